@@ -1,0 +1,11 @@
+"""The arena: recordings of a known truth, on which a discovery method can be marked.
+
+The simulator here shares no line with the package under test. Data made by the model that later
+explains it prove nothing, so this one steps differently (20 us, implicit midpoint), treats dry
+friction as the set-valued law it is, and knows nothing of the fitted parametrisation.
+
+* `arena.plant` - the rotary flexible joint with every hidden law built in;
+* `arena.hidden` - names, ports, default sizes, and what no recording can tell apart;
+* `arena.excite` - the input voltages;
+* `arena.records` - `make_record`: plant + hidden effects + input -> a recording and its truth.
+"""

@@ -1,0 +1,99 @@
+"""Make the notebooks from their scripts, or check that the two agree.
+
+The scripts (`NN_name.py`, jupytext percent format) are what people edit and review; the notebooks
+carry the outputs, so that figures show where the project is read on the web.
+
+    python notebooks/build.py                 # run every script, write its notebook
+    python notebooks/build.py 00_first_look   # only this one
+    python notebooks/build.py --check         # exit status 1 where a notebook is missing or stale
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import jupytext
+import nbformat
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).resolve().parent
+
+
+def scripts(names: list[str]) -> list[Path]:
+    """The scripts to work on, all of them unless some are named."""
+    found = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+    known = {script.stem: script for script in found}
+    for name in names:
+        if name not in known:
+            sys.exit(f"There is no notebook {name!r}; choose from {', '.join(known)}.")
+    return [known[name] for name in names] or found
+
+
+def cells(notebook: nbformat.NotebookNode) -> list[tuple[str, str]]:
+    """Kind and text of every cell that is not empty."""
+    return [(cell.cell_type, cell.source.strip()) for cell in notebook.cells if cell.source.strip()]
+
+
+def build(script: Path, timeout: float) -> None:
+    """Run one script as a notebook and write it with its outputs."""
+    notebook = jupytext.read(script)
+    notebook.metadata["kernelspec"] = {
+        "display_name": "Python 3",
+        "language": "python",
+        "name": "python3",
+    }
+    NotebookClient(
+        notebook,
+        timeout=timeout,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(FOLDER)}},
+    ).execute()
+    for number, cell in enumerate(notebook.cells):
+        # Fixed names and no times: a rebuilt notebook differs only where its content does.
+        cell["id"] = f"cell-{number}"
+        cell.metadata.pop("execution", None)
+    notebook.metadata.pop("jupytext", None)
+    nbformat.write(notebook, script.with_suffix(".ipynb"))
+
+
+def faults(script: Path) -> list[str]:
+    """What is wrong with the notebook of a script."""
+    target = script.with_suffix(".ipynb")
+    if not target.exists():
+        return ["is missing"]
+    notebook = nbformat.read(target, as_version=4)
+    found = []
+    if cells(notebook) != cells(jupytext.read(script)):
+        found.append("differs from its script")
+    code = [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
+    if any(cell.execution_count is None for cell in code):
+        found.append("has cells that were not run")
+    if not any(cell.outputs for cell in code):
+        found.append("has no outputs")
+    if any(output.output_type == "error" for cell in code for output in cell.outputs):
+        found.append("shows an error")
+    return found
+
+
+def main() -> None:
+    """Build, or check with --check."""
+    parser = argparse.ArgumentParser(description="Build or check the notebooks.")
+    parser.add_argument("names", nargs="*", help="scripts without .py; all unless given")
+    parser.add_argument("--check", action="store_true", help="write nothing, compare")
+    parser.add_argument("--timeout", type=float, default=600.0, help="limit per cell [s]")
+    arguments = parser.parse_args()
+    stale = False
+    for script in scripts(arguments.names):
+        if not arguments.check:
+            print(f"{script.name} ...", flush=True)
+            build(script, arguments.timeout)
+            continue
+        wrong = faults(script)
+        stale = stale or bool(wrong)
+        print(f"{script.stem}: {'; '.join(wrong) or 'ok'}")
+    if stale:
+        sys.exit("Run python notebooks/build.py and commit the notebooks.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Compare a model of a machine with measurements, find the physics it lacks, add it, watch the error fall.
+
+    import rotflex_jax as rf
+    rec = rf.load("run.csv")
+    train, test = rec.split(0.7)
+    result = rf.discover(rf.joints.paper(), train, test)
+
+Importing the package changes no setting of JAX and loads neither matplotlib nor pandas.
+"""
+
+from rotflex_jax import data, effects, joints, metrics
+from rotflex_jax.data import load
+from rotflex_jax.discover import Discovery, discover, locate
+from rotflex_jax.errors import InputError
+from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
+from rotflex_jax.fit import fit
+from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, linearise, simulate
+from rotflex_jax.model import Fit, Model
+from rotflex_jax.recording import Recording
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Discovery",
+    "Exponential",
+    "Fit",
+    "InputError",
+    "Mechanism",
+    "Model",
+    "Recording",
+    "SmoothRK4",
+    "data",
+    "discover",
+    "effects",
+    "enable_compilation_cache",
+    "enable_fast_loops",
+    "fit",
+    "joints",
+    "linearise",
+    "load",
+    "locate",
+    "metrics",
+    "simulate",
+]

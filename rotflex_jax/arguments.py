@@ -1,0 +1,225 @@
+"""What can be given on the command line, and its checks: all made before any long work starts."""
+
+import dataclasses
+import difflib
+import inspect
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rotflex_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from rotflex_jax.recording import Recording
+
+STDOUT = Path("-")
+JOINTS = ("paper", "quanser_2002", "quanser_2010", "single_inertia")
+
+Files = Annotated[
+    list[Path],
+    typer.Argument(metavar="FILE...", help="Recordings: .csv, .tsv, .mat, .npz, .parquet."),
+]
+JointName = Annotated[
+    str,
+    typer.Option(
+        "--joint",
+        metavar="NAME",
+        help=f"Textbook model to start from: {', '.join(JOINTS)}; numbers as paper:stiffness=1.2.",
+    ),
+]
+InputColumn = Annotated[
+    str | None, typer.Option("--input", metavar="COLUMN", help="Column of the motor voltage [V].")
+]
+OutputColumns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--output",
+        metavar="COLUMN",
+        help="Column of theta, then again for alpha; or CHANNEL=COLUMN.",
+    ),
+]
+Degrees = Annotated[bool, typer.Option("--degrees", help="Angles in the files are in degrees.")]
+SamplingPeriod = Annotated[
+    float | None,
+    typer.Option("--Ts", metavar="SECONDS", help="Sampling period, where no column has the time."),
+]
+TimeColumn = Annotated[
+    str | None, typer.Option("--time", metavar="COLUMN", help="Column of the time [s].")
+]
+Accept = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--accept", metavar="FAULT", help="Accept a named fault of the data, such as saturated."
+    ),
+]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - means stdout."),
+]
+ReportFolder = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FOLDER", help="Write a self-contained HTML report here."),
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """How to read a recording: the options that `discover` and `simulate` share."""
+
+    input: str | None
+    outputs: Sequence[str] | None
+    degrees: bool
+    Ts: float | None
+    time: str | None
+    accept: Sequence[str] | None
+
+    def __post_init__(self) -> None:
+        if self.Ts is not None and self.time is not None:
+            raise InputError(
+                "--Ts and --time were both given, but the sampling period comes either from a "
+                "column or from a number; give one of the two."
+            )
+        if self.Ts is not None and not self.Ts > 0:
+            raise InputError(
+                f"--Ts was given {self.Ts:g}, but a sampling period is a positive number of "
+                "seconds; give for instance --Ts 0.002."
+            )
+
+    def load(self, file: Path) -> "Recording":
+        """The recording in a file."""
+        if not file.exists():
+            raise InputError(f"{file} does not exist; give the path of a recording.")
+        if file.is_dir():
+            raise InputError(f"{file} is a folder, but a recording is one file; name the file.")
+        from rotflex_jax.data import load
+
+        try:
+            return load(
+                file,
+                input=self.input,
+                outputs=_channels(self.outputs or ()),
+                degrees=self.degrees,
+                Ts=self.Ts,
+                time=self.time,
+                accept=tuple(self.accept or ()),
+            )
+        except InputError as error:
+            raise InputError(_as_options(str(error))) from None
+
+
+def _channels(outputs: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
+    """`theta=servo` names the channel too; a plain column name leaves that to the order."""
+    if outputs and all("=" in text for text in outputs):
+        return dict(text.split("=", 1) for text in outputs)
+    return outputs or None
+
+
+def _as_options(sentence: str) -> str:
+    """A sentence about arguments of `rotflex_jax.load`, told in options of the command line."""
+    sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
+    sentence = sentence.replace("degrees=True", "--degrees").replace(
+        "degrees=False", "no --degrees"
+    )
+    sentence = re.sub(r"\b(input|time|Ts)=(?=\d)", r"--\1 ", sentence)
+    sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
+    sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
+    return re.sub(r"Argument `(\w+)`", r"--\1", sentence)
+
+
+def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:
+    """Refuse a file that is given twice: a model judged on what it has seen proves nothing."""
+    seen: dict[Path, Path] = {}
+    for file in (*files, *held_out):
+        if file.resolve() in seen:
+            raise InputError(
+                f"{file} was given twice, but a recording must not count twice nor be both learnt "
+                "from and judged on; name each file once."
+            )
+        seen[file.resolve()] = file
+
+
+def check_split(split: float | None, held_out: Sequence[Path]) -> float:
+    """The share of each file to learn from."""
+    if split is None:
+        return 0.7
+    if held_out:
+        raise InputError(
+            "--split and --held-out were both given, but the held-out data are either the end of "
+            "each FILE or files of their own; give one of the two."
+        )
+    if not 0 < split < 1:
+        raise InputError(
+            f"--split was given {split:g}, but it is the share of each FILE to learn from and must "
+            "lie between 0 and 1; give for instance --split 0.7."
+        )
+    return split
+
+
+def check_writable(*, json_file: Path | None = None, folder: Path | None = None) -> None:
+    """Refuse a place that nothing can be written to, while nothing has been computed yet."""
+    if json_file not in (None, STDOUT):
+        if json_file.is_dir():
+            raise InputError(f"{json_file} is a folder, but a file is written; name the file.")
+        if not json_file.absolute().parent.is_dir():
+            raise InputError(
+                f"{json_file} cannot be written, since the folder {json_file.parent} does not "
+                "exist; create it or name another."
+            )
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file, but the report needs a folder; name another.")
+
+
+def choose(name: str, choices: Iterable[str], what: str) -> str:
+    """`name` if it is one of the choices; otherwise a sentence with the likely one."""
+    choices = list(choices)
+    if name in choices:
+        return name
+    close = difflib.get_close_matches(name, choices, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
+    raise InputError(f"There is no {what} called {name!r}; {hint}")
+
+
+def joint(text: str) -> Any:
+    """The mechanism meant by `paper`, or by `quanser_2010:spring=3,hub_anchor=A`."""
+    from rotflex_jax import joints
+
+    name, _, values = text.partition(":")
+    preset = getattr(joints, choose(name, JOINTS, "joint"))
+    # A motor is not a number; whoever needs another one writes Python.
+    names = [key for key in inspect.signature(preset).parameters if key != "motor"]
+    return preset(**_numbers(values, names, f"option of {name}"))
+
+
+def effect(text: str) -> Any:
+    """The effect meant by `coulomb@hub`, or by `coulomb@hub:level=0.03`."""
+    from rotflex_jax.effects import CATALOG
+
+    place, _, values = text.partition(":")
+    name, separator, port = place.partition("@")
+    kind = CATALOG[choose(name, CATALOG, "effect")]
+    ports = list(kind.ports)
+    if not separator and len(ports) > 1:
+        raise InputError(
+            f"The effect {name} was given no port, but can act at {', '.join(ports)}; give for "
+            f"instance {name}@{ports[0]}."
+        )
+    numbers = _numbers(values, kind.declared(), f"parameter of {name}")
+    return kind(at=port or ports[0], **numbers)
+
+
+def _numbers(text: str, names: Iterable[str], what: str) -> dict[str, Any]:
+    """`a=1,b=C` as a dict; what does not read as a number stays text."""
+    found: dict[str, Any] = {}
+    for pair in filter(None, text.split(",")):
+        key, separator, value = (part.strip() for part in pair.partition("="))
+        if not separator or not value:
+            raise InputError(f"{pair!r} has no value, but needs one; write {key}=VALUE.")
+        choose(key, names, what)
+        try:
+            found[key] = int(value) if value.lstrip("+-").isdigit() else float(value)
+        except ValueError:
+            found[key] = value
+    return found

@@ -1,0 +1,11 @@
+"""Recordings from files, from public data sets, and inputs to record with."""
+
+from rotflex_jax.data import datasets as datasets, excitation as excitation
+from rotflex_jax.data.datasets import (
+    demo_recording as demo_recording,
+    fetch as fetch,
+    list_datasets as list_datasets,
+    load_dataset as load_dataset,
+)
+from rotflex_jax.data.io import load as load, save_csv as save_csv
+from rotflex_jax.data.rotflex import load_rotflex as load_rotflex

@@ -1,0 +1,251 @@
+"""Voltages to record with: noise, multisine, pseudo-random binary, steps, sweep, pulse.
+
+Filtered noise is the best single choice where nothing is known. Steps separate what depends on the
+position, a sweep or a multisine finds play, a binary signal finds delays and further modes; but two
+levels never show a dead zone or a saturation.
+
+Every input is an array of N voltages [V] at the sampling period Ts [s], the same for the same seed,
+which is an integer or a NumPy generator. An argument out of range raises `InputError`.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.errors import InputError
+
+Voltage = Float[np.ndarray, " N"]
+Seed = int | np.random.Generator
+
+
+def noise(
+    N: int, Ts: float, *, rms: float = 1.0, bandwidth: float = 5.0, seed: Seed = 0
+) -> Voltage:
+    """Gaussian noise through a first-order filter, stationary from the first sample.
+
+    u[k] = a u[k-1] + sqrt(1 - a^2) w[k],  a = exp(-2 pi bandwidth Ts),  w ~ N(0, rms^2)
+
+    Args:
+        N: samples.
+        Ts: sampling period [s].
+        rms: root mean square of the process [V].
+        bandwidth: corner frequency [Hz].
+        seed: of the random numbers.
+
+    >>> noise(3, 0.002, seed=1)
+    array([0.34558419, 0.60687965, 0.68347299])
+    """
+    from scipy.signal import lfilter  # takes long to import
+
+    _check_grid(N, Ts)
+    _check_positive(rms=rms, bandwidth=bandwidth)
+    a = np.exp(-2 * np.pi * bandwidth * Ts)
+    w = rms * np.random.default_rng(seed).standard_normal(N)
+    w[1:] *= np.sqrt(1 - a**2)
+    return np.asarray(lfilter([1.0], [1.0, -a], w))
+
+
+def multisine(
+    N: int,
+    Ts: float,
+    *,
+    band: tuple[float, float] = (0.1, 12.0),
+    rms: float = 1.0,
+    periods: int = 1,
+    optimise_crest: bool = True,
+    seed: Seed = 0,
+) -> Voltage:
+    """A periodic sum of sines of equal amplitude: every harmonic of the period within the band.
+
+    u[k] = A sum_h cos(2 pi h k / P + phase_h),  P = N / periods,  A = rms sqrt(2 / harmonics)
+
+    Phases are random; clipping the signal and keeping the phases of what is left brings the peak
+    down, so that the same power fits within the amplifier.
+
+    Args:
+        N: samples, a multiple of `periods`.
+        Ts: sampling period [s].
+        band: lowest and highest frequency [Hz].
+        rms: root mean square over a period, exactly [V].
+        periods: how often the signal repeats.
+        optimise_crest: whether to bring the peak down; otherwise the phases stay random.
+        seed: of the phases.
+
+    Source:
+        van der Ouderaa, Schoukens, Renneboog 1988, time-frequency domain swapping.
+
+    >>> u = multisine(1000, 0.01, band=(1.0, 5.0))
+    >>> round(float(np.sqrt(np.mean(u**2))), 12)
+    1.0
+    """
+    _check_grid(N, Ts)
+    _check_positive(rms=rms, periods=float(periods))
+    _check_band(band, Ts)
+    if int(periods) != periods or N % periods:
+        raise InputError(
+            f"Argument `N` must be a multiple of `periods`, a whole number, but is {N} for "
+            f"{periods} periods; change one of them."
+        )
+    P = int(N // periods)
+    harmonics = np.arange(np.ceil(band[0] * P * Ts - 1e-9), np.floor(band[1] * P * Ts + 1e-9) + 1)
+    harmonics = harmonics[(harmonics > 0) & (harmonics < P / 2)].astype(int)
+    if not len(harmonics):
+        raise InputError(
+            f"Argument `band` must hold a multiple of {1 / (P * Ts):g} Hz, one over the period, "
+            f"but is {band[0]:g} to {band[1]:g} Hz; widen it or lengthen the period."
+        )
+    amplitude = rms * np.sqrt(2 / len(harmonics))
+    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(harmonics))
+
+    def signal(phases: np.ndarray) -> np.ndarray:
+        spectrum = np.zeros(P // 2 + 1, dtype=complex)
+        spectrum[harmonics] = 0.5 * P * amplitude * np.exp(1j * phases)
+        return np.fft.irfft(spectrum, P)
+
+    best = u = signal(phases)
+    for _ in range(300 if optimise_crest else 0):
+        limit = 0.85 * np.max(np.abs(u))
+        u = signal(np.angle(np.fft.rfft(np.clip(u, -limit, limit))[harmonics]))
+        if np.max(np.abs(u)) < np.max(np.abs(best)):
+            best = u
+    return np.tile(best, int(periods))
+
+
+def prbs(
+    N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed: Seed = 0
+) -> Voltage:
+    """A maximum-length pseudo-random binary sequence: two levels, each bit held for a while.
+
+    As long as needed not to repeat. Not for a dead zone or a saturation: two levels hide them.
+
+    Args:
+        N: samples.
+        Ts: sampling period [s].
+        amplitude: the levels are plus and minus this [V].
+        hold: time of one bit [s], rounded to whole samples.
+        seed: of the bit to start from.
+
+    >>> prbs(6, 0.01, amplitude=2.0, hold=0.02)
+    array([-2., -2.,  2.,  2.,  2.,  2.])
+    """
+    from scipy.signal import max_len_seq  # takes long to import
+
+    _check_grid(N, Ts)
+    _check_positive(amplitude=amplitude, hold=hold)
+    samples = max(1, round(hold / Ts))
+    order = max(6, int(np.ceil(np.log2(-(-N // samples) + 1))))
+    bits, _ = max_len_seq(order)
+    bits = np.roll(bits, np.random.default_rng(seed).integers(len(bits)))
+    return amplitude * (2.0 * np.repeat(bits, samples)[:N] - 1.0)
+
+
+def steps(
+    N: int,
+    Ts: float,
+    *,
+    amplitude: float = 1.0,
+    hold: tuple[float, float] = (0.15, 0.8),
+    seed: Seed = 0,
+) -> Voltage:
+    """Random levels, each held for a random time, both uniform.
+
+    Not for play in the gears or a sensor bias, which steps hide.
+
+    Args:
+        N: samples.
+        Ts: sampling period [s].
+        amplitude: the levels lie within plus and minus this [V].
+        hold: shortest and longest time of a level [s].
+        seed: of the random numbers.
+
+    >>> np.unique(steps(50, 0.01, hold=(0.1, 0.1))).size
+    5
+    """
+    _check_grid(N, Ts)
+    shortest, longest = sorted(hold)
+    _check_positive(amplitude=amplitude, hold=shortest)
+    rng = np.random.default_rng(seed)
+    most = -(-N // max(1, round(shortest / Ts)))
+    times = np.maximum(1, np.round(rng.uniform(shortest, longest, most) / Ts)).astype(int)
+    return np.repeat(rng.uniform(-amplitude, amplitude, most), times)[:N]
+
+
+def sweep(
+    N: int, Ts: float, *, band: tuple[float, float] = (0.1, 12.0), amplitude: float = 1.0
+) -> Voltage:
+    """A sine whose frequency rises exponentially, the same time for every octave.
+
+    u(t) = A sin(2 pi f0 T (r^(t / T) - 1) / ln(r)),  r = f1 / f0,  T = N Ts
+
+    Args:
+        N: samples.
+        Ts: sampling period [s].
+        band: first and last frequency [Hz].
+        amplitude: of the sine [V].
+
+    >>> round(float(np.max(sweep(1000, 0.01, amplitude=3.0))), 2)
+    3.0
+    """
+    _check_grid(N, Ts)
+    _check_positive(amplitude=amplitude, band=band[0])
+    _check_band(band, Ts)
+    rise = np.log(band[1] / band[0])
+    cycles = band[0] * N * Ts / rise * np.expm1(rise * np.arange(N) / N)
+    return amplitude * np.sin(2 * np.pi * cycles)
+
+
+def pulse(
+    N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, delay: float = 0.1
+) -> Voltage:
+    """One rectangular pulse, nothing before and after: the free motion afterwards shows friction.
+
+    Args:
+        N: samples.
+        Ts: sampling period [s].
+        amplitude: height, of either sign [V].
+        width: how long it lasts [s].
+        delay: when it begins [s].
+
+    >>> pulse(5, 0.1, amplitude=3.0, width=0.2, delay=0.1)
+    array([0., 3., 3., 0., 0.])
+    """
+    _check_grid(N, Ts)
+    _check_positive(width=width)
+    start, stop = round(delay / Ts), round((delay + width) / Ts)
+    if not 0 <= start < stop <= N:
+        raise InputError(
+            f"The pulse must lie within the {N * Ts:g} s of the signal, but lasts from {delay:g} to "
+            f"{delay + width:g} s; change `delay`, `width` or `N`."
+        )
+    u = np.zeros(N)
+    u[start:stop] = amplitude
+    return u
+
+
+INPUTS: dict[str, Callable[..., Voltage]] = {
+    kind.__name__: kind for kind in (noise, multisine, prbs, steps, sweep, pulse)
+}
+"""Every kind of input by name."""
+
+
+def _check_grid(N: int, Ts: float) -> None:
+    if int(N) != N or N < 1 or not 0 < Ts < np.inf:
+        raise InputError(
+            "Arguments `N` and `Ts` must be a number of samples and a sampling period in seconds, "
+            f"but are {N} and {Ts}; give for instance 5000 and 0.002."
+        )
+
+
+def _check_positive(**values: float) -> None:
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise InputError(f"Argument `{name}` must be positive, but is {value:g}; correct it.")
+
+
+def _check_band(band: tuple[float, float], Ts: float) -> None:
+    if not 0 <= band[0] < band[1] <= 0.5 / Ts:
+        raise InputError(
+            f"Argument `band` must rise within 0 and {0.5 / Ts:g} Hz, half the sampling rate, but "
+            f"is {band[0]:g} to {band[1]:g} Hz; correct it."
+        )

@@ -1,0 +1,170 @@
+"""Hypotheses side by side: innovations and their slopes for several parameter sets in one call."""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rotflex_jax.discover.supermodel import Place, SuperModel
+from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.fit.residuals import Data, predicted
+from rotflex_jax.mechanism import Mechanism, Solver
+from rotflex_jax.parameters import Transform
+from rotflex_jax.precision import double_precision
+
+# Lanes per call. The work grows with the lanes, so few are as fast as many and compile sooner.
+LANES = 3
+
+
+class Lane(NamedTuple):
+    """Numbers of one hypothesis for all recordings; stacked, a leading axis is added."""
+
+    values: np.ndarray  # (R, P)
+    x0: np.ndarray  # (R, m)
+    gates: np.ndarray  # (E,)
+    K: np.ndarray  # (R, n, C)
+
+
+class Directions(NamedTuple):
+    """Tangents (D, ...) in which a lane is differentiated."""
+
+    values: np.ndarray  # (D, R, P)
+    x0: np.ndarray  # (D, m), the same in every recording
+    gates: np.ndarray  # (D, E)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _innovations(structure: Mechanism, solver: Solver, lanes: Lane, data: Data) -> jax.Array:
+    def one(lane: Lane) -> jax.Array:
+        y_hat = predicted(structure, solver, lane.values, lane.x0, lane.gates, data, lane.K)
+        return (data.y - y_hat) * data.seen[:, :, None]
+
+    return jax.vmap(one)(lanes)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _slopes(
+    structure: Mechanism, solver: Solver, lanes: Lane, directions: Directions, data: Data
+) -> tuple[jax.Array, jax.Array]:
+    def one(lane: Lane, along: Directions) -> tuple[jax.Array, jax.Array]:
+        run = lambda values, x0, gates: predicted(  # noqa: E731
+            structure, solver, values, x0, gates, data, lane.K
+        )
+        point = (lane.values, lane.x0, lane.gates)
+
+        def slope(dv: jax.Array, dx: jax.Array, dg: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jax.jvp(run, point, (dv, jnp.broadcast_to(dx, lane.x0.shape), dg))
+
+        y_hat, J = jax.vmap(slope, out_axes=(None, 0))(*along)
+        mask = data.seen[:, :, None]
+        return (data.y - y_hat) * mask, -J * mask[None]
+
+    return jax.vmap(one)(lanes, directions)
+
+
+def _stacked(parts: list) -> tuple:  # noqa: ANN001
+    """Leading axis over lanes; a short batch is filled up with copies of its last lane."""
+    full = parts + [parts[-1]] * (LANES - len(parts))
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *full)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """Where hypotheses are run: one super-model, one solver, one set of recordings."""
+
+    supermodel: SuperModel
+    solver: Solver
+    data: Data
+
+    def innovations(self, lanes: list[Lane]) -> np.ndarray:
+        """Innovations (L, R, N, C) of any number of lanes."""
+        out = []
+        structure = self.supermodel.mechanism.structure
+        with double_precision():
+            data = jax.tree.map(jnp.asarray, self.data)
+            for i in range(0, len(lanes), LANES):
+                part = lanes[i : i + LANES]
+                out.append(np.asarray(_innovations(structure, self.solver, _stacked(part), data))[: len(part)])
+        return np.concatenate(out)
+
+    def slopes(self, lanes: list[Lane], directions: list[Directions]) -> tuple[np.ndarray, np.ndarray]:
+        """Innovations (L, R, N, C) and their slopes (L, D, R, N, C)."""
+        es, Js = [], []
+        structure = self.supermodel.mechanism.structure
+        with double_precision():
+            data = jax.tree.map(jnp.asarray, self.data)
+            for i in range(0, len(lanes), LANES):
+                part = lanes[i : i + LANES]
+                along = _stacked(directions[i : i + LANES])
+                e, J = _slopes(structure, self.solver, _stacked(part), along, data)
+                es.append(np.asarray(e)[: len(part)])
+                Js.append(np.asarray(J)[: len(part)])
+        return np.concatenate(es), np.concatenate(Js)
+
+
+@dataclasses.dataclass(frozen=True)
+class Hypothesis:
+    """One model on one set of recordings, with everything a comparison needs.
+
+    Attributes:
+        places: Candidates and calibrations that are switched on, in the order they came.
+        free: Parameters common to all recordings that are fitted.
+        local: Parameters that each recording has for itself and that are fitted.
+        z: Unconstrained values (P,).
+        own: Unconstrained values of the local parameters (R, len(local)).
+        x0: First positions and speeds (R, m).
+        K: Gains (R, n, C).
+        process_noise: Port -> intensity that gave `K`.
+        whitener: Fixed while parameters move.
+        log_likelihood: Of the training recordings [nat].
+    """
+
+    places: tuple[Place, ...]
+    free: tuple[int, ...]
+    local: tuple[int, ...]
+    z: np.ndarray
+    own: np.ndarray
+    x0: np.ndarray
+    K: np.ndarray
+    process_noise: dict[str, float]
+    whitener: Whitener
+    log_likelihood: float = -np.inf
+
+    def values(self, bench: Bench) -> np.ndarray:
+        """Physical values (R, P)."""
+        z = np.tile(self.z, (len(self.x0), 1))
+        if self.local:
+            z[:, list(self.local)] = self.own
+        return constrain(bench, z)[0]
+
+    def lane(self, bench: Bench) -> Lane:
+        """The numbers to run."""
+        return Lane(self.values(bench), self.x0, bench.supermodel.gates(self.places), self.K)
+
+    @property
+    def moved(self) -> int:
+        """Number of directions a fit moves: common, then local, then first states."""
+        return len(self.free) + len(self.local) + self.x0.shape[1]
+
+    def directions(self, bench: Bench, count: int) -> Directions:
+        """Tangents of all that a fit moves, in unconstrained coordinates, filled up with zeros."""
+        R, P = len(self.x0), len(self.z)
+        z = np.tile(self.z, (R, 1))
+        if self.local:
+            z[:, list(self.local)] = self.own
+        stretch = constrain(bench, z)[1]
+        E, m = len(bench.supermodel.mechanism.effects), self.x0.shape[1]
+        d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
+        for k, i in enumerate((*self.free, *self.local)):
+            d.values[k, :, i] = stretch[:, i]
+        start = len(self.free) + len(self.local)
+        d.x0[start : start + m] = np.eye(m)
+        return d
+
+
+def constrain(bench: Bench, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Physical values of unconstrained ones (..., P), and their derivative."""
+    return Transform.of(bench.supermodel.mechanism.parameter_specifications).physical(z)

@@ -1,0 +1,252 @@
+"""The loop: compare, locate, propose, add, watch the held-out error fall, stop when nothing is missing."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from rotflex_jax.discover.decide import choose, describe, held_out, samples_of
+from rotflex_jax.discover.lanes import Bench, Hypothesis
+from rotflex_jax.discover.locate import locate
+from rotflex_jax.discover.refit import Judge, refit
+from rotflex_jax.discover.result import Discovery, Ranked, Round
+from rotflex_jax.discover.scales import scales
+from rotflex_jax.discover.score import Score, scores
+from rotflex_jax.discover.stages import Scribe
+from rotflex_jax.discover.supermodel import CALIBRATIONS, Place, SuperModel, build
+from rotflex_jax.discover.verdict import judge_end
+from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.effects import CATALOG, candidates as first_family
+from rotflex_jax.effects.kinds import Effect
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit.greybox import everywhere, torque_scale
+from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.model import Model
+from rotflex_jax.parameters import Transform
+from rotflex_jax.recording import Recording
+
+Progress = Callable[[str], None]
+
+# Candidates that are refitted in a round, and rounds at most.
+REFITTED, ROUNDS = 4, 4
+
+
+def discover(
+    mechanism: Mechanism | Model,
+    train: Recording | Sequence[Recording],
+    test: Recording | Sequence[Recording],
+    *,
+    candidates: Iterable[tuple[type[Effect], str]] | None = None,
+    rounds: int = ROUNDS,
+    window_seconds: float = 2.0,
+    progress: Progress | None = None,
+) -> Discovery:
+    """Find the physical effects that a model lacks, and say how sure that is.
+
+    The baseline is fitted as a predictor whose process noise the data choose; all candidate effects are
+    scored at once by the slope of its innovations; the best are refitted; likelihood on held-out data
+    decides, for one effect or for a set that the recordings cannot tell apart. Repeated until nothing is
+    gained, then every effect must show that the model is worse without it.
+
+    Args:
+        mechanism: The user's model; its numbers are the start.
+        train: Recordings to fit.
+        test: Recordings that no fit sees; at most their own first state and offsets are adapted when
+            likelihoods are compared, and only the first `n_init` samples for the errors reported.
+        candidates: (effect class, port) pairs; the catalogue's first family if None.
+        rounds: Most effects to add.
+        window_seconds: Length of the windows of the short held-out runs [s].
+        progress: Called with a line of text at each stage.
+
+    Returns:
+        Discovery.
+
+    Raises:
+        InputError: No recording, or channels that the model lacks.
+    """
+    began, say = time.perf_counter(), progress or (lambda _: None)
+    model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
+    trained = (train,) if isinstance(train, Recording) else tuple(train)
+    unseen = (test,) if isinstance(test, Recording) else tuple(test)
+    if not model.mechanism.free_names:
+        raise InputError("All parameters are trusted, but discovery fits the model; release one.")
+    data = stack(trained, model)
+    torque = torque_scale(model.mechanism, data)
+    wanted = list(first_family() if candidates is None else candidates)
+    supermodel = build(model.mechanism, wanted, scales(model, trained, torque))
+    noise = sensor_noise((*trained, *unseen), model)
+    ports = tuple(everywhere(model.mechanism, 1.0))
+    judge = Judge(Bench(supermodel, model.solver, data), noise, torque, ports)
+    away = Judge(Bench(supermodel, model.solver, stack(unseen, model)), noise, torque, ports)
+    first = first_states(model, unseen)
+
+    say("fitting the model as it is")
+    now = _baseline(judge, supermodel, model, trained)
+    base = held_out(away, now, first)
+    ranking: list[Score] = []
+    taken: list[tuple[Place, float]] = []
+    equivalents: dict[Place, list[Place]] = {}
+    samples = samples_of(judge.bench)
+    for number in range(rounds):
+        say(f"round {number + 1}: scoring {len(supermodel.candidates) - len(taken)} candidates")
+        listed = scores(judge, base.hypothesis)
+        ranking = ranking or listed
+        promising = [s for s in listed if s.nats > 0][:REFITTED]
+        if not promising:
+            break
+        say("refitting " + ", ".join(f"{s.place[0]} at {s.place[1]}" for s in promising))
+        refitted = refit(judge, [_with(judge, base.hypothesis, s) for s in promising])
+        trials = [
+            dataclasses.replace(held_out(away, h, first), place=s.place, numbers=len(s.start))
+            for h, s in zip(refitted, promising, strict=True)
+            if _physical(judge, h, s.place)
+        ]
+        for t in trials:
+            say("  " + describe(t, base))
+        winner, rivals = choose(trials, base, samples)
+        if winner is None or winner.place is None:
+            break
+        place = winner.place
+        score = next(s.nats for s in promising if s.place == place)
+        taken.append((place, score))
+        equivalents[place] = [t.place for t in rivals if t.place]
+        say(f"added {place[0]} at {place[1]}")
+        base = dataclasses.replace(winner, place=None, numbers=0)
+
+    say("checking that each effect is needed")
+    final, worth = _eliminated(judge, base.hypothesis, samples)
+    order = sorted(final.places, key=lambda p: -worth[p])
+    scribe = Scribe(judge, away, model, trained, unseen, window_seconds)
+    hypotheses = _ladder(judge, final, order)
+    say("simulating the held-out recordings")
+    stages = [scribe.stage(h, held_out(away, h, first)) for h in hypotheses]
+    steps = [
+        Round(
+            effect=place[0],
+            port=place[1],
+            equivalent=tuple(equivalents.get(place, [])),
+            parameters=scribe.own_estimates(stage, place),
+            stage=stage,
+            score=dict(taken).get(place, worth[place]),
+            held_out_gain_nats=stage.log_likelihood - before.log_likelihood,
+            sentence=stage.model.mechanism.effect(*place).sentence(),
+            equation=CATALOG[place[0]].equation,
+        )
+        for place, before, stage in zip(order, stages, stages[1:], strict=False)
+    ]
+    longest = max(range(len(unseen)), key=lambda i: unseen[i].N)
+    residual = model.measured(unseen[longest]) - stages[0].windowed[longest]
+    floor = dict(zip(model.mechanism.channels, noise.tolist(), strict=True))
+    verdict, sentence = judge_end(steps, stages[-1], floor, ranking, unseen)
+    return Discovery(
+        verdict=verdict,
+        sentence=sentence,
+        train=trained,
+        test=unseen,
+        baseline=stages[0],
+        rounds=tuple(steps),
+        ranking=tuple(
+            Ranked(*s.place, s.nats, s.excited, s.unconfounded, s.smallest) for s in ranking
+        ),
+        where=locate(unseen[longest], residual, model.mechanism.channels, noise),
+        noise_floor=floor,
+        elapsed_s=time.perf_counter() - began,
+    )
+
+
+def _baseline(
+    judge: Judge, s: SuperModel, model: Model, trained: Sequence[Recording]
+) -> Hypothesis:
+    """The user's model with calibrations, fitted from a short, a middle and an endless horizon."""
+    R, C = len(trained), len(s.mechanism.channels)
+    specs = s.mechanism.parameter_specifications
+    z = Transform.of(specs).unconstrain(s.mechanism.values)
+    for i in s.local:
+        z[i] = 0.0
+    start = Hypothesis(
+        places=s.calibrations,
+        free=tuple(s.baseline_free),
+        local=tuple(s.local),
+        z=z,
+        own=np.zeros((R, len(s.local))),
+        x0=first_states(model, trained),
+        K=np.zeros((0,)),
+        process_noise={},
+        whitener=Whitener(np.eye(1, 1).repeat(C, 0), np.diag(1 / judge.noise)),
+    )
+    unit = judge.torque**2 * float(judge.bench.data.Ts[0])
+    horizons = [dict.fromkeys(judge.ports, unit * f) for f in (1e-1, 1e-4, 1e-9)]
+    # A distant start is safe only with a short horizon: all paths begin with it.
+    short = refit(judge, [judge.with_process_noise(start, horizons[0])], turns=0)[0]
+    paths = refit(judge, [judge.with_process_noise(short, q) for q in horizons], wide=True)
+    return max(paths, key=lambda h: h.log_likelihood)
+
+
+def _with(judge: Judge, h: Hypothesis, score: Score) -> Hypothesis:
+    """The hypothesis with one more effect, started where the score test points."""
+    s = judge.bench.supermodel
+    c = s.candidates[score.place]
+    specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
+    size = np.abs(np.array(c.probes[0])).max(axis=0)
+    start = score.start.copy()
+    for k, spec in enumerate(specs):
+        # A bound at zero is the end of a logarithm: begin a little inside.
+        if np.isfinite(spec.lower):
+            start[k] = max(start[k], spec.lower + 0.05 * max(size[k], 1e-12))
+    z = h.z.copy()
+    z[list(c.parameters)] = Transform.of(specs).unconstrain(start)
+    return dataclasses.replace(
+        h, places=(*h.places, score.place), free=(*h.free, *c.parameters), z=z
+    )
+
+
+def _physical(judge: Judge, h: Hypothesis, place: Place) -> bool:
+    """Whether the effect's numbers lie in their physical range."""
+    s = judge.bench.supermodel
+    values = h.values(judge.bench).mean(axis=0)
+    specs = s.mechanism.parameter_specifications
+    return all(
+        specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(place)
+    )
+
+
+def _without(judge: Judge, h: Hypothesis, place: Place) -> Hypothesis:
+    s = judge.bench.supermodel
+    gone = set(s.parameter_indices(place))
+    kept = [k for k, i in enumerate(h.local) if i not in gone]
+    return dataclasses.replace(
+        h,
+        places=tuple(p for p in h.places if p != place),
+        free=tuple(i for i in h.free if i not in gone),
+        local=tuple(h.local[k] for k in kept),
+        own=h.own[:, kept],
+    )
+
+
+def _eliminated(judge: Judge, h: Hypothesis, samples: float) -> tuple[Hypothesis, dict[Place, float]]:
+    """Drop, one at a time, what the model does as well without; the rest with what each is worth [nat]."""
+    s = judge.bench.supermodel
+    while h.places:
+        rivals = refit(judge, [_without(judge, h, p) for p in h.places], turns=1)
+        worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(h.places, rivals, strict=True)}
+        each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
+        needed = {p: 8.0 + 0.5 * each[p] * np.log(samples) for p in worth}
+        weakest = min(worth, key=lambda p: worth[p] - needed[p])
+        if worth[weakest] >= needed[weakest]:
+            return h, worth
+        h = rivals[h.places.index(weakest)]
+    return h, {}
+
+
+def _ladder(judge: Judge, final: Hypothesis, order: list[Place]) -> list[Hypothesis]:
+    """The baseline alone, then with one more effect at a time, each refitted; the final model last."""
+    below = []
+    for k in range(len(order)):
+        h = final
+        for place in order[k:]:
+            h = _without(judge, h, place)
+        below.append(h)
+    fitted = refit(judge, below, wide=True, turns=2) if below else []
+    return [*fitted, final]

@@ -1,0 +1,181 @@
+"""Which effect would explain the innovations best, before any refit.
+
+Every candidate sits in the super-model with its amplitude at zero. The slope of the innovations along
+the amplitude, whitened, less its projection on everything the baseline can still move, says how much
+likelihood the effect would gain to first order (Rao's score statistic).
+"""
+
+import dataclasses
+
+import numpy as np
+
+from rotflex_jax.discover.lanes import Bench, Directions, Hypothesis, Lane
+from rotflex_jax.discover.refit import Judge
+from rotflex_jax.discover.supermodel import Candidate, Place
+
+# A plausible effect must be able to gain this much (chi-square) for a recording to show it.
+VISIBLE = 12.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """A candidate's score.
+
+    Attributes:
+        place: Effect and port.
+        nats: Log-likelihood gained to first order, less half a log N per number it needs.
+        start: Parameter values where a refit should start.
+        excited: Whether an effect of plausible size would have been visible.
+        unconfounded: Norm of the projected slope over the norm of the slope.
+        smallest: Factor of the plausible size that would just have been visible.
+    """
+
+    place: Place
+    nats: float
+    start: np.ndarray
+    excited: bool
+    unconfounded: float
+    smallest: float
+
+
+@dataclasses.dataclass(frozen=True)
+class _Probe:
+    """One direction of the test: candidate, alternative, member of the alternative."""
+
+    candidate: Candidate
+    shape: int
+    member: int
+
+
+def _lane_for(bench: Bench, h: Hypothesis, candidates: list[Candidate], shape: int) -> Lane:
+    """The hypothesis with candidates on at zero amplitude, or off where they have no amplitude."""
+    values = h.values(bench)
+    gates = bench.supermodel.gates(h.places)
+    for c in candidates:
+        group = c.probes[min(shape, len(c.probes) - 1)]
+        for k, i in enumerate(c.parameters):
+            values[:, i] = 0.0 if c.amplitudes[k] else group[0][k]
+        gates[c.effect] = 1.0 if any(c.amplitudes) else 0.0
+    return Lane(values, h.x0, gates, h.K)
+
+
+def _shapes(group: tuple[tuple[float, ...], ...], c: Candidate) -> tuple[float, ...]:
+    """Parameters of an alternative that are not amplitudes."""
+    return tuple(v for v, amplitude in zip(group[0], c.amplitudes, strict=True) if not amplitude)
+
+
+def scores(judge: Judge, h: Hypothesis) -> list[Score]:
+    """Scores of all candidates that are not yet in the hypothesis, best first."""
+    bench, seen = judge.bench, judge.bench.data.seen
+    candidates = [c for c in bench.supermodel.candidates.values() if c.place not in h.places]
+    if not candidates:
+        return []
+    count = max(judge.directions(), h.moved)
+    nuisance = h.directions(bench, count)
+    probes = [
+        _Probe(c, s, m) for c in candidates for s, group in enumerate(c.probes) for m in range(len(group))
+    ]
+    # Alternatives that differ in amplitudes only share a lane; shapes need lanes of their own.
+    batches: list[tuple[int, list[_Probe]]] = []
+    for shape in sorted({p.shape for p in probes}):
+        mine = [p for p in probes if p.shape == shape]
+        batches += [(shape, mine[i : i + count]) for i in range(0, len(mine), count)]
+    lanes = [h.lane(bench)] + [_lane_for(bench, h, candidates, shape) for shape, _ in batches]
+    along = [nuisance] + [_tangents(bench, h, part, count) for _, part in batches]
+    e, J = bench.slopes(lanes, along)
+    w = h.whitener(e[0], seen)
+    N = _expanded(h, h.whitener(J[0, : h.moved], seen))
+    Q = np.linalg.qr(N.T / np.maximum(np.linalg.norm(N, axis=1), 1e-300))[0]
+    r = w.ravel()
+    r = r - Q @ (Q.T @ r)
+    columns: dict[tuple[Place, int], list[np.ndarray]] = {}
+    for (_, part), slopes in zip(batches, J[1:], strict=True):
+        W = h.whitener(slopes[: len(part)], seen).reshape(len(part), -1)
+        for p, column in zip(part, W, strict=True):
+            columns.setdefault((p.candidate.place, p.shape), []).append(column)
+    samples = float(np.sum(seen)) * e.shape[-1]
+    found = [_score(c, columns, Q, r, samples) for c in candidates]
+    return sorted(found, key=lambda s: -s.nats)
+
+
+def _tangents(bench: Bench, h: Hypothesis, part: list[_Probe], count: int) -> Directions:
+    """Directions of probes: along amplitudes by their values, along effects without any by the gate."""
+    R, P = len(h.x0), len(h.z)
+    E, m = len(bench.supermodel.mechanism.effects), h.x0.shape[1]
+    d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
+    for row, p in enumerate(part):
+        c = p.candidate
+        if not any(c.amplitudes):
+            d.gates[row, c.effect] = 1.0
+            continue
+        for k, i in enumerate(c.parameters):
+            if c.amplitudes[k]:
+                d.values[row, :, i] = c.probes[p.shape][p.member][k]
+    return d
+
+
+def _expanded(h: Hypothesis, W: np.ndarray) -> np.ndarray:
+    """Nuisance directions as rows (D', R N C); local ones once per recording."""
+    shared, R = len(h.free), W.shape[1]
+    rows = [W[k].ravel() for k in range(shared)]
+    for k in range(shared, h.moved):
+        for r in range(R):
+            one = np.zeros_like(W[k])
+            one[r] = W[k, r]
+            rows.append(one.ravel())
+    return np.array(rows)
+
+
+def _score(
+    c: Candidate,
+    columns: dict[tuple[Place, int], list[np.ndarray]],
+    Q: np.ndarray,
+    r: np.ndarray,
+    samples: float,
+) -> Score:
+    best: Score | None = None
+    for shape, group in enumerate(c.probes):
+        J = np.array(columns[(c.place, shape)]).T
+        full = np.linalg.norm(J, axis=0)
+        J = J - Q @ (Q.T @ J)
+        left = np.linalg.norm(J, axis=0)
+        a = _nonnegative(J, r, c)
+        if not np.all(np.isfinite(J)):
+            continue
+        used = a != 0
+        gain = float(-np.sum((J @ a) * r) - 0.5 * np.sum((J @ a) ** 2)) if used.any() else 0.0
+        df = max(int(used.sum()), 1) + (1 if len(c.probes) > 1 else 0)
+        nats = gain - 0.5 * df * np.log(samples)
+        start = np.array(group[0], float)
+        if any(c.amplitudes):
+            mix = np.array(group, float)
+            for k, amplitude in enumerate(c.amplitudes):
+                start[k] = a @ mix[:, k] if amplitude else start[k]
+        strongest = float(left.max())
+        share = float((left / np.maximum(full, 1e-300)).max())
+        score = Score(
+            c.place,
+            nats,
+            start,
+            excited=strongest**2 > VISIBLE,
+            unconfounded=share,
+            smallest=float(np.sqrt(VISIBLE) / max(strongest, 1e-300)),
+        )
+        best = score if best is None or nats > best.nats else best
+    if best is None:
+        return Score(c.place, -np.inf, np.array(c.probes[0][0]), False, 0.0, np.inf)
+    return best
+
+
+def _nonnegative(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:
+    """Amplitudes that lower |r + J a| most, none of them negative where only positive ones exist."""
+    keep = np.linalg.norm(J, axis=0) > 1e-9 * max(float(np.linalg.norm(r)), 1e-300)
+    a = np.zeros(J.shape[1])
+    while keep.any():
+        part = np.linalg.lstsq(J[:, keep], -r, rcond=1e-8)[0]
+        if not c.one_sided or np.all(part >= 0):
+            a[keep] = part
+            break
+        drop = np.flatnonzero(keep)[np.argmin(part)]
+        keep[drop] = False
+    return a

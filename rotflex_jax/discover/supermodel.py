@@ -1,0 +1,141 @@
+"""The baseline with every candidate built in and switched off.
+
+One structure serves the score test, all refits and all comparisons, so it is compiled once; which
+effects take part is a matter of their gates, which are numbers.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects.kinds import Actuation, Effect, Scale, Sensing
+from rotflex_jax.mechanism import Mechanism
+
+Place = tuple[str, str]  # (effect name, port)
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """One effect that may be missing.
+
+    Attributes:
+        place: Effect name and port.
+        effect: Index in the super-model's effects.
+        parameters: Indices of its parameters in the super-model's values.
+        probes: Alternatives (shapes), each a list of parameter vectors tried together.
+        amplitudes: For each parameter, whether it is an amplitude.
+        one_sided: Whether a negative amplitude would not be physical.
+    """
+
+    place: Place
+    effect: int
+    parameters: tuple[int, ...]
+    probes: tuple[tuple[tuple[float, ...], ...], ...]
+    amplitudes: tuple[bool, ...]
+    one_sided: bool
+
+
+# What every recording may need to be read rightly, whatever the physics: fitted from the start, each
+# recording has its own, and reported as found where it matters.
+CALIBRATIONS: tuple[Place, ...] = (("voltage_offset", "input"), ("sensor_bias", "alpha"))
+
+
+@dataclasses.dataclass(frozen=True)
+class SuperModel:
+    """Baseline, calibrations and candidates in one mechanism.
+
+    Attributes:
+        baseline: The user's mechanism.
+        mechanism: With calibrations and candidates.
+        calibrations: Places of the calibrations that were added.
+        candidates: By place.
+    """
+
+    baseline: Mechanism
+    mechanism: Mechanism
+    calibrations: tuple[Place, ...]
+    candidates: dict[Place, Candidate]
+
+    def effect_index(self, place: Place) -> int:
+        """Index of an effect."""
+        return [(e.name, e.at) for e in self.mechanism.effects].index(place)
+
+    def parameter_indices(self, place: Place) -> list[int]:
+        """Indices of an effect's parameters in the values."""
+        head = f"{place[1]}.{place[0]}."
+        return [i for i, n in enumerate(self.mechanism.parameter_names) if n.startswith(head)]
+
+    @property
+    def local(self) -> list[int]:
+        """Parameters that each recording has for itself."""
+        return [i for place in self.calibrations for i in self.parameter_indices(place)]
+
+    @property
+    def baseline_free(self) -> list[int]:
+        """Free parameters of the baseline."""
+        names = self.mechanism.parameter_names
+        return [names.index(n) for n in self.baseline.free_names]
+
+    def gates(self, switched_on: Iterable[Place]) -> np.ndarray:
+        """Gates (E,): baseline and the named effects on."""
+        on = set(switched_on)
+        base = len(self.baseline.effects)
+        effects = self.mechanism.effects
+        return np.array([1.0 if i < base or (e.name, e.at) in on else 0.0 for i, e in enumerate(effects)])
+
+    def clean(self, values: np.ndarray, places: Iterable[Place]) -> Mechanism:
+        """The user's mechanism with fitted numbers and the named effects, nothing else."""
+        numbers = dict(zip(self.mechanism.parameter_names, values.tolist(), strict=True))
+        mechanism = self.baseline
+        for place in places:
+            mechanism = mechanism + self.mechanism.effects[self.effect_index(place)]
+        return mechanism.with_values({n: numbers[n] for n in mechanism.parameter_names})
+
+
+def build(
+    baseline: Mechanism, wanted: Iterable[tuple[type[Effect], str]], scales: dict[str, Scale]
+) -> SuperModel:
+    """A super-model of a baseline.
+
+    Args:
+        baseline: The user's mechanism.
+        wanted: Candidates (class, port); those the baseline has, or has no port for, are left out.
+        scales: Port (or `input`, or channel) -> size of its signals.
+    """
+    present = {(e.name, e.at) for e in baseline.effects}
+    mechanism = baseline
+    calibrations, candidates = [], {}
+    for place in CALIBRATIONS:
+        cls = CATALOG[place[0]]
+        if place not in present and _has(baseline, cls, place[1]):
+            mechanism = mechanism + cls(at=place[1])
+            calibrations.append(place)
+    for cls, port in wanted:
+        place = (cls.name, port)
+        if place in present or place in calibrations or not _has(baseline, cls, port):
+            continue
+        names = tuple(cls.declared())
+        probes = tuple(
+            tuple(tuple(float(p[n]) for n in names) for p in group) for group in cls.probes(scales[port])
+        )
+        if not probes:
+            continue
+        mechanism = mechanism + cls(at=port, **dict(zip(names, probes[0][0], strict=True)))
+        last = len(mechanism.parameter_names)
+        candidates[place] = Candidate(
+            place,
+            len(mechanism.effects) - 1,
+            tuple(range(last - len(names), last)),
+            probes,
+            tuple(n in cls.amplitudes for n in names),
+            all(max(s.lower, s.physical[0]) >= 0 for n, s in cls.declared().items() if n in cls.amplitudes),
+        )
+    return SuperModel(baseline, mechanism, tuple(calibrations), candidates)
+
+
+def _has(mechanism: Mechanism, cls: type[Effect], port: str) -> bool:
+    if issubclass(cls, Actuation):
+        return port == "input"
+    return port in (mechanism.channels if issubclass(cls, Sensing) else mechanism.port_vectors)

@@ -1,0 +1,76 @@
+"""Physical effects. One file holds one effect or a close family; each is entered by `register`.
+
+To add one, derive a frozen dataclass from a kind (`kinds.py`), decorate it with `register`, and
+import it here.
+"""
+
+from rotflex_jax.effects.catalogue import CATALOG, candidates, register
+from rotflex_jax.effects.coulomb import Coulomb, CoulombAsymmetric
+from rotflex_jax.effects.cubic_spring import CubicSpring
+from rotflex_jax.effects.dahl import Dahl
+from rotflex_jax.effects.dead_zone import DeadZone
+from rotflex_jax.effects.gravity import Gravity
+from rotflex_jax.effects.inertia import Inertia
+from rotflex_jax.effects.kinds import (
+    Actuation,
+    DryFriction,
+    Effect,
+    Force,
+    Linear,
+    Memory,
+    Probe,
+    Scale,
+    Sensing,
+    Stamp,
+)
+from rotflex_jax.effects.motor import Motor
+from rotflex_jax.effects.quadratic_drag import QuadraticDrag
+from rotflex_jax.effects.quadratic_spring import QuadraticSpring
+from rotflex_jax.effects.saturation import Saturation
+from rotflex_jax.effects.sensor_bias import SensorBias
+from rotflex_jax.effects.sensor_gain import SensorGain
+from rotflex_jax.effects.spring import Spring
+from rotflex_jax.effects.stribeck import Stribeck
+from rotflex_jax.effects.viscous import Viscous
+from rotflex_jax.effects.voltage_offset import VoltageOffset
+
+__all__ = [
+    # kinds, from which an effect of your own derives
+    "Effect",
+    "Linear",
+    "Force",
+    "DryFriction",
+    "Memory",
+    "Actuation",
+    "Sensing",
+    "Stamp",
+    "Scale",
+    "Probe",
+    # catalogue
+    "CATALOG",
+    "register",
+    "candidates",
+    # linear
+    "Inertia",
+    "Spring",
+    "Viscous",
+    "Motor",
+    # dry friction
+    "Coulomb",
+    "CoulombAsymmetric",
+    "Stribeck",
+    # force
+    "QuadraticDrag",
+    "CubicSpring",
+    "QuadraticSpring",
+    "Gravity",
+    # with memory
+    "Dahl",
+    # actuation
+    "DeadZone",
+    "Saturation",
+    "VoltageOffset",
+    # sensing
+    "SensorBias",
+    "SensorGain",
+]

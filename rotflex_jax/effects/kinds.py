@@ -1,0 +1,234 @@
+"""The six kinds of effect. A new effect is a frozen dataclass that derives from one of them.
+
+Sign: a law returns the torque that acts *on* the port in its positive direction, except a friction
+`limit`, which is the (non-negative) level of the torque that opposes sliding.
+"""
+
+import dataclasses
+import math
+import numbers
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple, Self
+
+import jax
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.parameters import Specification, specifications
+
+Scalar = jax.Array | float
+Probe = Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """How large the signals of a recording are, so that an effect can propose shapes worth trying.
+
+    Attributes:
+        voltage: Largest |u| [V].
+        speed: Root mean square speed of the port [rad/s].
+        position: Largest |position| of the port about its mean [rad].
+        torque: Root mean square torque the motor can be seen to give [N m].
+    """
+
+    voltage: float
+    speed: float
+    position: float
+    torque: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect:
+    """One physical mechanism at one port.
+
+    Attributes:
+        at: Port it acts at; `input` for actuation, a channel's name for sensing.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    equation: ClassVar[str]
+    ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
+    # Parameters that are amplitudes: at zero (all of them) the effect is absent.
+    amplitudes: ClassVar[tuple[str, ...]] = ()
+    # Simpler effects that this one contains at special values of its parameters.
+    contains: ClassVar[tuple[str, ...]] = ()
+    # Ports a search tries it at when not told otherwise; none for what a model has from the start.
+    searched: ClassVar[tuple[str, ...]] = ()
+
+    at: str
+
+    def __post_init__(self) -> None:
+        kind = type(self).__name__
+        if not isinstance(self.at, str):
+            raise InputError(
+                f"{kind} was given at={self.at!r}, but it needs the name of a port as its first "
+                "argument; give parameters by name."
+            )
+        for name, spec in specifications(type(self)).items():
+            value = getattr(self, name)
+            if value is None and getattr(type(self), name) is None:
+                continue  # an optional part that the instance lacks
+            if value is None or isinstance(value, str):
+                raise InputError(
+                    f"{kind} was given {name}={value!r}, but it needs a number"
+                    f"{f' in {spec.unit}' if spec.unit else ''}; give one."
+                )
+            if isinstance(value, jax.Array) or not isinstance(value, numbers.Real):
+                continue  # traced or symbolic: checked where the number was given
+            number = float(value)
+            if not math.isfinite(number) or not spec.lower <= number <= spec.upper:
+                raise InputError(
+                    f"{kind} was given {name}={value!r} {spec.unit}, but it needs a "
+                    f"finite value between {spec.lower:g} and {spec.upper:g}; correct the value."
+                )
+
+    @classmethod
+    def declared(cls) -> dict[str, Specification]:
+        """Parameters of this class, by name."""
+        return specifications(cls)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values [declared units], by name."""
+        return {name: getattr(self, name) for name in specifications(self)}
+
+    def replace(self, **values: Any) -> Self:
+        """The same effect with other parameter values."""
+        return dataclasses.replace(self, **values)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Parameter sets at which a score test tries the effect.
+
+        Returns:
+            Alternatives (different shapes); each a list of parameter sets that are tried together,
+            one direction of the test per set.
+        """
+        raise NotImplementedError
+
+    def sentence(self) -> str:
+        """What was found, in words with numbers, for a person."""
+        numbers = ", ".join(
+            f"{n} {v:.4g} {specifications(self)[n].unit}".rstrip() for n, v in self.values.items()
+        )
+        return f"{self.title} at the {self.at} ({numbers})"
+
+    @classmethod
+    def describe(cls) -> dict[str, Any]:
+        """Plain description for tables: name, kind, ports, equation, parameters."""
+        return {
+            "name": cls.name,
+            "class": cls.__name__,
+            "kind": cls.kind(),
+            "title": cls.title,
+            "equation": cls.equation,
+            "ports": list(cls.ports),
+            "parameters": {
+                n: {"unit": s.unit, "typical": s.typical, "meaning": s.meaning}
+                for n, s in cls.declared().items()
+            },
+        }
+
+    @classmethod
+    def kind(cls) -> str:
+        """Name of the kind, for instance 'dry friction'."""
+        return next(label for base, label in KIND_LABELS.items() if issubclass(cls, base))
+
+
+class Stamp(NamedTuple):
+    """What a linear effect writes into the equations of motion at its port `p`.
+
+    `M += inertia p p'`, `D += damping p p'`, `K += stiffness p p'`, torque `drive voltage` at `p`.
+    A linear effect with states `z` of its own adds `z' = own z + from_speed p.dq + from_voltage v`
+    (lists of length m, `own` m by m) and the torque `torque . z` at `p`.
+    """
+
+    inertia: Scalar = 0.0
+    damping: Scalar = 0.0
+    stiffness: Scalar = 0.0
+    drive: Scalar = 0.0
+    own: tuple[tuple[Scalar, ...], ...] = ()
+    from_speed: tuple[Scalar, ...] = ()
+    from_voltage: tuple[Scalar, ...] = ()
+    torque: tuple[Scalar, ...] = ()
+
+
+class Linear(Effect):
+    """Enters the linear part, which the step integrates exactly."""
+
+    def stamp(self) -> Stamp:
+        """Entries of the equations of motion."""
+        raise NotImplementedError
+
+    @property
+    def order(self) -> int:
+        """Number of states of its own."""
+        return 0
+
+
+class Force(Effect):
+    """A smooth (or at least continuous) torque law at a port."""
+
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        raise NotImplementedError
+
+
+class DryFriction(Effect):
+    """Set-valued friction: any torque within the level holds the port, sliding meets the level."""
+
+    # True where the level is the same at every speed and position: a step need not iterate on it.
+    steady: ClassVar[bool] = False
+
+    def limit(self, position: Scalar, speed: Scalar, direction: float) -> Scalar:
+        """Level [N m] >= 0 that opposes motion in `direction` (+1 or -1) at |speed| [rad/s]."""
+        raise NotImplementedError
+
+
+class Memory(Effect):
+    """A torque law with one state of its own, `dz/dt = flow`."""
+
+    def initial(self) -> float:
+        """State at rest."""
+        return 0.0
+
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Time derivative of the state [1/s]."""
+        raise NotImplementedError
+
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Actuation(Effect):
+    """Voltage to voltage, between the recorded command and the motor."""
+
+    ports: ClassVar[tuple[str, ...]] = ("input",)
+    # Several are applied in this order: what sits nearer to the command comes first.
+    stage: ClassVar[int] = 0
+
+    at: str = "input"
+
+    def drive(self, voltage: jax.Array, Ts: float) -> jax.Array:
+        """The whole sequence (N,) [V] that reaches the motor."""
+        raise NotImplementedError
+
+
+class Sensing(Effect):
+    """Output to output: what the sensor of one channel makes of the true value."""
+
+    def measure(self, value: Scalar) -> Scalar:
+        """Reading [unit of the channel] for a true value."""
+        raise NotImplementedError
+
+
+KIND_LABELS: dict[type, str] = {
+    Linear: "linear",
+    Force: "force",
+    DryFriction: "dry friction",
+    Memory: "with memory",
+    Actuation: "actuation",
+    Sensing: "sensing",
+}

@@ -1,0 +1,43 @@
+"""The one error a user meets on bad input, and the import of what is optional."""
+
+import importlib
+from types import ModuleType
+
+
+class InputError(ValueError):
+    """Bad input, told in one sentence: what was given, what is needed, what to do.
+
+    >>> raise InputError("Argument `Ts` must be positive [s], but is 0.")
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: Argument `Ts` must be positive [s], but is 0.
+    """
+
+
+def optional(module: str, purpose: str) -> ModuleType:
+    """Imports an optional package only when it is needed.
+
+    Args:
+        module: name of the module.
+        purpose: what the user wanted, to begin the sentence of the error.
+
+    Returns:
+        The imported module.
+
+    Raises:
+        InputError: the package is not installed.
+
+    >>> optional("no_such_package", "Reading a stone tablet")
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: Reading a stone tablet needs the package no_such_package, \
+which is not installed; install it with `pip install "rotflex_jax[io]"`.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        raise InputError(
+            f"{purpose} needs the package {package}, which is not installed; "
+            'install it with `pip install "rotflex_jax[io]"`.'
+        ) from error

@@ -1,0 +1,26 @@
+"""Ready-made mechanisms: the paper's joint, the maker's with its springs, a single inertia."""
+
+from rotflex_jax.joints.rotary_flexible import (
+    arm_inertia,
+    flexible_joint,
+    hub_inertia,
+    paper,
+    quanser_2002,
+    quanser_2010,
+)
+from rotflex_jax.joints.single_inertia import single_inertia
+from rotflex_jax.joints.springs import SPRINGS, SpringType, spring_settings, spring_stiffness
+
+__all__ = [
+    "paper",
+    "quanser_2002",
+    "quanser_2010",
+    "flexible_joint",
+    "single_inertia",
+    "arm_inertia",
+    "hub_inertia",
+    "spring_stiffness",
+    "spring_settings",
+    "SPRINGS",
+    "SpringType",
+]

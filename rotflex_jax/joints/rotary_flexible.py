@@ -1,0 +1,240 @@
+"""Rotary flexible joints: a servo turns a hub, springs carry the arm on it.
+
+Coordinates are the hub angle `theta` and the deflection `alpha` of the arm relative to the hub, so
+the arm itself turns with `theta + alpha`; a positive voltage turns the hub forwards and leaves the
+arm behind (first deflection negative).
+"""
+
+import math
+
+from rotflex_jax.effects import Inertia, Motor, Spring, Viscous
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints.springs import INCH, spring_stiffness
+from rotflex_jax.mechanism import Mechanism
+
+PORTS = {"hub": (1.0, 0.0), "joint": (0.0, 1.0), "arm": (1.0, 1.0)}
+
+# SRV02 in high gear: oz in/A and V/kRPM converted, efficiency of the motor times the gearbox's.
+_TORQUE_CONSTANT = 1.088 * 0.2780139 * INCH
+_BACK_EMF = 0.804e-3 * 60 / (2 * math.pi)
+_EFFICIENCY = 0.69 * 0.90
+_GEAR_RATIO = 70.0
+
+
+def flexible_joint(
+    *,
+    hub_inertia: float,
+    arm_inertia: float,
+    stiffness: float,
+    motor: Motor,
+    hub_damping: float = 0.0,
+    joint_damping: float = 0.0,
+) -> Mechanism:
+    """A rotary flexible joint of any make: motor at the hub, spring between hub and arm.
+
+        hub_inertia theta'' + arm_inertia (theta'' + alpha'') = motor - hub_damping theta'
+        arm_inertia (theta'' + alpha'') = -stiffness alpha - joint_damping alpha'
+
+    Angles and voltage alone tell torques only up to a common factor, so the arm's inertia is
+    trusted, and of the motor everything but its torque constant. Free are hub inertia, stiffness,
+    torque constant and both dampers.
+
+    Args:
+        hub_inertia: With motor and gears, as the hub feels it [kg m^2].
+        arm_inertia: [kg m^2].
+        stiffness: Of the joint [N m/rad].
+        motor: Motor with its gear.
+        hub_damping: Viscous damping beside the motor's own [N m s/rad].
+        joint_damping: Viscous damping of the deflection [N m s/rad].
+
+    Returns:
+        Mechanism with the outputs `theta` and `alpha`.
+
+    Source: Lagrange's equations; Quanser, Rotary Flexible Joint workbook, 2011.
+    """
+    held = [name for name in motor.values if name != "torque_constant"]
+    return Mechanism(
+        coordinates=("theta", "alpha"),
+        ports=PORTS,
+        effects=(
+            Inertia(at="hub", inertia=hub_inertia),
+            Inertia(at="arm", inertia=arm_inertia),
+            Spring(at="joint", stiffness=stiffness),
+            motor,
+            Viscous(at="hub", coefficient=hub_damping),
+            Viscous(at="joint", coefficient=joint_damping),
+        ),
+        outputs={"theta": "hub", "alpha": "joint"},
+        trusted=("arm.inertia.inertia", *(f"{motor.at}.motor.{name}" for name in held)),
+    )
+
+
+def paper(
+    *,
+    hub_inertia: float = 0.0021,
+    arm_inertia: float = 0.0059,
+    stiffness: float = 1.61,
+    torque_constant: float = 0.00767,
+    back_emf: float = 0.00767,
+    resistance: float = 2.6,
+    gear_ratio: float = 70.0,
+    efficiency: float = 1.0,
+    inductance: float | None = None,
+    hub_damping: float = 0.0,
+    joint_damping: float = 0.0,
+) -> Mechanism:
+    """The joint of the paper "Nonlinear Identification of a Rotary Flexible Joint Experiment".
+
+    No loss in the gear and no damping but the motor's own. Not for a module of the maker's later
+    series, whose arm is lighter and whose gear loses more than a third: `quanser_2010`.
+
+    Args:
+        hub_inertia: [kg m^2].
+        arm_inertia: [kg m^2].
+        stiffness: [N m/rad].
+        torque_constant: [N m/A].
+        back_emf: [V s/rad].
+        resistance: [ohm].
+        gear_ratio: Turns of the motor per turn of the hub.
+        efficiency: Of motor and gear.
+        inductance: [H]; the maker says 0.18 mH. None for a current that follows at once.
+        hub_damping: [N m s/rad].
+        joint_damping: [N m s/rad].
+
+    Returns:
+        Mechanism with the outputs `theta` and `alpha`.
+
+    Source: That paper's table of parameters; its stiffness is in N m/rad, not N/m as printed.
+
+    >>> joint = paper(inductance=0.18e-3)
+    >>> joint.channels
+    ('theta', 'alpha')
+    """
+    return flexible_joint(
+        hub_inertia=hub_inertia,
+        arm_inertia=arm_inertia,
+        stiffness=stiffness,
+        motor=Motor(
+            at="hub",
+            torque_constant=torque_constant,
+            back_emf=back_emf,
+            resistance=resistance,
+            gear_ratio=gear_ratio,
+            efficiency=efficiency,
+            inductance=inductance,
+        ),
+        hub_damping=hub_damping,
+        joint_damping=joint_damping,
+    )
+
+
+def quanser_2002(
+    arm: int = 2,
+    *,
+    spring: int = 2,
+    hub_anchor: str = "B",
+    arm_anchor: int = 2,
+    inductance: float | None = None,
+) -> Mechanism:
+    """The maker's joint on an SRV02 servo, by the files of 2002.
+
+    They take the springs' preload for their whole force, and little damping at the hub.
+
+    Args:
+        arm: Where the short arm sits on the main arm: 1, 2 or 3 outwards, 0 for none.
+        spring: 1, 2 or 3.
+        hub_anchor: "A", "B" or "C".
+        arm_anchor: 1, 2 or 3.
+        inductance: [H] or None.
+
+    Returns:
+        Mechanism with the outputs `theta` and `alpha`.
+
+    Source: Quanser, config_servo_exp.m and config_flexjoint.m, 2002.
+    """
+    stiffness = spring_stiffness(spring, hub_anchor, arm_anchor, preload_only=True)
+    return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance)
+
+
+def quanser_2010(
+    arm: int = 2,
+    *,
+    spring: int = 2,
+    hub_anchor: str = "B",
+    arm_anchor: int = 2,
+    inductance: float | None = None,
+) -> Mechanism:
+    """The maker's joint on an SRV02 servo, by the files of 2010.
+
+    Args:
+        arm: Where the short arm sits on the main arm: 1, 2 or 3 outwards, 0 for none.
+        spring: 1, 2 or 3.
+        hub_anchor: "A", "B" or "C".
+        arm_anchor: 1, 2 or 3.
+        inductance: [H] or None.
+
+    Returns:
+        Mechanism with the outputs `theta` and `alpha`.
+
+    Source: Quanser, config_srv02.m and config_rotflex.m, 2010.
+    """
+    stiffness = spring_stiffness(spring, hub_anchor, arm_anchor)
+    return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance)
+
+
+def arm_inertia(arm: int = 2) -> float:
+    """Moment of inertia [kg m^2] of the maker's arm about the joint.
+
+    A main arm of 64 g and 11.75 in, alone (0) or with a short arm of 30 g and 6 in whose middle
+    sits 9, 10 or 11 in from the axis (1, 2, 3).
+
+    Source: Quanser, config_rotflex.m, 2010.
+
+    >>> round(arm_inertia(2), 7)
+    0.0038938
+    """
+    centres = {0: None, 1: 9 * INCH, 2: 10 * INCH, 3: 11 * INCH}
+    if arm not in centres:
+        raise InputError(
+            f"arm was given {arm!r}, but the short arm sits at 1, 2 or 3, or is left off (0); "
+            "choose one of these."
+        )
+    main = 0.064 * (11.75 * INCH) ** 2 / 3
+    centre = centres[arm]
+    return main if centre is None else main + 0.030 * ((6 * INCH) ** 2 / 12 + centre**2)
+
+
+def hub_inertia(tachometer: bool = True) -> float:
+    """Moment of inertia [kg m^2] of the maker's servo and the joint's body, seen at the load shaft.
+
+    Source: Quanser, config_servo_exp.m, 2002, and config_srv02.m, 2010, in high gear.
+
+    >>> round(hub_inertia(), 8)
+    0.00258418
+    """
+    disc = lambda mass, diameter: mass * (diameter / 2 * INCH) ** 2 / 2  # noqa: E731
+    gears = disc(0.005, 0.5) + 2 * disc(0.030, 1.5) + disc(0.083, 2.5)
+    # Rotor and tachometer, oz in s^2 converted.
+    motor = (5.523e-5 + (1e-5 if tachometer else 0.0)) * 0.2780139 * INCH
+    body = 0.0005
+    return gears + _GEAR_RATIO**2 * 0.90 * motor + body
+
+
+def _srv02(
+    arm: int, stiffness: float, *, hub_damping: float, inductance: float | None
+) -> Mechanism:
+    return flexible_joint(
+        hub_inertia=hub_inertia(),
+        arm_inertia=arm_inertia(arm),
+        stiffness=stiffness,
+        motor=Motor(
+            at="hub",
+            torque_constant=_TORQUE_CONSTANT,
+            back_emf=_BACK_EMF,
+            resistance=2.6,
+            gear_ratio=_GEAR_RATIO,
+            efficiency=_EFFICIENCY,
+            inductance=inductance,
+        ),
+        hub_damping=hub_damping,
+    )

@@ -1,0 +1,241 @@
+"""From effects to the constants of one step: equations of motion, matrix exponential, port mobilities.
+
+Everything here is formed once per set of parameters, outside the scan, and is differentiable.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rotflex_jax.effects.kinds import (
+    Actuation,
+    DryFriction,
+    Effect,
+    Force,
+    Linear,
+    Memory,
+    Scalar,
+    Sensing,
+    Stamp,
+)
+from rotflex_jax.mechanism.mechanism import Mechanism
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where things sit, known from the structure alone.
+
+    The state is `x = [q, dq, linear states, memory states]`; the first `linear` entries take part in
+    the matrix exponential. Of the ports that carry torques, the first `contacts` have dry friction.
+    """
+
+    n: int
+    linear: int
+    size: int
+    torque_ports: tuple[str, ...]
+    port_matrix: tuple[tuple[float, ...], ...]
+    contacts: int
+    output_rows: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    @functools.cache
+    def of(cls, structure: Mechanism) -> "Layout":
+        """Layout of a structure."""
+        n = len(structure.coordinates)
+        states = sum(e.order for e in structure.effects if isinstance(e, Linear))
+        memory = sum(isinstance(e, Memory) for e in structure.effects)
+        rough = [e for e in structure.effects if isinstance(e, (Force, Memory, DryFriction))]
+        used = {e.at for e in rough}
+        dry = {e.at for e in rough if isinstance(e, DryFriction)}
+        names = tuple(p for p in structure.port_vectors if p in dry)
+        names += tuple(p for p in structure.port_vectors if p in used - dry)
+        rows = []
+        for _, (port, what) in structure.outputs:
+            vector = structure.port_vectors[port]
+            zeros = (0.0,) * n
+            rows.append(vector + zeros if what == "position" else zeros + vector)
+        return cls(
+            n=n,
+            linear=2 * n + states,
+            size=2 * n + states + memory,
+            torque_ports=names,
+            port_matrix=tuple(structure.port_vectors[p] for p in names),
+            contacts=len(dry),
+            output_rows=tuple(rows),
+        )
+
+
+def effects_of(mechanism: Mechanism, kind: type[Effect]) -> list[tuple[int, Effect]]:
+    """Effects of one kind with their places in `mechanism.effects`."""
+    return [(i, e) for i, e in enumerate(mechanism.effects) if isinstance(e, kind)]
+
+
+class Equations(NamedTuple):
+    """Linear part `x' = A x + B v + sum_ports b_p tau_p` and the inverse mass matrix."""
+
+    A: jax.Array
+    B: jax.Array
+    ports: jax.Array
+    inverse_mass: jax.Array
+
+
+def equations(mechanism: Mechanism, gates: jax.Array) -> Equations:
+    """Equations of motion of the linear effects, each multiplied by its gate.
+
+    Args:
+        mechanism: Numbers may be traced.
+        gates: One factor per effect; one where it is on, zero where it is off.
+    """
+    layout = Layout.of(mechanism.structure)
+    n, size, dtype = layout.n, layout.linear, gates.dtype
+    M, D, K = (jnp.zeros((n, n), dtype) for _ in range(3))
+    drive = jnp.zeros(n, dtype)
+    extra: list[tuple[Stamp, np.ndarray, jax.Array]] = []
+    for i, effect in effects_of(mechanism, Linear):
+        p = np.array(mechanism.port_vectors[effect.at])
+        outer = jnp.asarray(np.outer(p, p), dtype)
+        stamp, gate = effect.stamp(), gates[i]
+        M = M + gate * stamp.inertia * outer
+        D = D + gate * stamp.damping * outer
+        K = K + gate * stamp.stiffness * outer
+        drive = drive + gate * stamp.drive * jnp.asarray(p, dtype)
+        if effect.order:
+            extra.append((stamp, p, gate))
+    Minv = jnp.linalg.inv(M)
+    A = jnp.zeros((size, size), dtype).at[:n, n : 2 * n].set(jnp.eye(n, dtype=dtype))
+    A = A.at[n : 2 * n, :n].set(-Minv @ K).at[n : 2 * n, n : 2 * n].set(-Minv @ D)
+    B = jnp.zeros(size, dtype).at[n : 2 * n].set(Minv @ drive)
+    at = 2 * n
+    for stamp, p, gate in extra:
+        m, vector = len(stamp.own), jnp.asarray(p, dtype)
+        own = jnp.stack([jnp.stack([_scalar(c, dtype) for c in row]) for row in stamp.own])
+        speed = jnp.stack([_scalar(c, dtype) for c in stamp.from_speed])
+        torque = jnp.stack([_scalar(c, dtype) for c in stamp.torque])
+        A = A.at[at : at + m, at : at + m].set(own)
+        A = A.at[at : at + m, n : 2 * n].set(speed[:, None] * vector[None, :])
+        A = A.at[n : 2 * n, at : at + m].set(gate * (Minv @ vector)[:, None] * torque[None, :])
+        B = B.at[at : at + m].set(jnp.stack([_scalar(c, dtype) for c in stamp.from_voltage]))
+        at += m
+    P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), n)
+    ports = jnp.zeros((size, len(P)), dtype).at[n : 2 * n].set(Minv @ jnp.asarray(P.T, dtype))
+    return Equations(A, B, ports, Minv)
+
+
+def _scalar(value: Scalar, dtype: jnp.dtype) -> jax.Array:
+    return jnp.asarray(value, dtype)
+
+
+class Constants(NamedTuple):
+    """What the exponential step needs, formed once per parameter set.
+
+    With `phi_k` the exponential-integrator functions of `A h`: `E = exp(A h)`, `input = h phi_1 B`,
+    `hold = h phi_1 b_p` (answer to a constant port torque), `ramp = h phi_2 b_p`, `rise = h phi_3 b_p`;
+    `half_*` the same for `h / 2`. `stop[i, j]` is the speed that a unit torque at port j, held for one
+    step, gives port i; `mobility` the same for a unit impulse; `push` its coordinates.
+    """
+
+    values: jax.Array
+    gates: jax.Array
+    h: jax.Array
+    E: jax.Array
+    input: jax.Array
+    hold: jax.Array
+    ramp: jax.Array
+    rise: jax.Array
+    half_E: jax.Array
+    half_input: jax.Array
+    half_hold: jax.Array
+    stop: jax.Array
+    mobility: jax.Array
+    push: jax.Array
+
+
+def exponential_less_one(M: jax.Array) -> jax.Array:
+    """`exp(M) - 1` by scaling, a Taylor polynomial of degree 8, and squaring `X -> 2 X + X X`.
+
+    Squaring the difference from one keeps the digits of a small step that squaring `exp` would round
+    away. A fixed number of halvings (2^-14, good to a norm of a few thousand) has no branch, so it
+    compiles fast and differentiates plainly.
+    """
+    halvings, degree = 14, 8
+    small = M / 2.0**halvings
+    X = small / degree
+    for k in range(degree - 1, 0, -1):
+        X = (small + small @ X) / k
+    return jax.lax.fori_loop(0, halvings, lambda _, X: 2 * X + X @ X, X)
+
+
+def _phi(A: jax.Array, V: jax.Array, h: jax.Array, orders: int) -> list[jax.Array]:
+    """`exp(A h)` and `h phi_k(A h) V`, k = 1..orders, from one augmented matrix exponential."""
+    size, m = V.shape
+    total = size + orders * m
+    big = jnp.zeros((total, total), A.dtype).at[:size, :size].set(A * h)
+    big = big.at[:size, size : size + m].set(V * h)
+    for k in range(orders - 1):
+        rows = slice(size + k * m, size + (k + 1) * m)
+        columns = slice(size + (k + 1) * m, size + (k + 2) * m)
+        big = big.at[rows, columns].set(jnp.eye(m, dtype=A.dtype))
+    expo = exponential_less_one(big)
+    return [expo[:size, :size] + jnp.eye(size, dtype=A.dtype)] + [
+        expo[:size, size + k * m : size + (k + 1) * m] for k in range(orders)
+    ]
+
+
+def constants(mechanism: Mechanism, values: jax.Array, gates: jax.Array, h: jax.Array) -> Constants:
+    """Constants of a step of length `h` [s] for traced parameter values."""
+    layout = Layout.of(mechanism.structure)
+    eq = equations(mechanism.with_values(values), gates)
+    n = layout.n
+    V = jnp.concatenate([eq.B[:, None], eq.ports], axis=1)
+    E, one, two, three = _phi(eq.A, V, h, 3)
+    half_E, half = _phi(eq.A, V, h / 2, 1)
+    P = jnp.asarray(np.array(layout.port_matrix).reshape(len(layout.torque_ports), n), E.dtype)
+    push = eq.inverse_mass @ P.T
+    return Constants(
+        values=values,
+        gates=gates,
+        h=h,
+        E=E,
+        input=one[:, 0],
+        hold=one[:, 1:],
+        ramp=two[:, 1:],
+        rise=three[:, 1:],
+        half_E=half_E,
+        half_input=half[:, 0],
+        half_hold=half[:, 1:],
+        stop=P @ one[n : 2 * n, 1:],
+        mobility=P @ push,
+        push=push,
+    )
+
+
+def driven_voltage(mechanism: Mechanism, gates: jax.Array, u: jax.Array, Ts: float) -> jax.Array:
+    """Voltage (N,) that reaches the motor after all actuation effects, nearest to the command first."""
+    v = u
+    for i, effect in sorted(effects_of(mechanism, Actuation), key=lambda pair: pair[1].stage):
+        v = v + gates[i] * (effect.drive(v, Ts) - v)
+    return v
+
+
+def read_outputs(mechanism: Mechanism, gates: jax.Array, x: jax.Array) -> jax.Array:
+    """Sensor readings (C, ...) of states (n, ...)."""
+    layout = Layout.of(mechanism.structure)
+    C = jnp.asarray(np.array(layout.output_rows), x.dtype)
+    C = C.reshape(C.shape + (1,) * (x.ndim - 1))
+    y = jnp.sum(C * x[None, : 2 * layout.n], axis=1)
+    for i, effect in effects_of(mechanism, Sensing):
+        c = mechanism.channels.index(effect.at)
+        read = y[c] + gates[i] * (effect.measure(y[c]) - y[c])
+        y = jnp.concatenate([y[:c], read[None], y[c + 1 :]])
+    return y
+
+
+def rest_state(structure: Mechanism, dtype: np.dtype) -> np.ndarray:
+    """State at rest: zero motion, memories at their initial value."""
+    layout = Layout.of(structure)
+    memory = [e.initial() for _, e in effects_of(structure, Memory)]
+    return np.array([0.0] * layout.linear + memory, dtype=dtype)

@@ -1,0 +1,96 @@
+"""The state that a recording's first samples tell, by a short least-squares fit through the simulator."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rotflex_jax.mechanism.assembly import Layout, rest_state
+from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.simulate import Solver, free_run
+from rotflex_jax.precision import double_precision
+
+
+def rough_state(structure: Mechanism, y: np.ndarray, Ts: float) -> np.ndarray:
+    """Positions and speeds from a straight line through the samples; zero where nothing is measured."""
+    layout = Layout.of(structure)
+    t = np.arange(len(y)) * Ts
+    slope, start = np.polyfit(t, y, 1) if len(y) > 1 else (0 * y[0], y[0])
+    rows = np.array(layout.output_rows)
+    n, is_position = layout.n, np.any(np.array(layout.output_rows)[:, : layout.n] != 0, axis=1)
+    q = np.linalg.pinv(rows[is_position, :n]) @ start[is_position]
+    dq = np.linalg.pinv(rows[is_position, :n]) @ slope[is_position]
+    if not is_position.all():
+        dq = np.linalg.pinv(rows[~is_position, n:]) @ start[~is_position]
+    return np.concatenate([q, dq])
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _refine(structure, solver, values, gates, guess, u, y, scale, Ts):  # noqa: ANN001, ANN202
+    """Damped Gauss-Newton on all stretches at once.
+
+    Slopes are secants: stretches are short, and the derivative of the simulation would take longer to
+    compile than all the runs take.
+    """
+    W, m = guess.shape
+    rest = jnp.asarray(rest_state(structure, np.float64))[m:]
+    reach = 1e-6 * jnp.maximum(jnp.max(jnp.abs(guess)), 1.0)
+    nudges = jnp.concatenate([jnp.zeros((1, m)), reach * jnp.eye(m)])
+    run = functools.partial(free_run, structure, solver)
+    runs = jax.vmap(run, in_axes=(None, None, 0, 0, None))
+
+    def errors(states):  # noqa: ANN001, ANN202 - (W, V, m) -> (W, V, samples * C)
+        V = states.shape[1]
+        flat = states.reshape(W * V, m)
+        start = jnp.concatenate([flat, jnp.broadcast_to(rest, (W * V, len(rest)))], axis=1)
+        y_hat = runs(values, gates, start, jnp.repeat(u, V, axis=0), Ts)[1]
+        e = (y_hat.reshape(W, V, *y.shape[1:]) - y[:, None]) / scale[None, None, None]
+        return e.reshape(W, V, -1)
+
+    def iterate(_, state):  # noqa: ANN001, ANN202
+        s, damping, previous, kept = state
+        e = errors(s[:, None] + nudges[None])
+        r, J = e[:, 0], (e[:, 1:] - e[:, :1]) / reach
+        cost = jnp.sum(r**2, axis=1)
+        better = cost <= previous
+        damping = jnp.where(better, damping / 10, damping * 100)
+        kept = jnp.where(better[:, None], s, kept)
+        H = jnp.einsum("wik,wjk->wij", J, J)
+        # A trace of damping also decides what a stretch cannot tell: such directions stay put.
+        D = jnp.diagonal(H, axis1=1, axis2=2) * damping[:, None] + 1e-9 * jnp.max(H)
+        step = jnp.linalg.solve(H + D[:, :, None] * jnp.eye(m)[None], -jnp.einsum("wik,wk->wi", J, r)[..., None])
+        moved = jnp.where(better[:, None], s + step[..., 0], (s + kept) / 2)
+        return moved, damping, jnp.minimum(cost, previous), kept
+
+    start = (guess, jnp.full(W, 1e-2), jnp.full(W, jnp.inf), guess)
+    return jax.lax.fori_loop(0, 8, iterate, start)[3]
+
+
+def initial_states(
+    mechanism: Mechanism,
+    solver: Solver,
+    gates: np.ndarray,
+    u: np.ndarray,
+    y: np.ndarray,
+    Ts: float,
+) -> np.ndarray:
+    """First positions and speeds (W, 2 n) of W stretches of a recording.
+
+    Memories and motor current start at rest.
+
+    Args:
+        mechanism: Model.
+        solver: Integration rule.
+        gates: One factor per effect.
+        u: Voltage (W, m) [V].
+        y: Measured outputs (W, m, C).
+        Ts: Sampling period [s].
+    """
+    structure = mechanism.structure
+    guess = np.array([rough_state(structure, stretch, Ts) for stretch in y])
+    spread = np.std(y.reshape(-1, y.shape[-1]), axis=0)
+    scale = np.where(spread > 0, spread, 1.0)
+    with double_precision():
+        arrays = map(jnp.asarray, (mechanism.values, gates, guess, u, y, scale, np.float64(Ts)))
+        return np.asarray(_refine(structure, solver, *arrays))

@@ -1,0 +1,114 @@
+"""The linear part of a mechanism as state space, and the Kalman gain that goes with it."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+from rotflex_jax.mechanism.assembly import Equations, Layout, equations
+from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.precision import double_precision
+
+
+class StateSpace(NamedTuple):
+    """`x' = A x + B u, y = C x`; the state is positions, speeds, then linear states of effects."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+
+    def discretise(self, Ts: float) -> tuple[np.ndarray, np.ndarray]:
+        """`(Ad, Bd)` for an input held over `Ts` [s]; exact."""
+        n = len(self.A)
+        big = np.zeros((n + 1, n + 1))
+        big[:n, :n], big[:n, n] = self.A, self.B
+        big = scipy.linalg.expm(big * Ts)
+        return big[:n, :n], big[:n, n]
+
+
+_equations = jax.jit(
+    lambda structure, values, gates: equations(structure.with_values(values), gates),
+    static_argnums=0,
+)
+
+
+def _linear_part(mechanism: Mechanism) -> Equations:
+    with double_precision():
+        gates = jnp.ones(len(mechanism.effects))
+        eq = _equations(mechanism.structure, jnp.asarray(mechanism.values), gates)
+        return Equations(*map(np.asarray, eq))
+
+
+def linearise(mechanism: Mechanism) -> StateSpace:
+    """State space of the linear effects (inertias, springs, dampers, motor); the others are left out.
+
+    A friction or a dead zone has no slope at rest, so the linear model of a joint is the one without.
+    """
+    layout = Layout.of(mechanism.structure)
+    eq = _linear_part(mechanism)
+    C = np.zeros((len(mechanism.channels), layout.linear))
+    C[:, : 2 * layout.n] = layout.output_rows
+    return StateSpace(eq.A, eq.B, C)
+
+
+def kalman_gains(
+    mechanism: Mechanism,
+    intensities: Sequence[Mapping[str, float]],
+    noise: np.ndarray,
+    Ts: float,
+) -> np.ndarray:
+    """Steady gains K (Q, n, C) of the linear part under white process torques at some ports.
+
+        x+ = Ad (x + K e) + Bd u,   K = P C' (C P C' + R)^-1,   P from the discrete Riccati equation
+
+    The Riccati equations of all intensities are solved together by doubling (Chu, Fan, Lin and Wang,
+    Int. J. Control 77, 2004), each step of which doubles the horizon.
+
+    Args:
+        mechanism: Its linear part is used.
+        intensities: Port -> intensity of the white torque [(N m)^2 s]; all zero gives a zero gain.
+        noise: Standard deviation of the sensor noise per channel.
+        Ts: Sampling period [s].
+
+    Returns:
+        Gains with zero rows for memories.
+    """
+    layout, ss = Layout.of(mechanism.structure), linearise(mechanism)
+    n, size = layout.n, layout.linear
+    Minv = np.asarray(_linear_part(mechanism).inverse_mass)
+    covariance = {port: _built_up(ss.A, Minv @ np.array(vector), n, Ts) for port, vector in mechanism.ports}
+    Ad, _ = ss.discretise(Ts)
+    Q = np.array([sum((q * covariance[p] for p, q in i.items()), np.zeros((size, size))) for i in intensities])
+    R = np.diag(np.square(noise))
+    A = np.broadcast_to(Ad.T, Q.shape)
+    G = np.broadcast_to(ss.C.T @ np.linalg.inv(R) @ ss.C, Q.shape)
+    P, eye = Q, np.eye(size)
+    for _ in range(60):
+        W = np.linalg.inv(eye + G @ P)
+        At = np.swapaxes(A, 1, 2)
+        grown = P + At @ P @ W @ A
+        A, G = A @ W @ A, G + A @ W @ G @ At
+        grown = (grown + np.swapaxes(grown, 1, 2)) / 2
+        done = np.max(np.abs(grown - P)) <= 1e-12 * np.max(np.abs(grown))
+        P = grown
+        if done:
+            break
+    gains = np.zeros((len(Q), layout.size, len(ss.C)))
+    S = ss.C @ P @ ss.C.T + R
+    gains[:, :size] = np.swapaxes(np.linalg.solve(S, ss.C @ P), 1, 2)
+    return gains
+
+
+def _built_up(A: np.ndarray, push: np.ndarray, n: int, Ts: float) -> np.ndarray:
+    """Covariance that a white torque of unit intensity builds up over one sample (Van Loan, 1978)."""
+    size = len(A)
+    g = np.zeros(size)
+    g[n : 2 * n] = push
+    big = np.zeros((2 * size, 2 * size))
+    big[:size, :size], big[:size, size:], big[size:, size:] = -A, np.outer(g, g), A.T
+    big = scipy.linalg.expm(big * Ts)
+    Q = big[size:, size:].T @ big[:size, size:]
+    return (Q + Q.T) / 2

@@ -1,0 +1,231 @@
+"""A mechanism: coordinates, named ports, effects at the ports, and what the sensors see."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Self
+
+import jax
+import numpy as np
+
+from rotflex_jax.effects.kinds import Actuation, Effect, Sensing
+from rotflex_jax.errors import InputError
+from rotflex_jax.parameters import Specification, specifications
+
+Pairs = tuple[tuple[str, Any], ...]
+
+
+class _Slot:
+    """Stands for a number whose value is given elsewhere."""
+
+    def __repr__(self) -> str:
+        return "·"
+
+
+_SLOT = _Slot()
+
+
+@jax.tree_util.register_pytree_node_class
+@dataclasses.dataclass(frozen=True)
+class Mechanism:
+    """Coordinates `q`, ports `p` (position p.q, speed p.dq, torque tau acts as p tau), effects, outputs.
+
+        M ddq + D dq + K q = sum over ports of p tau,   y = outputs of (q, dq)
+
+    Args:
+        coordinates: Names of the coordinates.
+        ports: Name -> vector, one entry per coordinate.
+        effects: Physical effects; inertias, springs, dampers and the motor among them.
+        outputs: Channel -> port (its position) or (port, "speed").
+        trusted: Full names `port.effect.parameter` of constants that fits hold.
+
+    Raises:
+        InputError: A port, output or trusted name that does not exist, or two equal effects at a port.
+
+    A mechanism is a pytree whose leaves are the parameter values, so it passes through `jax.jit` and
+    `jax.grad`; `mechanism + effect` is a new mechanism.
+    """
+
+    coordinates: tuple[str, ...]
+    ports: Any
+    effects: tuple[Effect, ...] = ()
+    outputs: Any = ()
+    trusted: Iterable[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - frozen class
+        ports = dict(self.ports)
+        put("coordinates", tuple(self.coordinates))
+        put("ports", tuple((k, tuple(float(c) for c in v)) for k, v in ports.items()))
+        put("effects", tuple(self.effects))
+        outputs = {k: v if isinstance(v, tuple) else (v, "position") for k, v in dict(self.outputs).items()}
+        put("outputs", tuple(outputs.items()))
+        put("trusted", frozenset(self.trusted))
+        self._check()
+
+    def _check(self) -> None:
+        ports, channels = self.port_vectors, self.channels
+        for name, vector in ports.items():
+            if len(vector) != len(self.coordinates):
+                raise InputError(
+                    f"Port {name!r} was given {len(vector)} entries, but the mechanism has the "
+                    f"{len(self.coordinates)} coordinates {self.coordinates}; give one entry for each."
+                )
+        for channel, (port, what) in self.outputs:
+            if port not in ports or what not in ("position", "speed"):
+                raise InputError(
+                    f"Output {channel!r} was given as {(port, what)}, but it needs one of the ports "
+                    f"{tuple(ports)} with 'position' or 'speed'; correct the output."
+                )
+        seen: set[tuple[str, str]] = set()
+        for effect in self.effects:
+            places = ("input",) if isinstance(effect, Actuation) else tuple(ports)
+            places = channels if isinstance(effect, Sensing) else places
+            if effect.at not in places:
+                raise InputError(
+                    f"{type(effect).__name__} was put at {effect.at!r}, but this mechanism has "
+                    f"{', '.join(map(repr, places))} for it; choose one of them."
+                )
+            if (effect.at, effect.name) in seen:
+                raise InputError(
+                    f"Two effects named {effect.name!r} were put at {effect.at!r}, but one is needed; "
+                    f"add up their parameters."
+                )
+            seen.add((effect.at, effect.name))
+        for name in sorted(self.trusted):
+            self._must_exist(name)
+
+    def _must_exist(self, name: str) -> None:
+        if name not in self.parameter_names:
+            raise InputError(
+                f"Parameter {name!r} was named, but this mechanism has {', '.join(self.parameter_names)}; "
+                f"use one of these names."
+            )
+
+    # -- structure ---------------------------------------------------------------------------------
+
+    @property
+    def port_vectors(self) -> dict[str, tuple[float, ...]]:
+        """Port name -> vector over the coordinates."""
+        return dict(self.ports)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the outputs, in order."""
+        return tuple(channel for channel, _ in self.outputs)
+
+    @property
+    def structure(self) -> Self:
+        """The mechanism without its numbers: hashable, equal for equal structure."""
+        empty = tuple(e.replace(**dict.fromkeys(e.values, _SLOT)) for e in self.effects)
+        return dataclasses.replace(self, effects=empty, trusted=frozenset())
+
+    def __add__(self, effect: Effect) -> Self:
+        """The mechanism with one more effect."""
+        if not isinstance(effect, Effect):
+            return NotImplemented
+        return dataclasses.replace(self, effects=(*self.effects, effect))
+
+    def without(self, name: str, at: str) -> Self:
+        """The mechanism without the effect `name` at port `at`."""
+        kept = tuple(e for e in self.effects if (e.name, e.at) != (name, at))
+        if len(kept) == len(self.effects):
+            present = ", ".join(f"{e.name} at {e.at}" for e in self.effects)
+            raise InputError(
+                f"{name!r} at {at!r} was to be removed, but the mechanism has {present}; name one."
+            )
+        gone = f"{at}.{name}."
+        trusted = frozenset(t for t in self.trusted if not t.startswith(gone))
+        return dataclasses.replace(self, effects=kept, trusted=trusted)
+
+    def effect(self, name: str, at: str) -> Effect:
+        """The effect `name` at port `at`."""
+        for e in self.effects:
+            if (e.name, e.at) == (name, at):
+                return e
+        raise InputError(f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first.")
+
+    # -- parameters --------------------------------------------------------------------------------
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Full names `port.effect.parameter`, in the order of `values`."""
+        return tuple(f"{e.at}.{e.name}.{p}" for e in self.effects for p in e.values)
+
+    @property
+    def parameter_specifications(self) -> tuple[Specification, ...]:
+        """Declared unit, bounds and size of each parameter, in the order of `values`."""
+        return tuple(s for e in self.effects for s in specifications(e).values())
+
+    @property
+    def values(self) -> np.ndarray:
+        """Parameter values [declared units], one vector."""
+        return np.array([v for e in self.effects for v in e.values.values()], dtype=float)
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Parameters that a fit moves: all but the trusted ones."""
+        return tuple(n for n in self.parameter_names if n not in self.trusted)
+
+    def with_values(self, values: Mapping[str, float] | Sequence[Any] | np.ndarray | jax.Array) -> Self:
+        """The same mechanism with other numbers, given by full name or as the whole vector."""
+        if isinstance(values, Mapping):
+            for name in values:
+                self._must_exist(name)
+            old = dict(zip(self.parameter_names, self.values, strict=True))
+            values = list((old | dict(values)).values())
+        if isinstance(values, np.ndarray):
+            values = values.tolist()
+        effects, start = [], 0
+        for e in self.effects:
+            names = tuple(e.values)
+            part = {n: values[start + i] for i, n in enumerate(names)}
+            effects.append(e.replace(**part))
+            start += len(names)
+        return dataclasses.replace(self, effects=tuple(effects))
+
+    def trust(self, *names: str) -> Self:
+        """Hold these parameters in fits."""
+        return dataclasses.replace(self, trusted=self.trusted | set(names))
+
+    def release(self, *names: str) -> Self:
+        """Let fits move these parameters."""
+        for name in names:
+            self._must_exist(name)
+        return dataclasses.replace(self, trusted=self.trusted - set(names))
+
+    # -- pytree ------------------------------------------------------------------------------------
+
+    def tree_flatten(self) -> tuple[list[Any], Any]:
+        """Leaves are the parameter values."""
+        return [v for e in self.effects for v in e.values.values()], (self.structure, self.trusted)
+
+    @classmethod
+    def tree_unflatten(cls, aux: Any, leaves: Sequence[Any]) -> "Mechanism":
+        """Rebuild from leaves (numbers or tracers)."""
+        structure, trusted = aux
+        effects, start = [], 0
+        for e in structure.effects:
+            part = {n: leaves[start + i] for i, n in enumerate(e.values)}
+            effects.append(e.replace(**part))
+            start += len(part)
+        rebuilt = object.__new__(cls)
+        for field, value in (
+            ("coordinates", structure.coordinates),
+            ("ports", structure.ports),
+            ("effects", tuple(effects)),
+            ("outputs", structure.outputs),
+            ("trusted", trusted),
+        ):
+            object.__setattr__(rebuilt, field, value)
+        return rebuilt
+
+    def __str__(self) -> str:
+        lines = [f"Mechanism of {', '.join(self.coordinates)}; outputs {', '.join(self.channels)}"]
+        for e in self.effects:
+            for name, value in e.values.items():
+                full = f"{e.at}.{e.name}.{name}"
+                held = "  (trusted)" if full in self.trusted else ""
+                number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
+                lines.append(f"  {full} = {number} {specifications(e)[name].unit}{held}")
+        return "\n".join(lines)
+

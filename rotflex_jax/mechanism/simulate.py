@@ -1,0 +1,154 @@
+"""Free run and prediction on arrays; everything is pure, jitted once per structure and differentiable."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rotflex_jax.mechanism.assembly import driven_voltage, read_outputs, rest_state
+from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.propagate import states
+from rotflex_jax.mechanism.smooth import SmoothRK4
+from rotflex_jax.mechanism.step import Exponential, apply
+from rotflex_jax.precision import working_precision
+
+Solver = Exponential | SmoothRK4
+
+
+@dataclasses.dataclass(frozen=True)
+class _FreeStep:
+    """State to state under the recorded voltage."""
+
+    structure: Mechanism
+    solver: Solver
+
+    def __call__(self, x: jax.Array, v: jax.Array, c: Any) -> jax.Array:
+        return self.solver.advance(self.structure, x, v, c)
+
+
+@dataclasses.dataclass(frozen=True)
+class _PredictorStep:
+    """State to state, corrected by the measured output first: `x+ = F(x + K (y - h(x)), v)`."""
+
+    structure: Mechanism
+    solver: Solver
+
+    def __call__(self, x: jax.Array, w: tuple[jax.Array, ...], constants: Any) -> jax.Array:
+        v, y, seen = w
+        c, K = constants
+        mechanism = self.structure.with_values(c.values)
+        e = (y - read_outputs(mechanism, c.gates, x)) * seen[None]
+        return self.solver.advance(self.structure, x + apply(K, e), v, c)
+
+
+def free_run(
+    structure: Mechanism,
+    solver: Solver,
+    values: jax.Array,
+    gates: jax.Array,
+    x0: jax.Array,
+    u: jax.Array,
+    Ts: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Simulated states (N, n) and outputs (N, C) from the first state and the voltage alone.
+
+    Args:
+        structure: `mechanism.structure`; static.
+        solver: Integration rule; static.
+        values: Parameter values (P,).
+        gates: One factor per effect, 1 where it is on.
+        x0: First state (n,).
+        u: Voltage (N,) [V], held over each sample.
+        Ts: Sampling period [s].
+    """
+    mechanism = structure.with_values(values)
+    c = solver.prepare(structure, values, gates, Ts)
+    X = states(_FreeStep(structure, solver), x0, driven_voltage(mechanism, gates, u, Ts), c)
+    return X, read_outputs(mechanism, gates, X.T).T
+
+
+def predictor_run(
+    structure: Mechanism,
+    solver: Solver,
+    values: jax.Array,
+    gates: jax.Array,
+    x0: jax.Array,
+    u: jax.Array,
+    y: jax.Array,
+    seen: jax.Array,
+    K: jax.Array,
+    Ts: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """States before correction (N, n) and outputs predicted one step ahead (N, C).
+
+    Args:
+        structure: `mechanism.structure`; static.
+        solver: Integration rule; static.
+        values: Parameter values (P,).
+        gates: One factor per effect.
+        x0: First state (n,).
+        u: Voltage (N,) [V].
+        y: Measured outputs (N, C).
+        seen: One where a sample may correct the state, zero where it may not (N,).
+        K: Gain (n, C); zero is a free run.
+        Ts: Sampling period [s].
+    """
+    mechanism = structure.with_values(values)
+    c = solver.prepare(structure, values, gates, Ts)
+    v = driven_voltage(mechanism, gates, u, Ts)
+    X = states(_PredictorStep(structure, solver), x0, (v, y, seen), (c, K))
+    return X, read_outputs(mechanism, gates, X.T).T
+
+
+_free_run = jax.jit(free_run, static_argnums=(0, 1))
+
+
+def simulate(
+    mechanism: Mechanism,
+    u: np.ndarray,
+    Ts: float,
+    x0: np.ndarray | None = None,
+    solver: Solver | None = None,
+) -> np.ndarray:
+    """Outputs (N, C) of a free run from `x0` (rest if None), in the precision of `u`.
+
+    Args:
+        mechanism: Model.
+        u: Voltage (N,) [V], held over each sample.
+        Ts: Sampling period [s].
+        x0: First state, or only its positions and speeds.
+        solver: Integration rule; `Exponential()` if None.
+    """
+    return _simulated(mechanism, u, Ts, x0, solver)[1]
+
+
+def simulate_states(
+    mechanism: Mechanism,
+    u: np.ndarray,
+    Ts: float,
+    x0: np.ndarray | None = None,
+    solver: Solver | None = None,
+) -> np.ndarray:
+    """States (N, n) of a free run: positions, speeds, then states of motor and memories."""
+    return _simulated(mechanism, u, Ts, x0, solver)[0]
+
+
+def _simulated(mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typed in the two callers
+    u = np.asarray(u)
+    u = u if u.dtype in (np.float32, np.float64) else u.astype(np.float64)
+    start = rest_state(mechanism.structure, u.dtype)
+    if x0 is not None:
+        start[: len(x0)] = x0
+    with working_precision(u):
+        X, y = _free_run(
+            mechanism.structure,
+            solver or Exponential(),
+            jnp.asarray(mechanism.values.astype(u.dtype)),
+            jnp.ones(len(mechanism.effects), u.dtype),
+            jnp.asarray(start),
+            jnp.asarray(u),
+            jnp.asarray(Ts, u.dtype),
+        )
+        return np.asarray(X), np.asarray(y)

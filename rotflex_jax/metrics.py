@@ -1,0 +1,166 @@
+"""How far a model is from the measurement, per channel, after the samples that it may see.
+
+Every metric takes either a recording and what a model made of it, and gives one number per channel
+name, or two arrays, time first, and gives one number per column.
+
+>>> import numpy as np
+>>> y = np.array([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]])
+>>> rmse(y, y + [0.5, 0.0])
+array([0.5, 0. ])
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rotflex_jax.errors import InputError
+
+
+@runtime_checkable
+class Measured(Protocol):
+    """What a metric needs of a recording."""
+
+    @property
+    def y(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def channels(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def n_init(self) -> int: ...  # noqa: D102
+
+
+def _score(
+    formula: Callable[[np.ndarray, np.ndarray], Any],
+    y: Measured | ArrayLike,
+    y_hat: ArrayLike,
+    n_init: int | None,
+) -> Any:
+    """Applies `formula(y, e)`, with `e = y - y_hat`, to the samples from `n_init` on."""
+    channels = getattr(y, "channels", None)
+    measured = np.asarray(y if channels is None else getattr(y, "y"))  # noqa: B009
+    modelled = np.asarray(y_hat)
+    start = int(getattr(y, "n_init", 0) if n_init is None else n_init)
+    if measured.shape != modelled.shape:
+        raise InputError(
+            f"The measured and the modelled output must have the same shape, but have "
+            f"{measured.shape} and {modelled.shape}; simulate the recording they are compared on."
+        )
+    if not 0 <= start < len(measured):
+        raise InputError(
+            f"Argument `n_init` must leave samples to score, but is {start} of {len(measured)} "
+            "samples; give a smaller one."
+        )
+    measured = measured[start:]
+    values = formula(measured, measured - modelled[start:])
+    if channels is None:
+        return values
+    return {name: float(value) for name, value in zip(channels, values, strict=True)}
+
+
+def _ratio(part: Any, whole: Any) -> Any:
+    """The quotient, not a number where the whole is nothing: a channel at rest has no fit."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(whole > 0, part / whole, np.nan)[()]
+
+
+def _rms(y: np.ndarray, e: np.ndarray) -> Any:
+    return np.sqrt(np.mean(e**2, axis=0))
+
+
+def _relative(y: np.ndarray, e: np.ndarray) -> Any:
+    return _ratio(_rms(y, e), np.std(y, axis=0))
+
+
+def rmse(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+    """Root mean square error.
+
+    rmse = sqrt(mean(e^2)),  e = y - y_hat
+
+    Args:
+        y: Recording, or measured output (N,) or (N, C) [unit of the channel].
+        y_hat: modelled output, same shape.
+        n_init: samples at the start that are not scored; the recording's own, or 0 for arrays.
+
+    Returns:
+        Channel name to value for a recording, else one value per column [unit of the channel].
+
+    Raises:
+        InputError: the shapes differ, or no sample is left to score.
+
+    >>> float(rmse([1.0, 2.0, 3.0], [1.0, 2.0, 5.0], n_init=1))
+    1.4142135623730951
+    """
+    return _score(_rms, y, y_hat, n_init)
+
+
+def nrmse(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+    """Root mean square error relative to the standard deviation of the measurement [-].
+
+    nrmse = norm(e) / norm(y - mean(y))
+
+    0 is perfect, 1 is as good as the mean. Not for a channel at rest: it is not a number there.
+    Args, Returns, Raises as `rmse`.
+
+    >>> float(nrmse([0.0, 1.0, 2.0], [1.0, 1.0, 1.0]))
+    1.0
+    """
+    return _score(_relative, y, y_hat, n_init)
+
+
+def fit_percent(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+    """Share of the measurement that the model explains [%].
+
+    fit = 100 (1 - norm(e) / norm(y - mean(y)))
+
+    Negative for a model worse than the mean. Not for a channel at rest: it is not a number there.
+    Args, Returns, Raises as `rmse`.
+
+    >>> float(fit_percent([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]))
+    100.0
+    """
+    return _score(lambda y, e: 100.0 * (1.0 - _relative(y, e)), y, y_hat, n_init)
+
+
+def vaf(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+    """Variance accounted for [%].
+
+    vaf = 100 (1 - var(e) / var(y))
+
+    Not where an offset matters: it does not see one, `fit_percent` does.
+    Args, Returns, Raises as `rmse`.
+
+    >>> float(vaf([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]))
+    100.0
+    """
+
+    def formula(y: np.ndarray, e: np.ndarray) -> Any:
+        return 100.0 * (1.0 - _ratio(np.var(e, axis=0), np.var(y, axis=0)))
+
+    return _score(formula, y, y_hat, n_init)
+
+
+def mae(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+    """Mean absolute error [unit of the channel].
+
+    mae = mean(abs(e))
+
+    Args, Returns, Raises as `rmse`.
+
+    >>> float(mae([0.0, 0.0], [1.0, -3.0]))
+    2.0
+    """
+    return _score(lambda y, e: np.mean(np.abs(e), axis=0), y, y_hat, n_init)
+
+
+def max_error(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+    """Largest absolute error [unit of the channel].
+
+    max_error = max(abs(e))
+
+    Args, Returns, Raises as `rmse`.
+
+    >>> float(max_error([0.0, 0.0], [1.0, -3.0]))
+    3.0
+    """
+    return _score(lambda y, e: np.max(np.abs(e), axis=0), y, y_hat, n_init)

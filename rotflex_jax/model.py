@@ -1,0 +1,212 @@
+"""A model of a recording: a mechanism with the rule that integrates it."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rotflex_jax.effects.kinds import Effect
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import (
+    Exponential,
+    Mechanism,
+    Solver,
+    free_run,
+    kalman_gains,
+    predictor_run,
+)
+from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.initial import initial_states
+from rotflex_jax.parameters import Estimate
+from rotflex_jax.precision import double_precision
+from rotflex_jax.recording import Recording
+
+_free = jax.jit(free_run, static_argnums=(0, 1))
+_free_many = jax.jit(
+    jax.vmap(free_run, in_axes=(None, None, None, None, 0, 0, None)), static_argnums=(0, 1)
+)
+_predict = jax.jit(predictor_run, static_argnums=(0, 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """What can simulate a recording.
+
+    Attributes:
+        mechanism: The physics.
+        solver: Integration rule.
+        gates: Factor of each effect, 0 where it is switched off; None for all on. Models that differ only
+            in their gates share one compilation.
+    """
+
+    mechanism: Mechanism
+    solver: Solver = Exponential()
+    gates: tuple[float, ...] | None = None
+
+    def __add__(self, effect: Effect) -> Self:
+        """The model with one more effect."""
+        gates = None if self.gates is None else (*self.gates, 1.0)
+        return dataclasses.replace(self, mechanism=self.mechanism + effect, gates=gates)
+
+    def measured(self, recording: Recording) -> np.ndarray:
+        """The channels of a recording that the mechanism has as outputs, in its order (N, C)."""
+        missing = [c for c in self.mechanism.channels if c not in recording.channels]
+        if missing:
+            raise InputError(
+                f"The model has the outputs {', '.join(self.mechanism.channels)}, but the recording "
+                f"has the channels {', '.join(recording.channels)}; give the recording these "
+                f"channel names, or the model these outputs."
+            )
+        return np.stack([recording.channel(c) for c in self.mechanism.channels], axis=1)
+
+    def _arguments(self) -> tuple[Any, ...]:
+        return jnp.asarray(self.mechanism.values), jnp.asarray(self._switches())
+
+    def _switches(self) -> np.ndarray:
+        return np.ones(len(self.mechanism.effects)) if self.gates is None else np.array(self.gates)
+
+    def _starts(self, u: np.ndarray, y: np.ndarray, Ts: float) -> np.ndarray:
+        return initial_states(self.mechanism, self.solver, self._switches(), u, y, Ts)
+
+    def _full(self, start: np.ndarray) -> np.ndarray:
+        rest = rest_state(self.mechanism.structure, np.float64)
+        full = np.tile(rest, (len(start), 1))
+        full[:, : start.shape[1]] = start
+        return full
+
+    def simulate(self, recording: Recording, x0: np.ndarray | None = None) -> np.ndarray:
+        """Free run over a recording: outputs (N, C) from its voltage alone.
+
+        The first state comes from the first `n_init` samples, which is all that the model sees of
+        the measured outputs.
+
+        Args:
+            recording: Its voltage drives the model.
+            x0: First positions and speeds, where they are known.
+        """
+        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        if x0 is None:
+            m = recording.n_init
+            x0 = self._starts(u[None, :m], y[None, :m], recording.Ts)[0]
+        with double_precision():
+            run = _free(
+                self.mechanism.structure,
+                self.solver,
+                *self._arguments(),
+                jnp.asarray(self._full(np.asarray(x0, float)[None])[0]),
+                jnp.asarray(u),
+                jnp.asarray(float(recording.Ts)),
+            )
+            return np.asarray(run[1])
+
+    def simulate_windows(self, recording: Recording, seconds: float = 2.0) -> np.ndarray:
+        """Free runs that start anew every few seconds: outputs (N, C).
+
+        Each starts from the state that the first `n_init` samples of its window tell. The servo angle
+        integrates every small torque error, so one long run hides where the error is made.
+
+        Args:
+            recording: Its voltage drives the model.
+            seconds: Length of a window [s]; a rest shorter than twice `n_init` joins the last one.
+        """
+        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        starts, length = window_starts(recording, seconds)
+        pick = starts[:, None] + np.arange(length)[None, :]
+        inside = np.minimum(pick, len(u) - 1)
+        m = recording.n_init
+        head = inside[:, :m]
+        x0 = self._starts(u[head], y[head], recording.Ts)
+        with double_precision():
+            run = _free_many(
+                self.mechanism.structure,
+                self.solver,
+                *self._arguments(),
+                jnp.asarray(self._full(x0)),
+                jnp.asarray(u[inside]),
+                jnp.asarray(float(recording.Ts)),
+            )
+            answers = np.asarray(run[1])
+        out = np.empty_like(y)
+        for window, start, end in zip(answers, starts, [*starts[1:], len(u)], strict=True):
+            out[start:end] = window[: end - start]
+        return out
+
+    def predict(
+        self, recording: Recording, process_noise: Mapping[str, float], noise: np.ndarray
+    ) -> np.ndarray:
+        """Outputs (N, C) predicted one step ahead by the steady Kalman gain of the linear part.
+
+        Args:
+            recording: Voltage and measured outputs.
+            process_noise: Port -> intensity of a white process torque [(N m)^2 s].
+            noise: Standard deviation of the sensor noise per channel.
+        """
+        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        K = kalman_gains(self.mechanism, [process_noise], noise, recording.Ts)[0]
+        m = recording.n_init
+        x0 = self._starts(u[None, :m], y[None, :m], recording.Ts)
+        with double_precision():
+            run = _predict(
+                self.mechanism.structure,
+                self.solver,
+                *self._arguments(),
+                jnp.asarray(self._full(x0)[0]),
+                *map(jnp.asarray, (u, y, np.ones(len(u)), K)),
+                jnp.asarray(float(recording.Ts)),
+            )
+            return np.asarray(run[1])
+
+
+def window_starts(recording: Recording, seconds: float) -> tuple[np.ndarray, int]:
+    """First samples of the windows, and the longest window's length [samples]."""
+    N, m = recording.N, recording.n_init
+    width = min(N, max(round(seconds / recording.Ts), 2 * m))
+    starts = np.arange(0, max(N - 2 * m, 1), width)
+    return starts, max(width, N - int(starts[-1]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """A fitted model and how it was reached.
+
+    Attributes:
+        model: The fitted model.
+        cost: Negative log-likelihood per recording sample set, constants included [nat].
+        status: "converged", or in words what stopped the fit.
+        parameters: Estimates, free and held.
+        noise: Standard deviation of the residual per channel [unit of the channel].
+        covariance: Of the free parameters [declared units], in the order of `free_names`.
+        free_names: Full names of the free parameters.
+        steps: Iterations.
+        history: Cost after each stage.
+        weakest: Direction of the free parameters (in shares of their values) that the data say least of.
+    """
+
+    model: Model
+    cost: float
+    status: str
+    parameters: tuple[Estimate, ...]
+    noise: dict[str, float]
+    covariance: np.ndarray
+    free_names: tuple[str, ...]
+    steps: int
+    history: tuple[float, ...] = ()
+    weakest: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Estimate:
+        """An estimate by full name."""
+        for estimate in self.parameters:
+            if estimate.name == name:
+                return estimate
+        raise InputError(
+            f"Parameter {name!r} was asked for, but the fit has "
+            f"{', '.join(e.name for e in self.parameters)}; use one of these names."
+        )
+
+    def __str__(self) -> str:
+        lines = [f"Fit: {self.status} after {self.steps} steps, cost {self.cost:.1f}"]
+        lines += [f"  residual {c}: {s:.3g} rms" for c, s in self.noise.items()]
+        return "\n".join(lines + [f"  {e}" for e in self.parameters])

@@ -1,0 +1,150 @@
+"""What a parameter is: a number with a unit, bounds and a typical size, and how a fit moves it.
+
+An effect declares its parameters with `parameter(...)`; a fit moves unconstrained coordinates `z`
+and `Transform` carries them to physical values, so that a bound can never be left.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Specification:
+    """Declares one parameter of an effect.
+
+    Attributes:
+        unit: SI unit as people write it, "" where there is none.
+        typical: Size [unit] at which the parameter is usually met; sets the scale of a fit.
+        lower: Values below are impossible [unit].
+        upper: Values above are impossible [unit].
+        physical: Range [unit] a healthy machine lies in; an estimate outside is flagged, not forbidden.
+        meaning: A phrase for tables.
+    """
+
+    unit: str
+    typical: float
+    lower: float = -math.inf
+    upper: float = math.inf
+    physical: tuple[float, float] = (-math.inf, math.inf)
+    meaning: str = ""
+
+
+def parameter(default: float | None, **declared: Any) -> Any:
+    """A dataclass field that is a parameter; keywords as in `Specification`."""
+    declared.setdefault("typical", abs(default) if default else 1.0)
+    return dataclasses.field(default=default, metadata={"parameter": Specification(**declared)})
+
+
+def specifications(owner: Any) -> dict[str, Specification]:
+    """Name -> `Specification` of every parameter of a dataclass (class or instance), in order.
+
+    A parameter whose value is None belongs to a part that the instance lacks and is left out.
+    """
+    found = {
+        f.name: f.metadata["parameter"]
+        for f in dataclasses.fields(owner)
+        if "parameter" in f.metadata
+    }
+    if isinstance(owner, type):
+        return found
+    return {name: spec for name, spec in found.items() if getattr(owner, name) is not None}
+
+
+@dataclasses.dataclass(frozen=True)
+class Transform:
+    """Unconstrained `z` <-> physical `p`, elementwise, by the bounds of each parameter.
+
+    Positive parameters move as `p = lower + exp(z)`, doubly bounded ones on a logistic curve, free
+    ones as `p = typical z`. A step of one in `z` is always a sizeable step in `p`.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    typical: np.ndarray
+
+    @classmethod
+    def of(cls, specs: Sequence[Specification]) -> "Transform":
+        """The transform for a list of declared parameters."""
+        columns = ("lower", "upper", "typical")
+        return cls(*(np.array([getattr(s, c) for s in specs], dtype=float) for c in columns))
+
+    def _kinds(self) -> tuple[np.ndarray, np.ndarray]:
+        positive = np.isfinite(self.lower) & ~np.isfinite(self.upper)
+        boxed = np.isfinite(self.lower) & np.isfinite(self.upper)
+        return positive, boxed
+
+    def constrain(self, z: jax.Array) -> jax.Array:
+        """Physical values [declared units] of the unconstrained coordinates."""
+        positive, boxed = self._kinds()
+        low = jnp.asarray(np.where(np.isfinite(self.lower), self.lower, 0.0), z.dtype)
+        span = jnp.asarray(np.where(boxed, self.upper - self.lower, 1.0), z.dtype)
+        # The exponent is capped where it would overflow: a rejected trial step may ask for anything.
+        grown = jnp.exp(jnp.minimum(jnp.where(jnp.asarray(positive), z, 0.0), 60.0))
+        p = jnp.where(jnp.asarray(positive), low + grown, z * jnp.asarray(self.typical, z.dtype))
+        return jnp.where(jnp.asarray(boxed), low + span * jax.nn.sigmoid(z), p)
+
+    def physical(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Outside of traced code: `constrain(z)` for z of shape (..., P), and its derivative."""
+        positive, boxed = self._kinds()
+        low = np.where(np.isfinite(self.lower), self.lower, 0.0)
+        span = np.where(boxed, self.upper - self.lower, 1.0)
+        grown = np.exp(np.minimum(np.where(positive, z, 0.0), 60.0))
+        share = 1 / (1 + np.exp(-np.where(boxed, z, 0.0)))
+        p = np.where(positive, low + grown, z * self.typical)
+        slope = np.where(positive, grown, self.typical)
+        return np.where(boxed, low + span * share, p), np.where(boxed, span * share * (1 - share), slope)
+
+    def unconstrain(self, p: np.ndarray) -> np.ndarray:
+        """Unconstrained coordinates of physical values; a value on its bound starts just inside."""
+        p = np.asarray(p, dtype=float)
+        positive, boxed = self._kinds()
+        z = p / self.typical
+        inside = np.maximum(p - np.where(positive, self.lower, 0.0), 1e-3 * self.typical)
+        z = np.where(positive, np.log(inside), z)
+        share = (p - np.where(boxed, self.lower, 0.0)) / np.where(boxed, self.upper - self.lower, 1)
+        share = np.clip(share, 1e-3, 1 - 1e-3)
+        return np.where(boxed, np.log(share / (1 - share)), z)
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """One fitted (or trusted) parameter.
+
+    Attributes:
+        name: Full name, `port.effect.parameter`.
+        value: Estimate [unit].
+        std: Standard deviation [unit], robust to correlated residuals; nan for a held constant.
+        ci95: 95 % interval [unit].
+        unit: SI unit.
+        free: False where the value was trusted and held.
+        note: What a reader must know, for instance that the estimate is not physical.
+    """
+
+    name: str
+    value: float
+    std: float
+    ci95: tuple[float, float]
+    unit: str
+    free: bool = True
+    note: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "value": self.value,
+            "std": None if math.isnan(self.std) else self.std,
+            "ci95": None if math.isnan(self.ci95[0]) else list(self.ci95),
+            "unit": self.unit,
+        }
+
+    def __str__(self) -> str:
+        if not self.free:
+            return f"{self.name} = {self.value:.6g} {self.unit} (held)"
+        low, high = self.ci95
+        return f"{self.name} = {self.value:.6g} {self.unit}  [{low:.4g}, {high:.4g}]"

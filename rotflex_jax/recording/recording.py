@@ -1,0 +1,250 @@
+"""One experiment as it was measured."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.recording import quality
+from rotflex_jax.recording.quality import Finding
+from rotflex_jax.recording.samples import aligned, finite, real_numbers, sampling_period
+from rotflex_jax.recording.sensor import quantisation_step
+
+
+@dataclass(frozen=True, init=False, eq=False, repr=False)
+class Recording:
+    """One experiment: the input, the outputs and the sampling period, uniformly sampled.
+
+    `u[k]` is held over `[k Ts, (k + 1) Ts)`; `y[k]` is measured at its beginning.
+
+    Not for data sampled unevenly: resample them first, with a method you can defend.
+
+    Args:
+        u: input (N,) [input_unit].
+        y: outputs (N, C), or (N,) for one [units].
+        Ts: sampling period [s].
+        channels: names of the outputs; `("theta", "alpha")` for two, `("theta",)` for one.
+        units: of the outputs; radians unless given.
+        input_name: name of the input.
+        input_unit: its unit.
+        n_init: samples at the start that a model may look at and that are not scored; those of
+            0.2 s unless given, at least 10 and at most a quarter of the recording.
+        source: where it comes from.
+        start: time of the first sample [s].
+        accept: faults to accept, which then are findings of severity `warning`: `short`,
+            `constant_input`, `constant`, `saturated`, `units`.
+        resolution: quantisation step by channel, where it is known; found from the data otherwise.
+
+    Raises:
+        InputError: the data are not what they must be, told in one sentence.
+
+    >>> u = np.sin(np.arange(100.0))
+    >>> recording = Recording(u=u, y=0.01 * np.cumsum(u), Ts=0.01, source="an integrator")
+    >>> recording
+    Recording(100 samples, 1 s at 100 Hz, voltage [V] to theta [rad], an integrator)
+    >>> train, test = recording.split(0.7)
+    >>> train.N, test.N, round(test.start, 9)
+    (70, 30, 0.7)
+    """
+
+    u: Float[np.ndarray, " N"]
+    y: Float[np.ndarray, "N C"]
+    Ts: float
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    input_name: str
+    input_unit: str
+    n_init: int
+    source: str
+    start: float
+    accept: tuple[str, ...]
+    resolution: Mapping[str, float | None]
+
+    def __init__(
+        self,
+        u: Any,
+        y: Any,
+        Ts: Any,
+        channels: str | Sequence[str] | None = None,
+        units: str | Sequence[str] | None = None,
+        input_name: str = "voltage",
+        input_unit: str = "V",
+        n_init: int | None = None,
+        source: str = "",
+        start: float = 0.0,
+        accept: str | Sequence[str] = (),
+        resolution: Mapping[str, float | None] | None = None,
+    ) -> None:
+        u, y = aligned(real_numbers(u, "Argument `u`"), real_numbers(y, "Argument `y`"))
+        Ts = sampling_period(Ts)
+        names, units = _labels(channels, units, y.shape[1])
+        finite(u, f"Input {input_name!r}")
+        for x, name in zip(y.T, names, strict=True):
+            finite(x, f"Channel {name!r}")
+        known = resolution or {}
+        values = {
+            "u": u,
+            "y": y,
+            "Ts": Ts,
+            "channels": names,
+            "units": units,
+            "input_name": input_name,
+            "input_unit": input_unit,
+            "n_init": _initial_samples(n_init, len(u), Ts),
+            "source": source,
+            "start": float(start),
+            "accept": quality.acceptable(accept),
+            "resolution": {
+                name: known[name] if name in known else quantisation_step(x)
+                for x, name in zip(y.T, names, strict=True)
+            },
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        # A part of a recording accepts everything: its findings wait until somebody asks.
+        if self.accept != quality.ACCEPTABLE:
+            quality.refuse(self.findings)
+
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """What there is to know about the quality of the data."""
+        names, units = (self.input_name, *self.channels), (self.input_unit, *self.units)
+        return quality.inspect(self.u, self.y, self.Ts, names, units, self.resolution, self.accept)
+
+    @property
+    def N(self) -> int:
+        """Number of samples."""
+        return len(self.u)
+
+    @property
+    def t(self) -> Float[np.ndarray, " N"]:
+        """Time of every sample [s]."""
+        return self.start + self.Ts * np.arange(self.N)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the end of the last [s]."""
+        return self.N * self.Ts
+
+    def channel(self, name: str) -> Float[np.ndarray, " N"]:
+        """One output by name."""
+        if name not in self.channels:
+            raise InputError(
+                f"The recording has no channel {name!r}; it has {', '.join(self.channels)}."
+            )
+        return self.y[:, self.channels.index(name)]
+
+    def slice(self, i: int, j: int) -> "Recording":
+        """The samples from `i` up to, but without, `j`.
+
+        What is still in a part, or short, is no error: the whole has passed the checks.
+        """
+        if not 0 <= i < j <= self.N:
+            raise InputError(
+                f"A part of the recording must lie within its {self.N} samples, "
+                f"but was asked from {i} to {j}; choose 0 <= i < j <= {self.N}."
+            )
+        return replace(
+            self,
+            u=self.u[i:j],
+            y=self.y[i:j],
+            start=self.start + i * self.Ts,
+            n_init=min(self.n_init, max(1, (j - i) // 4)),
+            accept=quality.ACCEPTABLE,
+        )
+
+    def split(
+        self, share: float | None = None, *, seconds: float | None = None
+    ) -> tuple["Recording", "Recording"]:
+        """Cuts the recording in two, in the order of time: one part to learn from, one to judge on.
+
+        Args:
+            share: of the samples in the first part [-]; 0.7 where neither is given.
+            seconds: length of the first part instead [s].
+
+        Returns:
+            The first and the second part.
+        """
+        if share is not None and seconds is not None:
+            raise InputError(
+                f"Arguments `share` ({share:g}) and `seconds` ({seconds:g}) were both given, "
+                "but say the same thing; give one of them."
+            )
+        if seconds is not None:
+            wanted = seconds / self.Ts
+        else:
+            wanted = self.N * (0.7 if share is None else share)
+        if not 1 <= round(wanted) < self.N:
+            raise InputError(
+                f"Both parts of a split must have samples, but the first would have {wanted:.6g} "
+                f"of {self.N}; give a share between 0 and 1, or fewer than {self.duration:g} s."
+            )
+        return self.slice(0, round(wanted)), self.slice(round(wanted), self.N)
+
+    def decimate(self, k: int) -> "Recording":
+        """Every k-th sample: the mean of the input over k samples, the output as it was measured.
+
+        The mean keeps the impulse of the held input, to first order in `k Ts`. The output is not
+        filtered: a filter would have to be part of the model, and angles have next to no content
+        beyond the new Nyquist frequency. Not for outputs with strong noise there, which folds back.
+
+        Args:
+            k: factor; samples at the end that do not fill a group are left out.
+        """
+        if k != int(k) or not 1 <= k <= self.N:
+            raise InputError(
+                f"Argument `k` must be a whole number from 1 to the {self.N} samples, but is {k}; "
+                "give for instance 2."
+            )
+        groups = self.N // int(k)
+        return replace(
+            self,
+            u=self.u[: groups * k].reshape(groups, k).mean(axis=1),
+            y=self.y[: groups * k : k],
+            Ts=self.Ts * k,
+            n_init=max(1, min(round(self.n_init / k), groups // 4)),
+            accept=quality.ACCEPTABLE,
+        )
+
+    def __repr__(self) -> str:
+        pairs = zip(self.channels, self.units, strict=True)
+        outputs = ", ".join(f"{name} [{unit}]" for name, unit in pairs)
+        return (
+            f"Recording({self.N} samples, {self.duration:.6g} s at {1 / self.Ts:.6g} Hz, "
+            f"{self.input_name} [{self.input_unit}] to {outputs}"
+            f"{f', {self.source}' if self.source else ''})"
+        )
+
+
+def _labels(
+    channels: str | Sequence[str] | None, units: str | Sequence[str] | None, width: int
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of the outputs, by default those of the joint."""
+    default = ("theta", "alpha")[:width] if width <= 2 else ()
+    names = _tuple(default if channels is None else channels)
+    each = _tuple(("rad",) * width if units is None else units)
+    if not len(set(names)) == len(names) == len(each) == width:
+        raise InputError(
+            f"Arguments `channels` and `units` must have a name of its own and a unit for each of "
+            f"the {width} columns of `y`, but are {names} and {each}; give them in order."
+        )
+    return names, each
+
+
+def _tuple(words: str | Sequence[str]) -> tuple[str, ...]:
+    return (words,) if isinstance(words, str) else tuple(words)
+
+
+def _initial_samples(n_init: int | None, N: int, Ts: float) -> int:
+    if n_init is None:
+        return max(1, min(max(10, round(0.2 / Ts)), N // 4))
+    if n_init != int(n_init) or not 1 <= n_init < N:
+        raise InputError(
+            f"Argument `n_init` must be a whole number from 1 and smaller than the recording, "
+            f"but is {n_init} of {N} samples; 0.2 s are {round(0.2 / Ts)} samples."
+        )
+    return int(n_init)

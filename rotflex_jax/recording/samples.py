@@ -1,0 +1,180 @@
+"""What numbers must be before they are of use: real, finite, aligned, evenly spaced in time."""
+
+from typing import Any
+
+import numpy as np
+
+from rotflex_jax.errors import InputError
+
+
+def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0) -> np.ndarray:
+    """An array of real numbers, text parsed strictly.
+
+    Args:
+        values: what was given.
+        label: begins the sentence of an error, such as "run.csv: column 'theta'".
+        where: what one entry is called.
+        first: number of the first entry.
+
+    Returns:
+        The array, float32 where that was given, else float64 or whole numbers.
+
+    Raises:
+        InputError: ragged, complex, text that is no number, or no numbers at all.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise InputError(
+            f"{label} must be an array of numbers, but its rows differ in length; "
+            "give every sample the same channels."
+        ) from error
+    if np.ma.is_masked(values):
+        raise InputError(f"{label} has masked samples, but all are needed; cut or refill them.")
+    if array.dtype.kind in "iuf":
+        return array
+    if array.dtype.kind not in "OUST" or array.ndim != 1:
+        raise InputError(
+            f"{label} must hold real numbers, but holds {array.dtype.name}; convert it first."
+        )
+    numbers = np.empty(len(array))
+    for k, entry in enumerate(array):
+        try:
+            numbers[k] = float(entry)
+        except (TypeError, ValueError) as error:
+            text = entry.decode(errors="replace") if isinstance(entry, bytes) else str(entry)
+            what = f"holds {text!r}" if text.strip() else "is empty"
+            raise InputError(
+                f"{label} {what} at {where} {first + k} where a number is needed; "
+                "correct the data, or cut them there."
+            ) from error
+    return numbers
+
+
+def finite(x: np.ndarray, label: str, where: str = "sample", first: int = 0) -> None:
+    """Refuses NaN and infinity, naming the first.
+
+    Raises:
+        InputError: with the place of the first and the number of all.
+
+    >>> finite(np.array([0.0, np.nan, 1.0]), "Channel 'alpha'")
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: Channel 'alpha' is nan at sample 1, in 1 of 3 samples in all; \
+cut the recording there, or record again, since nothing is filled in silently.
+    """
+    bad = np.flatnonzero(~np.isfinite(x))
+    if len(bad):
+        raise InputError(
+            f"{label} is {x[bad[0]]} at {where} {first + bad[0]}, in {len(bad)} of {len(x)} "
+            "samples in all; cut the recording there, or record again, since nothing is filled in "
+            "silently."
+        )
+
+
+def aligned(u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Input and outputs as (N,) and (N, C) of one precision, copied and read only.
+
+    Raises:
+        InputError: other shapes, or lengths that differ.
+    """
+    if u.ndim == 2 and u.shape[1] == 1:
+        u = u[:, 0]
+    if y.ndim == 1:
+        y = y[:, None]
+    if u.ndim != 1 or y.ndim != 2 or 0 in (len(u), *y.shape):
+        raise InputError(
+            "Arguments `u` and `y` must have the shapes (N,) and (N, C), one row per sample, "
+            f"but have {u.shape} and {y.shape}; give one input, and outputs side by side."
+        )
+    if len(u) != len(y):
+        hint = "transpose `y`" if y.shape[1] == len(u) else "cut both to the same samples"
+        raise InputError(
+            f"Arguments `u` and `y` must have the same length, but have {len(u)} and {len(y)} "
+            f"samples; {hint}."
+        )
+    dtype = np.float32 if u.dtype == y.dtype == np.float32 else np.float64
+    u, y = np.array(u, dtype=dtype), np.array(y, dtype=dtype)
+    u.setflags(write=False)
+    y.setflags(write=False)
+    return u, y
+
+
+def sampling_period(Ts: Any, label: str = "Argument `Ts`") -> float:
+    """The sampling period as a positive number [s].
+
+    Raises:
+        InputError: it is not.
+
+    >>> sampling_period("fast")
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: Argument `Ts` must be a positive number of seconds, \
+but is 'fast'; give for instance 0.002.
+    """
+    value = np.asarray(Ts)
+    if value.size != 1 or value.dtype.kind not in "iuf" or not 0 < value.item() < np.inf:
+        what = f"{value.item()!r}" if value.size == 1 else f"{value.size} values"
+        raise InputError(
+            f"{label} must be a positive number of seconds, but is {what}; give for instance 0.002."
+        )
+    return float(value.item())
+
+
+def even_spacing(t: np.ndarray, label: str, where: str = "sample", first: int = 0) -> float:
+    """The sampling period of time stamps that must be evenly spaced, each to 1 % of it.
+
+    Args:
+        t: time stamps [s].
+        label: begins the sentence of an error.
+        where: what one entry is called.
+        first: number of the first entry.
+
+    Returns:
+        Sampling period [s].
+
+    Raises:
+        InputError: equal or falling time stamps, a gap, or jitter, with the worst place.
+
+    >>> even_spacing(np.arange(100) / 500, "Time")
+    0.002
+    """
+    finite(t, label, where, first)
+    if len(t) < 2:
+        raise InputError(
+            f"{label} has {len(t)} time stamps, but a sampling period needs two; record longer."
+        )
+    steps = np.diff(t)
+    period = float(np.median(steps))
+
+    def place(k: Any) -> str:
+        return f"between {where}s {first + k} and {first + k + 1}"
+
+    fallen, equal = np.flatnonzero(steps < 0), np.flatnonzero(steps == 0)
+    if len(fallen):
+        raise InputError(
+            f"{label} must increase, but falls by {-steps[fallen[0]]:g} s {place(fallen[0])}; "
+            "sort the rows, or load one run at a time."
+        )
+    if len(equal):
+        raise InputError(
+            f"{label} must increase, but has a duplicate time stamp {place(equal[0])}, "
+            f"{len(equal)} in all; remove the repeated rows, or write the time with more digits."
+        )
+    worst = int(np.argmax(np.abs(steps - period)))
+    if steps[worst] > 1.5 * period:
+        raise InputError(
+            f"{label} has a gap of {steps[worst]:g} s {place(worst)} at a sampling period of "
+            f"{period:g} s, about {round(steps[worst] / period) - 1} samples lost; "
+            "load the parts before and after it as recordings of their own."
+        )
+    if abs(steps[worst] - period) > 0.01 * period:
+        raise InputError(
+            f"{label} is jittery: an interval of {steps[worst]:g} s {place(worst)} at a sampling "
+            f"period of {period:g} s is off by {100 * abs(steps[worst] / period - 1):.2g} %, more "
+            "than 1 %; resample on a uniform grid, or write the time with more digits."
+        )
+    mean = float(t[-1] - t[0]) / (len(t) - 1)
+    # Written times are rounded; the plain number within their error is the one that was set.
+    plain = float(f"{mean:.6g}")
+    return plain if abs(plain - mean) < 1e-7 * mean else mean

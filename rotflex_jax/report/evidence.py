@@ -1,0 +1,209 @@
+"""Figures of the evidence: the ranking, the error that falls, the parameters that settle."""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from rotflex_jax.discover.result import Discovery
+from rotflex_jax.parameters import Estimate
+from rotflex_jax.report.style import (
+    FINAL,
+    INK,
+    MEASURED,
+    MUTED,
+    NOISE,
+    blank,
+    legend_above,
+    stage_colours,
+    styled,
+)
+from rotflex_jax.report.tables import stage_labels
+from rotflex_jax.report.wording import effect_label, plain_number, readable, units
+
+MOST_BARS = 14
+
+
+@styled
+def ranking(discovery: Discovery) -> Figure | None:
+    """Score of each candidate at the baseline; found ones strong, unexcited ones faint."""
+    listed = discovery.ranking[:MOST_BARS]
+    if not listed:
+        return None
+    found = {(r.effect, r.port) for r in discovery.rounds}
+    alike = {pair for r in discovery.rounds for pair in r.equivalent}
+    figure = blank(10.0, 0.27 * len(listed) + 1.1)
+    ax = figure.subplots()
+    groups = {
+        "found": (FINAL, 1.0),
+        "cannot be told from what was found": ("#7fb2bf", 1.0),
+        "not added": (MEASURED, 0.75),
+        "not excited by this recording": ("#dfe4e8", 1.0),
+    }
+    for k, r in enumerate(listed):
+        pair = (r.effect, r.port)
+        group = (
+            "found"
+            if pair in found
+            else "cannot be told from what was found"
+            if pair in alike
+            else "not added"
+            if r.excited
+            else "not excited by this recording"
+        )
+        colour, strength = groups[group]
+        ax.barh(k, r.score, 0.72, color=colour, alpha=strength, label=group)
+        ax.annotate(
+            plain_number(r.score),
+            (r.score, k),
+            (5 if r.score >= 0 else -5, 0),
+            textcoords="offset points",
+            va="center",
+            ha="left" if r.score >= 0 else "right",
+            fontsize=8,
+            color=MUTED,
+        )
+    ax.set_yticks(range(len(listed)), [effect_label(r.effect, r.port) for r in listed])
+    for text, r in zip(ax.get_yticklabels(), listed, strict=True):
+        text.set_color(INK if r.excited else MUTED)
+        text.set_fontweight("bold" if (r.effect, r.port) in found else "normal")
+    ax.invert_yaxis()
+    ax.set_ylabel("candidate effect [–]")
+    ax.set_xscale("symlog", linthresh=10.0, linscale=0.6)
+    ax.axvline(0.0, color=MUTED, lw=0.8)
+    low, high = min(0.0, *(r.score for r in listed)), max(10.0, *(r.score for r in listed))
+    ax.set_xlim(3 * low if low < -10 else low - 8 if low < 0 else 0.0, 4 * high)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel("penalised score [nat], logarithmic beyond ±10")
+    order = [label for label in groups]
+    _ordered_legend(figure, ax, order)
+    return figure
+
+
+def _ordered_legend(figure: Figure, ax: Axes, order: list[str]) -> None:
+    handles, labels = ax.get_legend_handles_labels()
+    seen = dict(zip(labels, handles, strict=True))
+    kept = [label for label in order if label in seen]
+    figure.legend([seen[k] for k in kept], kept, loc="outside upper left", ncols=len(kept))
+
+
+@styled
+def staircase(discovery: Discovery) -> Figure:
+    """Held-out error of every stage against the noise of the sensor."""
+    by_channel, labels = units(discovery), stage_labels(discovery)
+    colours = stage_colours(len(labels))
+    figure = blank(10.0, 3.6)
+    axes = figure.subplots(1, len(by_channel), squeeze=False)[0]
+    x = np.arange(len(labels))
+    for ax, (channel, unit) in zip(axes, by_channel.items(), strict=True):
+        scale, read = readable(1.0, unit)
+        windows = [scale * s.held_out_rmse_windows[channel] for s in discovery.stages]
+        whole = [scale * s.held_out_rmse[channel] for s in discovery.stages]
+        seconds = discovery.baseline.window_seconds
+        ax.plot(x, windows, color=MEASURED, lw=1.6, zorder=2)
+        ax.plot(x + 0.08, whole, color=MEASURED, lw=1.0, ls=(0, (2, 2)), zorder=2)
+        ax.scatter(x, windows, 62, c=list(colours), zorder=3)
+        ax.scatter(
+            x + 0.08,
+            whole,
+            40,
+            facecolors="white",
+            edgecolors=list(colours),
+            linewidths=1.5,
+            zorder=3,
+        )
+        for k, value in enumerate(windows):
+            ax.annotate(
+                plain_number(value),
+                (k, value),
+                (-8, -3),
+                textcoords="offset points",
+                ha="right",
+                va="center",
+                fontsize=8.5,
+                color=INK,
+            )
+        # Markers in the legend speak of the kind of run; their colours, of the stage.
+        ax.plot([], [], "o", color=MUTED, ms=7, label=f"run anew every {seconds:g} s")
+        ax.plot(
+            [], [], "o", mfc="white", color=MUTED, ms=6, mew=1.5, label="one run over all of it"
+        )
+        floor = scale * discovery.noise_floor.get(channel, 0.0)
+        if floor > 0:
+            ax.axhline(floor, color=NOISE, lw=1.1, ls=(0, (4, 2)), label="sensor noise")
+        ax.set_yscale("log")
+        values = [v for v in (*windows, *whole, floor) if v > 0 and math.isfinite(v)] or [1.0]
+        ax.set_ylim(min(values) / 1.8, 1.8 * max(values))
+        ax.set_xlim(-0.55, len(labels) - 0.55)
+        ax.set_xticks(x, [label.replace(" at ", "\nat ") for label in labels])
+        ax.tick_params(axis="x", length=0)
+        for text, colour in zip(ax.get_xticklabels(), colours, strict=True):
+            text.set_color(colour)
+            text.set_fontweight("bold")
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        ax.yaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+        ax.grid(axis="x", visible=False)
+        ax.set_title(channel)
+        ax.set_xlabel("model [stage]")
+        ax.set_ylabel(f"held-out rms error [{read}]")
+    legend_above(figure, axes)
+    return figure
+
+
+def _comparable(discovery: Discovery) -> dict[str, list[Estimate | None]]:
+    """Free parameters that differ clearly from zero in the final model, in every stage."""
+    stages = [{e.name: e for e in s.estimates} for s in discovery.stages]
+    last = stages[-1]
+    kept = (
+        e.name
+        for e in last.values()
+        if e.free and math.isfinite(e.std) and abs(e.value) > 3 * e.std
+    )
+    return {name: [s.get(name) for s in stages] for name in kept}
+
+
+@styled
+def parameters(discovery: Discovery) -> Figure | None:
+    """Every free parameter of every stage, relative to its final estimate, with 95 % intervals."""
+    rows = _comparable(discovery)
+    if not rows:
+        return None
+    labels, colours = stage_labels(discovery), stage_colours(len(discovery.stages))
+    figure = blank(10.0, 0.42 * len(rows) + 1.2)
+    ax = figure.subplots()
+    ax.axvline(0.0, color=NOISE, lw=0.9)
+    spread = np.linspace(-0.22, 0.22, len(labels)) if len(labels) > 1 else [0.0]
+    for k, each in enumerate(rows.values()):
+        final = each[-1]
+        assert final is not None  # rows are those of the final stage
+        for stage, e in enumerate(each):
+            if e is None or not math.isfinite(e.value):
+                continue
+            centre = 100 * (e.value / final.value - 1)
+            reach = 100 * 1.96 * e.std / abs(final.value) if math.isfinite(e.std) else 0.0
+            ax.errorbar(
+                centre,
+                k + spread[stage],
+                xerr=reach,
+                fmt="o",
+                ms=4.5,
+                lw=1.6,
+                capsize=2.5,
+                color=colours[stage],
+                label=labels[stage],
+            )
+    ax.set_yticks(range(len(rows)), list(rows))
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.set_ylabel("parameter [–]")
+    ax.set_xlabel("difference from the final estimate [%]")
+    ax.set_xscale("symlog", linthresh=10.0, linscale=0.8)
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+g}" if v else "0"))
+    ax.xaxis.set_major_locator(MaxNLocator(9)) if _reach(ax) <= 10 else None
+    legend_above(figure, [ax])
+    return figure
+
+
+def _reach(ax: Axes) -> float:
+    return max(abs(v) for v in ax.get_xlim())

@@ -1,0 +1,428 @@
+"""The command line: what it accepts, what it refuses and how, what it prints."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import rotflex_jax as rf
+from rotflex_jax import cli, fastloops, terminal
+from rotflex_jax.data.datasets import DATASETS
+from rotflex_jax.model import Model
+
+NAMES = ("t", "voltage", "theta", "alpha")
+DEMO = np.loadtxt(
+    files("rotflex_jax.data").joinpath("demo.csv").read_text().splitlines(),
+    delimiter=",",
+    skiprows=1,
+    max_rows=600,
+)
+WAVE = np.sin(np.arange(len(DEMO)) / 50)
+# A process of its own finds the package wherever it was started.
+HERE = os.environ | {"PYTHONPATH": str(Path(rf.__path__[0]).parent)}
+
+
+@pytest.fixture(autouse=True)
+def no_global_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the program sets up for its own process must not leak into the other tests."""
+    monkeypatch.setattr(fastloops, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(fastloops, "enable_compilation_cache", lambda: None)
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run the command line in this process: exit status, stdout, stderr."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as left:
+            cli.main([str(argument) for argument in arguments])
+        assert isinstance(left.value.code, int)
+        return left.value.code, *capsys.readouterr()
+
+    return run
+
+
+def write(file: Path, table: np.ndarray = DEMO, names: Sequence[str] = NAMES) -> Path:
+    np.savetxt(file, table, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    return file
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    return write(tmp_path / "run.csv")
+
+
+def put(table: np.ndarray, column: int, value: float) -> np.ndarray:
+    table[50, column] = value
+    return table
+
+
+# What is wrong -> how to spoil the table, and words that the sentence must have.
+SPOILT: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "a value that is not a number": (lambda x: put(x, 2, np.nan), "theta"),
+    "an infinite voltage": (lambda x: put(x, 1, np.inf), "voltage"),
+    "a gap in time": (lambda x: np.delete(x, slice(100, 140), axis=0), "sampl"),
+    "jitter": (
+        lambda x: x + np.random.default_rng(0).uniform(-4e-4, 4e-4, len(x))[:, None] * [1, 0, 0, 0],
+        "sampl",
+    ),
+    "time running backwards": (lambda x: x[::-1] * [1, 1, 1, 1], "time"),
+    "too few samples": (lambda x: x[:20], "20"),
+    "no samples": (lambda x: x[:0], ""),
+    "a constant input": (lambda x: x * [1, 0, 1, 1], "voltage"),
+    "a constant channel": (lambda x: x * [1, 1, 1, 0], "alpha"),
+    "a saturated sensor": (
+        lambda x: np.c_[x[:, 0], WAVE, np.minimum(WAVE, 0.7), 0.1 * WAVE],
+        "saturated",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", SPOILT)
+def test_bad_recordings_are_refused_with_one_sentence(fault, run, tmp_path) -> None:
+    spoil, word = SPOILT[fault]
+    bad = write(tmp_path / "bad.csv", spoil(DEMO.copy()))
+    status, out, err = run("discover", bad)
+    assert (status, out) == (2, "")
+    assert_one_sentence(err, word)
+
+
+def assert_one_sentence(err: str, *words: str) -> None:
+    assert err.startswith("rotflex: ")
+    assert err.count("\n") == 1
+    assert err.rstrip()[-1] in ".?"
+    assert "Traceback" not in err
+    for word in words:
+        assert word.lower() in err.lower()
+
+
+# Command line, {run} for a good recording and {tmp} for a folder -> words of the sentence.
+REFUSED = {
+    "discover": "FILE",
+    "discover {tmp}/missing.csv": "does not exist",
+    "discover {tmp}": "folder",
+    "discover {tmp}/empty.csv": "empty.csv",
+    "discover {tmp}/text.csv": "text.csv",
+    "discover {tmp}/noise.mat": "noise.mat",
+    "discover {tmp}/noise.npz": "noise.npz",
+    "discover {tmp}/two_columns.csv": "theta",
+    "discover {tmp}/run.xyz": ".xyz",
+    "discover {run} --nonsense": "--nonsense",
+    "discover {run} --split nonsense": "--split",
+    "discover {run} --split 1.5": "between 0 and 1",
+    "discover {run} --split 0.6 --held-out {tmp}/other.csv": "--held-out",
+    "discover {run} --held-out {run}": "twice",
+    "discover {run} {run}": "twice",
+    "discover {run} --held-out {tmp}/missing.csv": "missing.csv",
+    "discover {run} --joint papre": "paper",
+    "discover {run} --joint paper:mass=1": "mass",
+    "discover {run} --joint paper:stiffness=soft": "stiffness",
+    "discover {run} --joint paper:stiffness=-1": "stiffness",
+    "discover {run} --output theta": "alpha",
+    "discover {run} --Ts 0.002 --time t": "--Ts",
+    "discover {run} --Ts -1": "--Ts",
+    "discover {run} --Ts 0.004": "Ts",
+    "discover {run} --time clock": "clock",
+    "discover {run} --input motor": "motor",
+    "discover {run} --output theta --output beta": "beta",
+    "discover {run} --output theta --output theta": "--output",
+    "discover {tmp}/degrees.csv": "--degrees",
+    "discover {tmp}/degrees.csv --output theta_deg --output alpha": "pass --degrees",
+    "discover {run} --input theta": "theta",
+    "discover {run} --accept everything": "everything",
+    "discover {run} --json {tmp}/missing/r.json": "missing",
+    "discover {run} --json {tmp}": "folder",
+    "discover {run} --report {run}": "file",
+    "simulate {run} --add colomb@hub": "coulomb",
+    "simulate {run} --add coulomb": "hub",
+    "simulate {run} --add coulomb@elbow": "elbow",
+    "simulate {run} --add coulomb@hub:size=1": "size",
+    "simulate {run} --add coulomb@hub:level=much": "level",
+    "simulate {run} --add coulomb@hub:level=-1": "level",
+    "simulate {run} --add coulomb@hub:level": "level",
+    "simulate {run} --add coulomb@hub --add coulomb@hub": "coulomb",
+    "simulate {run} --fit {run}": "twice",
+    "simulate {run} --save {tmp}/missing/s.csv": "missing",
+    "data fetch nothing_of_this_name": "nothing_of_this_name",
+    "data fetch": "NAME",
+    "dicsover {run}": "dicsover",
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_bad_arguments_are_refused_with_one_sentence(line, run, recorded, tmp_path) -> None:
+    write(tmp_path / "other.csv", DEMO[:300])
+    write(tmp_path / "run.xyz")
+    write(tmp_path / "two_columns.csv", DEMO[:, :2], NAMES[:2])
+    degrees = DEMO * [1, 1, 180 / np.pi, 180 / np.pi]
+    write(tmp_path / "degrees.csv", np.c_[degrees, degrees[:, 2]], (*NAMES, "theta_deg"))
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "text.csv").write_text("t,voltage,theta,alpha\n" + "a,b,c,d\n" * 100)
+    for name in ("noise.mat", "noise.npz"):
+        (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(500))
+    before = sorted(tmp_path.iterdir())
+    status, out, err = run(*line.format(run=recorded, tmp=tmp_path).split())
+    assert (status, out) == (2, "")
+    assert_one_sentence(err, REFUSED[line])
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "bad.csv").write_text("t,voltage\n0,1\n")
+    left = subprocess.run(
+        [sys.executable, "-m", "rotflex_jax", "discover", "bad.csv"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=HERE,
+        check=False,
+    )
+    assert (left.returncode, left.stdout) == (2, "")
+    assert_one_sentence(left.stderr)
+
+
+def test_version(run) -> None:
+    assert run("--version") == (0, f"{rf.__version__}\n", "")
+
+
+@pytest.mark.parametrize("line", ["", "--help", "discover --help", "data", "data --help"])
+def test_help_is_no_error(line, run) -> None:
+    status, out, err = run(*line.split())
+    assert (status, err) == (0, "")
+    assert "Usage" in out
+
+
+def test_effects_as_json(run) -> None:
+    status, out, err = run("effects", "--json")
+    assert (status, err) == (0, "")
+    described = json.loads(out)
+    assert described["schema"] == 1
+    assert {effect["name"] for effect in described["effects"]} == set(rf.effects.CATALOG)
+    for effect in described["effects"]:
+        assert {"name", "kind", "title", "equation", "ports", "parameters"} <= set(effect)
+        assert effect["ports"]
+        for parameter in effect["parameters"].values():
+            assert {"unit", "typical", "meaning"} <= set(parameter)
+
+
+def test_effects_for_people(run) -> None:
+    status, out, _ = run("effects")
+    assert status == 0
+    assert all(name in out for name in rf.effects.CATALOG)
+    assert "level [N m]" in out
+
+
+def test_data_list_names_every_recording(run) -> None:
+    status, out, _ = run("data", "list")
+    assert status == 0
+    assert all(name in out for name in DATASETS)
+
+
+def test_data_fetch_prints_paths_and_checks_the_content(run, tmp_path, monkeypatch) -> None:
+    file = DATASETS["silverbox"].files[0]
+    there = tmp_path / file.name
+    there.parent.mkdir()
+    there.write_bytes(b"not what was published")
+    monkeypatch.setenv("ROTFLEX_DATA", str(tmp_path))
+    status, out, err = run("data", "fetch", "silverbox")
+    assert (status, out) == (2, "")
+    assert_one_sentence(err.splitlines(keepends=True)[-1], "SHA-256")
+    known = dataclasses.replace(
+        DATASETS["silverbox"],
+        files=(dataclasses.replace(file, sha256=hashlib.sha256(there.read_bytes()).hexdigest()),),
+    )
+    monkeypatch.setitem(DATASETS, "silverbox", known)
+    status, out, _ = run("data", "fetch", "silverbox")
+    assert (status, out.strip()) == (0, str(there))
+
+
+def test_simulate_tells_errors_and_saves(run, recorded, tmp_path) -> None:
+    saved = tmp_path / "simulated.csv"
+    status, out, _ = run("simulate", recorded, "--add", "coulomb@hub:level=0.03", "--save", saved)
+    assert status == 0
+    assert "theta [deg]" in out
+    header, *rows = saved.read_text().splitlines()
+    assert header == "t,voltage,theta,alpha,theta_simulated,alpha_simulated"
+    table = np.array([row.split(",") for row in rows], dtype=float)
+    np.testing.assert_allclose(table[:, :4], DEMO, atol=1e-8)
+    recording = rf.load(recorded)
+    mechanism = rf.joints.paper() + rf.effects.Coulomb(at="hub", level=0.03)
+    y_hat = Model(mechanism).simulate(recording)
+    np.testing.assert_allclose(table[:, 4:], y_hat, atol=1e-6)
+    degrees = np.rad2deg(rf.metrics.rmse(recording.y, y_hat, recording.n_init))
+    assert all(terminal.number(value) in out for value in degrees)
+
+
+class FakeSearch:
+    """Stands for `rf.discover` where only the command line around it is tested."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple] = []
+
+    def __call__(self, joint, train, test, progress=None) -> SimpleNamespace:
+        self.calls.append((joint, train, test))
+        progress("Fitting the [baseline]")
+        rmse = {"theta": 0.1, "alpha": 0.01}
+        stage = SimpleNamespace(held_out_rmse=rmse, held_out_rmse_windows=rmse, window_seconds=2.0)
+        level = SimpleNamespace(value=0.03, std=1e-3, ci95=(0.028, 0.032), unit="N m")
+        turn = SimpleNamespace(
+            effect="coulomb",
+            port="hub",
+            sentence="the hub meets friction [N m]",
+            equation="tau = -level * sign(speed)",
+            parameters={"level": level},
+            equivalent=(("stribeck", "hub"),),
+            stage=stage,
+        )
+        return SimpleNamespace(
+            verdict="found",
+            sentence="The rounds explain the record.",
+            train=train,
+            test=test,
+            baseline=stage,
+            rounds=[turn],
+            noise_floor={"theta": 5e-4, "alpha": 5e-4},
+            notes=("a [note] to read",),
+            where=[SimpleNamespace(statement="78 % of the error follows reversals")],
+            to_dict=lambda: {"schema": 1, "verdict": "found"},
+            report=self.report,
+        )
+
+    @staticmethod
+    def report(folder: Path) -> Path:
+        folder.mkdir()
+        page = folder / "index.html"
+        page.write_text("<html>")
+        return page
+
+
+@pytest.fixture
+def search(monkeypatch: pytest.MonkeyPatch) -> FakeSearch:
+    fake = FakeSearch()
+    monkeypatch.setattr(rf, "discover", fake)
+    return fake
+
+
+def test_discover_splits_each_file(run, search, recorded, tmp_path) -> None:
+    other = write(tmp_path / "other.csv", DEMO[:400])
+    status, out, err = run("discover", recorded, other, "--split", 0.75)
+    assert status == 0
+    ((_, train, test),) = search.calls
+    assert [recording.N for recording in train] == [450, 300]
+    assert [recording.N for recording in test] == [150, 100]
+    assert "Fitting the [baseline]" in err
+    for text in (
+        "FOUND",
+        "the hub meets friction [N m]",
+        "0.028 .. 0.032",
+        "cannot tell it from: stribeck at hub",
+        "5.73",
+        "reversals",
+        "a [note] to read",
+    ):
+        assert text in out
+
+
+def test_discover_judges_on_held_out_files_and_maps_columns(run, search, tmp_path) -> None:
+    table = DEMO * [1, 1, 180 / np.pi, 180 / np.pi]
+    names = ("time", "u", "servo", "tip")
+    a, b = (write(tmp_path / f"{name}.csv", table, names) for name in "ab")
+    line = "--time time --input u --output alpha=tip --output theta=servo --degrees"
+    preset = "quanser_2010:spring=3,hub_anchor=A"
+    status, *_ = run("discover", a, "--held-out", b, "--joint", preset, *line.split())
+    assert status == 0
+    ((joint, train, test),) = search.calls
+    assert [recording.N for recording in (*train, *test)] == [600, 600]
+    for channel, column in (("theta", 2), ("alpha", 3)):
+        np.testing.assert_allclose(train[0].channel(channel), DEMO[:, column], atol=1e-7)
+    softest = rf.joints.quanser_2010().effect("spring", "joint").values["stiffness"]
+    assert joint.effect("spring", "joint").values["stiffness"] > softest
+
+
+def test_discover_writes_json_and_report(run, search, recorded, tmp_path) -> None:
+    places = "--json", tmp_path / "r.json", "--report", tmp_path / "page"
+    status, out, _ = run("discover", recorded, *places)
+    assert status == 0
+    assert json.loads((tmp_path / "r.json").read_text()) == {"schema": 1, "verdict": "found"}
+    assert (tmp_path / "page" / "index.html").exists()
+    assert "index.html" in out
+
+
+def test_json_on_stdout_stands_alone(run, search, recorded, tmp_path) -> None:
+    status, out, err = run("discover", recorded, "--json", "-", "--report", tmp_path / "page")
+    assert status == 0
+    assert json.loads(out)["verdict"] == "found"
+    assert "index.html" in err
+
+
+def test_the_user_is_told_what_to_look_at(run, search, tmp_path) -> None:
+    doubtful = write(tmp_path / "degrees.csv", DEMO * [1, 1, 180 / np.pi, 180 / np.pi])
+    status, _, err = run("discover", doubtful, "--accept", "units")
+    assert status == 0
+    assert "looks like degrees" in err
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (None, f"--xla_backend_extra_options={fastloops._OPTION}=262144"),
+        ("--xla_a=1", f"--xla_a=1 --xla_backend_extra_options={fastloops._OPTION}=262144"),
+        (f"--xla_backend_extra_options={fastloops._OPTION}=7",) * 2,
+        ("flags.txt",) * 2,
+    ],
+)
+def test_fast_loops_keep_the_users_flags(before, after, monkeypatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    if before is not None:
+        monkeypatch.setenv("XLA_FLAGS", before)
+    assert fastloops.enable_fast_loops() is (before != "flags.txt")
+    assert os.environ["XLA_FLAGS"] == after
+
+
+def test_compilation_cache_is_filled_and_spares_a_folder_that_was_chosen(tmp_path: Path) -> None:
+    program = """
+import sys
+from rotflex_jax.fastloops import enable_compilation_cache
+print(enable_compilation_cache(sys.argv[1]))
+import jax
+jax.jit(lambda x: x + 1)(1.0)
+print(enable_compilation_cache())
+"""
+    left = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "c")],
+        capture_output=True,
+        text=True,
+        env={name: value for name, value in HERE.items() if not name.startswith("JAX_")},
+        check=True,
+    )
+    assert left.stdout.split() == [str(tmp_path / "c")] * 2
+    assert any((tmp_path / "c").iterdir())
+
+
+@pytest.mark.slow
+def test_discover_on_the_demo_recording(tmp_path: Path) -> None:
+    demo = files("rotflex_jax.data").joinpath("demo.csv").read_text().splitlines()
+    (tmp_path / "demo.csv").write_text("\n".join(demo[:2001]))
+    left = subprocess.run(
+        [sys.executable, "-m", "rotflex_jax", "discover", "demo.csv", "--json", "-"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=HERE | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")},
+        check=False,
+    )
+    assert left.returncode == 0, left.stderr
+    found = json.loads(left.stdout, parse_constant=pytest.fail)
+    assert found["schema"] == 1
+    assert ("coulomb", "hub") in {(turn["effect"], turn["port"]) for turn in found["rounds"]}
+    assert "Traceback" not in left.stderr

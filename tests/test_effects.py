@@ -1,0 +1,439 @@
+"""What every effect must satisfy, and what each one says."""
+
+import ast
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rotflex_jax.effects as effects
+from rotflex_jax.effects import (
+    CATALOG,
+    Actuation,
+    Coulomb,
+    CoulombAsymmetric,
+    CubicSpring,
+    Dahl,
+    DeadZone,
+    DryFriction,
+    Effect,
+    Force,
+    Gravity,
+    Inertia,
+    Linear,
+    Memory,
+    Motor,
+    QuadraticDrag,
+    QuadraticSpring,
+    Saturation,
+    Scale,
+    Sensing,
+    SensorBias,
+    SensorGain,
+    Spring,
+    Stribeck,
+    Viscous,
+    VoltageOffset,
+    candidates,
+    register,
+)
+from rotflex_jax.errors import InputError
+from rotflex_jax.parameters import specifications
+from rotflex_jax.precision import double_precision
+
+CLASSES = [CATALOG[name] for name in sorted(CATALOG)]
+SCALES = [
+    Scale(voltage=5.0, speed=2.0, position=0.05, torque=0.2),
+    Scale(voltage=0.1, speed=40.0, position=10.0, torque=1e-3),
+    Scale(voltage=24.0, speed=1e-3, position=1e-4, torque=50.0),
+]
+PASSIVE = {
+    "viscous",
+    "motor",
+    "coulomb",
+    "coulomb_asymmetric",
+    "stribeck",
+    "quadratic_drag",
+    "dahl",
+}
+CONSERVATIVE = {"inertia", "spring", "cubic_spring", "quadratic_spring", "gravity"}
+
+every_effect = pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.name)
+
+
+@pytest.fixture(autouse=True)
+def _strict_double():
+    strict = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
+    with double_precision(), strict[0], strict[1]:
+        yield
+
+
+def example(cls: type[Effect]) -> Effect:
+    """An instance with a different, unremarkable value for each parameter."""
+    given = {}
+    for i, (name, spec) in enumerate(cls.declared().items()):
+        if getattr(cls, name) is not None:
+            given[name] = spec.typical * (1 + 0.3 * i)
+    return cls(at=cls.ports[0], **given)
+
+
+def law(effect: Effect, numbers, position, speed, voltage, z):
+    """All that an effect says at one point, as one vector, whatever its kind."""
+    effect = effect.replace(**dict(zip(effect.values, numbers, strict=True)))
+    if isinstance(effect, Linear):
+        s = effect.stamp()
+        lists = (*s.own, s.from_speed, s.from_voltage, s.torque)
+        said = [s.inertia, s.damping, s.stiffness, s.drive, *(c for row in lists for c in row)]
+    elif isinstance(effect, Force):
+        said = [effect.force(position, speed, voltage)]
+    elif isinstance(effect, DryFriction):
+        said = [effect.limit(position, jnp.abs(speed), way) for way in (1.0, -1.0)]
+    elif isinstance(effect, Memory):
+        said = [
+            effect.force(z, position, speed, voltage),
+            effect.flow(z, position, speed, voltage),
+        ]
+    elif isinstance(effect, Actuation):
+        voltages = voltage * jnp.array([1.0, -1.0, 0.3], voltage.dtype)
+        return effect.drive(voltages, 0.002)
+    else:
+        assert isinstance(effect, Sensing)
+        said = [effect.measure(position)]
+    return jnp.stack([jnp.asarray(s, position.dtype) for s in said])
+
+
+def nothing(effect: Effect, position, voltage):
+    """What `law` gives where the effect is absent."""
+    if isinstance(effect, Actuation):
+        return voltage * jnp.array([1.0, -1.0, 0.3])
+    if isinstance(effect, Sensing):
+        return position[None]
+    return jnp.zeros(())
+
+
+def scalars(*numbers: float, dtype=jnp.float64) -> list[jax.Array]:
+    return [jnp.asarray(n, dtype) for n in numbers]
+
+
+# -- conformance: every effect ------------------------------------------------------------------
+
+
+@every_effect
+@pytest.mark.parametrize("scale", SCALES)
+def test_probes_are_valid_and_show(cls, scale):
+    groups = cls.probes(scale)
+    assert groups or not cls.searched
+    for group in groups:
+        moved = []
+        for probe in group:
+            assert set(probe) == set(example(cls).values)
+            effect = cls(at=cls.ports[0], **probe)
+            assert not cls.amplitudes or any(probe[a] != 0 for a in cls.amplitudes)
+            shown = []
+            for share in (-1.0, -0.4, 0.02, 0.4, 1.0):
+                point = [share * s for s in (scale.position, scale.speed, scale.voltage)]
+                x, w, v, z = scalars(*point, 0.5 * share)
+                said = law(effect, list(effect.values.values()), x, w, v, z)
+                assert np.isfinite(said).all()
+                shown.append(np.ravel(said - nothing(effect, x, v)))
+            moved.append(np.concatenate(shown))
+        # Each probe does something, and each something else than the others of its group.
+        assert np.linalg.matrix_rank(np.array(moved), tol=1e-12) == len(group)
+
+
+@every_effect
+def test_ports_and_relations(cls):
+    assert set(cls.searched) <= set(cls.ports)
+    assert set(cls.amplitudes) <= set(cls.declared())
+    assert set(cls.contains) <= set(CATALOG)
+    assert all(name in cls.equation for name in cls.declared())
+
+
+@pytest.mark.parametrize("cls", [c for c in CLASSES if c.amplitudes], ids=lambda c: c.name)
+def test_absent_at_zero_amplitude(cls):
+    effect = example(cls).replace(**dict.fromkeys(cls.amplitudes, 0.0))
+    for point in ((0.0, 0.0, 0.0, 0.0), (0.7, -1.3, 2.0, 0.4), (-0.2, 5.0, -0.1, -1.0)):
+        x, w, v, z = scalars(*point)
+        said = law(effect, list(effect.values.values()), x, w, v, z)
+        if isinstance(effect, Memory):
+            said = said[:1]  # the state may move, the torque may not
+        assert np.abs(said - nothing(effect, x, v)).max() == 0
+
+
+@every_effect
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["double", "single"])
+def test_nothing_is_nan_at_rest_or_at_a_kink(cls, dtype):
+    effect = example(cls)
+    numbers = np.array(list(effect.values.values()))
+    lowest = np.array([max(s.lower, 0.0) for s in specifications(effect).values()])
+    edges = [0.0, *numbers]  # a voltage on the edge of a dead zone, and so on
+    points = [(e, w, -e, 0.0) for e in edges for w in (0.0, e, -1e3)]
+    cases = np.array([(*n, *p) for n in (numbers, lowest) for p in points])
+
+    def flat(a):
+        return law(effect, list(a[: len(numbers)]), *a[len(numbers) :])
+
+    @jax.jit
+    @jax.vmap
+    def all_of(a):
+        return flat(a), jax.jacfwd(flat)(a), jax.jacrev(flat)(a)
+
+    said, *slopes = all_of(jnp.asarray(cases, dtype))
+    assert said.dtype == dtype
+    assert np.isfinite(said).all() and all(np.isfinite(s).all() for s in slopes)
+
+
+@every_effect
+def test_derivatives_equal_central_differences(cls):
+    effect = example(cls)
+    numbers = np.array(list(effect.values.values()))
+    point = np.array([0.31, -0.17, 3.7, 0.4])  # away from every kink of the example
+
+    def flat(a):
+        return law(effect, list(a[: len(numbers)]), *a[len(numbers) :])
+
+    at = np.concatenate([numbers, point])
+    flat_jit = jax.jit(flat)
+    slopes = np.array(jax.jit(jax.jacfwd(flat))(jnp.asarray(at)))
+    for i in range(len(at)):
+        h = 1e-5 * max(abs(at[i]), 1e-3)
+        up, down = (
+            np.array(flat_jit(jnp.asarray(at + s * h * np.eye(len(at))[i]))) for s in (1, -1)
+        )
+        np.testing.assert_allclose(slopes[:, i], (up - down) / (2 * h), rtol=1e-6, atol=1e-7)
+
+
+@every_effect
+def test_jit_vmap_and_arrays_agree_with_one_point(cls):
+    effect = example(cls)
+    numbers = [jnp.asarray(n) for n in effect.values.values()]
+    grid = jnp.linspace(-2.0, 2.0, 7)
+    one_by_one = jnp.stack([law(effect, numbers, g, 2 * g, 3 * g, g / 4) for g in grid])
+    mapped = jax.jit(jax.vmap(lambda g: law(effect, numbers, g, 2 * g, 3 * g, g / 4)))(grid)
+    np.testing.assert_allclose(mapped, one_by_one, rtol=1e-14, atol=1e-16)
+    if isinstance(effect, Force):
+        np.testing.assert_allclose(
+            effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, 0], rtol=1e-14
+        )
+    if isinstance(effect, Sensing):
+        np.testing.assert_allclose(effect.measure(grid), one_by_one[:, 0], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "cls", [c for c in CLASSES if not issubclass(c, (Actuation, Sensing))], ids=lambda c: c.name
+)
+def test_gives_no_energy(cls):
+    """A torque either takes energy at every moment or stores it as a function of the state."""
+    assert (cls.name in PASSIVE) != (cls.name in CONSERVATIVE), "say which of the two it is"
+    effect = example(cls)
+    if cls.name == "viscous":
+        effect = effect.replace(coefficient=0.01)
+    numbers = [jnp.asarray(n) for n in effect.values.values()]
+    rng = np.random.default_rng(0)
+    for x, w, v, z in rng.normal(size=(50, 4)) * [1.0, 3.0, 5.0, 1.0]:
+        said = np.array(law(effect, numbers, *scalars(x, w, v, np.tanh(z))))
+        if isinstance(effect, Linear):
+            assert (said[:3] >= 0).all()
+        elif cls.name in CONSERVATIVE:
+            other = law(effect, numbers, *scalars(x, -2 * w, v + 1, 0.0))
+            assert said == other  # of the position alone, so it has a potential
+        elif isinstance(effect, DryFriction):
+            assert (said >= 0).all()
+            elsewhere = law(effect, numbers, *scalars(x + 1, 3 * w, v, z))
+            assert (elsewhere == said).all() or not effect.steady
+        elif isinstance(effect, Force):
+            assert said[0] * w <= 0
+        else:
+            assert isinstance(effect, Dahl)
+            torque, rate = said
+            storing = effect.level * effect.presliding * np.tanh(z) * rate
+            assert torque * w + storing <= 1e-15
+
+
+@every_effect
+def test_description_is_plain(cls):
+    text = json.dumps(cls.describe())
+    assert cls.name in text and cls.title in text
+    assert all(name in text for name in cls.declared())
+    assert cls.title == cls.title.strip(". ")
+
+
+@every_effect
+def test_sentence_is_for_people(cls):
+    effect = example(cls)
+    said = effect.sentence()
+    assert any(c.isdigit() for c in said)
+    assert not said.endswith(".") and "nan" not in said and "None" not in said
+    if not isinstance(effect, Actuation):
+        assert effect.at in said
+
+
+@every_effect
+def test_frozen_hashable_and_replaced_by_value(cls):
+    effect = example(cls)
+    assert effect == example(cls) and hash(effect) == hash(example(cls))
+    name = next(iter(effect.values))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(effect, name, 1.0)
+    changed = effect.replace(**{name: 2 * effect.values[name] + 0.5})
+    assert changed != effect and changed.at == effect.at
+
+
+@every_effect
+def test_bad_parameters_are_named(cls):
+    for name, spec in cls.declared().items():
+        bad = [math.nan, math.inf, "1.0", np.float64(math.nan)]
+        bad += [None] if getattr(cls, name) is not None else []
+        bad += [spec.lower - 1.0] if math.isfinite(spec.lower) else []
+        for value in bad:
+            with pytest.raises(InputError, match=f"{cls.__name__} was given {name}="):
+                cls(at=cls.ports[0], **{name: value})
+    with pytest.raises(InputError, match="name of a port"):
+        cls(at=0.3)
+
+
+def test_every_file_registers_and_knows_no_sibling():
+    folder = Path(effects.__file__).parent
+    apart = {"__init__", "kinds", "catalogue"}
+    registered = {c.__module__.rpartition(".")[2] for c in CLASSES}
+    assert {f.stem for f in folder.glob("*.py")} - apart == registered
+    allowed = {"effects.kinds", "effects.catalogue", "parameters", "errors"}
+    for file in folder.glob("*.py"):
+        if file.stem in apart:
+            continue
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            module = node.module if isinstance(node, ast.ImportFrom) else ""
+            if module and module.startswith("rotflex_jax."):
+                assert module.removeprefix("rotflex_jax.") in allowed, f"{file.name}: {module}"
+    exported = {name for name in effects.__all__ if isinstance(getattr(effects, name), type)}
+    assert {c.__name__ for c in CLASSES} <= exported
+
+
+def test_a_name_is_taken_once():
+    @dataclasses.dataclass(frozen=True)
+    class Impostor(Coulomb):
+        name: ClassVar[str] = "stribeck"
+
+    with pytest.raises(InputError, match="'stribeck' is taken by Stribeck"):
+        register(Impostor)
+    assert CATALOG["stribeck"] is Stribeck
+
+
+def test_a_users_own_effect_enters_the_catalogue_and_the_search():
+    @dataclasses.dataclass(frozen=True)
+    class Cog(Coulomb):
+        name: ClassVar[str] = "cog_of_a_user"
+        searched: ClassVar[tuple[str, ...]] = ("arm",)
+
+    try:
+        assert register(Cog) is Cog
+        assert (Cog, "arm") in candidates()
+        register(Cog)  # a cell that is run twice
+    finally:
+        del CATALOG["cog_of_a_user"]
+
+
+def test_candidates_cover_the_first_family():
+    pairs = {(cls.name, port) for cls, port in candidates()}
+    assert len(pairs) == len(candidates())
+    for name in ("coulomb", "coulomb_asymmetric", "stribeck", "dahl", "quadratic_drag", "viscous"):
+        assert {(name, p) for p in ("hub", "arm", "joint")} <= pairs
+    assert {p for n, p in pairs if n == "gravity"} == {"hub", "arm"}
+    assert ("cubic_spring", "joint") in pairs and ("cubic_spring", "hub") not in pairs
+    assert ("sensor_bias", "alpha") in pairs and ("sensor_bias", "theta") not in pairs
+    assert not {"inertia", "spring", "motor"} & {n for n, _ in pairs}
+
+
+# -- what each one says -------------------------------------------------------------------------
+
+
+def test_linear_stamps():
+    assert Inertia(at="arm", inertia=0.0059).stamp().inertia == 0.0059
+    assert Spring(at="joint", stiffness=1.61).stamp().stiffness == 1.61
+    assert Viscous(at="hub", coefficient=-0.01).stamp().damping == -0.01
+
+
+def test_motor_by_the_papers_numbers():
+    """g = 0.2065 N m/V, b = 0.110870 N m s/rad, 1.86254 rad/s/V running free."""
+    stamp = Motor().stamp()
+    np.testing.assert_allclose(stamp.drive, 0.2065, rtol=1e-12)
+    np.testing.assert_allclose(stamp.damping, 0.110870, atol=5e-7)
+    np.testing.assert_allclose(stamp.drive / stamp.damping, 1.86254, atol=5e-6)
+    lossy = Motor(efficiency=0.621).stamp()
+    np.testing.assert_allclose(lossy.drive, 0.621 * stamp.drive, rtol=1e-15)
+    np.testing.assert_allclose(lossy.damping, 0.621 * stamp.damping, rtol=1e-15)
+
+
+def test_motor_with_inductance_has_the_same_steady_state():
+    slow, quick = Motor(inductance=0.18e-3, efficiency=0.8), Motor(efficiency=0.8)
+    assert (slow.order, quick.order) == (1, 0)
+    s = slow.stamp()
+    v, w = 3.0, 2.0
+    current = -(s.from_voltage[0] * v + s.from_speed[0] * w) / s.own[0][0]
+    q = quick.stamp()
+    np.testing.assert_allclose(s.torque[0] * current, q.drive * v - q.damping * w, rtol=1e-14)
+    np.testing.assert_allclose(s.own[0][0], -2.6 / 0.18e-3, rtol=1e-15)
+
+
+def test_dry_friction_levels():
+    assert Coulomb(at="hub", level=0.03).limit(0.0, 2.0, -1.0) == 0.03
+    uneven = CoulombAsymmetric(at="hub", forward=0.045, backward=0.015)
+    assert float(uneven.limit(0.0, 1.0, 1.0)) == 0.045
+    assert float(uneven.limit(0.0, 1.0, -1.0)) == 0.015
+    stribeck = Stribeck(at="hub", level=0.02, excess=0.01, speed=0.3)
+    at = lambda speed: float(stribeck.limit(0.0, jnp.asarray(speed), 1.0))  # noqa: E731
+    np.testing.assert_allclose(at(0.0), 0.03, rtol=1e-15)
+    np.testing.assert_allclose(at(0.3), 0.02 + 0.01 / math.e, rtol=1e-15)
+    np.testing.assert_allclose(at(30.0), 0.02, rtol=1e-15)
+
+
+def test_force_laws():
+    x, w, v = scalars(0.2, -3.0, 1.0)
+    np.testing.assert_allclose(QuadraticDrag("arm", 0.01).force(x, w, v), 0.09, rtol=1e-14)
+    np.testing.assert_allclose(CubicSpring("joint", 60.0).force(x, w, v), -0.48, rtol=1e-14)
+    np.testing.assert_allclose(QuadraticSpring("joint", 3.0).force(x, w, v), -0.12, rtol=1e-14)
+    np.testing.assert_allclose(QuadraticSpring("joint", 3.0).force(-x, w, v), -0.12, rtol=1e-14)
+
+
+def test_gravity_is_a_pendulum():
+    """An unbalance m g l that hangs lowest at `rest` restores with m g l sin(x - rest)."""
+    size, rest = 0.3, 0.7
+    weight = Gravity("hub", sine=size * math.cos(rest), cosine=-size * math.sin(rest))
+    x = jnp.linspace(-4.0, 4.0, 9)
+    expected = -size * jnp.sin(x - rest)
+    np.testing.assert_allclose(weight.force(x, x, x), expected, rtol=1e-13, atol=1e-16)
+    assert f"{math.degrees(rest):.0f} degrees" in weight.sentence()
+
+
+def test_actuation_laws_and_their_order():
+    v = jnp.array([-6.0, -0.2, -0.05, 0.0, 0.05, 0.3, 6.0])
+    zone = DeadZone(positive=0.25, negative=0.1).drive(v, 0.01)
+    np.testing.assert_allclose(zone, [-5.9, -0.1, 0, 0, 0, 0.05, 5.75], atol=1e-15)
+    limited = Saturation(limit=5.0).drive(v, 0.01)
+    np.testing.assert_allclose(limited, [-5, -0.2, -0.05, 0, 0.05, 0.3, 5], atol=0)
+    np.testing.assert_allclose(VoltageOffset(offset=0.3).drive(v, 0.01), v + 0.3, atol=0)
+    assert Saturation.stage < VoltageOffset.stage < DeadZone.stage
+    assert DeadZone().at == "input"
+
+
+def test_sensing_laws():
+    assert SensorBias("alpha", bias=0.02).measure(0.1) == pytest.approx(0.12, rel=1e-15)
+    assert SensorGain("alpha", error=-0.1).measure(0.2) == pytest.approx(0.18, rel=1e-15)
+
+
+def test_dahl_builds_up_over_the_presliding():
+    """Under a steady motion z = 1 - exp(-x / presliding)."""
+    friction = Dahl("hub", level=0.03, presliding=0.004)
+    x = jnp.linspace(0.0, 0.03, 50)
+    z = 1 - jnp.exp(-x / 0.004)
+    speed = jnp.full_like(x, 1.7)
+    rate = friction.flow(z, x, speed, x)
+    np.testing.assert_allclose(rate, 1.7 * jnp.exp(-x / 0.004) / 0.004, rtol=1e-12)
+    np.testing.assert_allclose(friction.force(z, x, speed, x)[-1], -0.03, rtol=1e-3)
+    assert friction.initial() == 0.0

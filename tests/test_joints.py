@@ -1,0 +1,164 @@
+"""The presets against the numbers of their sources."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rotflex_jax import joints
+from rotflex_jax.effects import Motor
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints.springs import ARM_ANCHORS, HUB_ANCHORS, SIDE, SPRINGS
+from rotflex_jax.mechanism import linearise
+from rotflex_jax.precision import double_precision
+
+# Stiffness [N m/rad] by the maker's 2010 formula (config_rotflex.m) at spring, hub anchor A B C
+# and arm anchor 1 2 3, rounded to 4 decimals.
+TABLE = {
+    1: {
+        "A": (1.0582, 0.9413, 0.8395),
+        "B": (0.8656, 0.7701, 0.6842),
+        "C": (0.6705, 0.5988, 0.5331),
+    },
+    2: {
+        "A": (1.6911, 1.5136, 1.3694),
+        "B": (1.3949, 1.2485, 1.1234),
+        "C": (1.0931, 0.9832, 0.8865),
+    },
+    3: {
+        "A": (3.0323, 2.7168, 2.4641),
+        "B": (2.5047, 2.2442, 2.0237),
+        "C": (1.9668, 1.7712, 1.6004),
+    },
+}
+
+
+def test_the_27_stiffnesses():
+    settings = joints.spring_settings()
+    assert len(settings) == 27
+    for (spring, hub, arm), stiffness in settings.items():
+        assert stiffness == pytest.approx(TABLE[spring][hub][arm - 1], abs=1e-4)
+    assert (min(settings, key=settings.get), max(settings, key=settings.get)) == (
+        (1, "C", 3),
+        (3, "A", 1),
+    )
+
+
+@pytest.mark.parametrize(("spring", "hub", "arm"), joints.spring_settings())
+def test_stiffness_is_the_curvature_of_the_springs_energy(spring, hub, arm):
+    kit, d, R = SPRINGS[spring], HUB_ANCHORS[hub], ARM_ANCHORS[arm]
+
+    def energy(alpha):
+        total = 0.0
+        for side in (SIDE, -SIDE):
+            length = jnp.hypot(R * jnp.cos(alpha) - d, R * jnp.sin(alpha) - side)
+            stretch = length - kit.length
+            total = total + kit.preload * stretch + kit.rate / 2 * stretch**2
+        return total
+
+    with double_precision():
+        slope = jax.grad(energy)(0.0)
+        curvature = jax.grad(jax.grad(energy))(0.0)
+    assert abs(float(slope)) < 1e-12  # the two springs balance
+    assert float(curvature) == pytest.approx(joints.spring_stiffness(spring, hub, arm), rel=1e-12)
+
+
+def test_the_older_stiffness_formula():
+    """0.509 to 2.247 N m/rad over the settings, 1.0142 at the default."""
+    old = [joints.spring_stiffness(*s, preload_only=True) for s in joints.spring_settings()]
+    assert joints.spring_stiffness(preload_only=True) == pytest.approx(1.0142, abs=5e-5)
+    assert min(old) == pytest.approx(0.509, abs=5e-4)
+    assert max(old) == pytest.approx(2.247, abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [((4, "A", 1), "spring was given 4"), ((1, "D", 1), "hub_anchor"), ((1, "A", 0), "arm_anchor")],
+)
+def test_a_setting_the_kit_lacks(setting, said):
+    with pytest.raises(InputError, match=said):
+        joints.spring_stiffness(*setting)
+
+
+def test_inertias_of_the_maker():
+    arms = [joints.arm_inertia(i) for i in range(4)]
+    np.testing.assert_allclose(arms, [0.0019002, 0.0035260, 0.0038938, 0.0043002], atol=5e-8)
+    # Servo alone 0.00208418 and 0.00177276 without tachometer; the joint's body adds 0.0005.
+    assert joints.hub_inertia() == pytest.approx(0.00258418, abs=5e-9)
+    assert joints.hub_inertia(tachometer=False) == pytest.approx(0.00227276, abs=5e-9)
+    with pytest.raises(InputError, match="arm was given 5"):
+        joints.quanser_2010(arm=5)
+
+
+def test_paper_holds_its_table_and_takes_other_values():
+    joint = joints.paper()
+    values = dict(zip(joint.parameter_names, joint.values, strict=True))
+    assert values == {
+        "hub.inertia.inertia": 0.0021,
+        "arm.inertia.inertia": 0.0059,
+        "joint.spring.stiffness": 1.61,
+        "hub.motor.torque_constant": 0.00767,
+        "hub.motor.back_emf": 0.00767,
+        "hub.motor.resistance": 2.6,
+        "hub.motor.gear_ratio": 70.0,
+        "hub.motor.efficiency": 1.0,
+        "hub.viscous.coefficient": 0.0,
+        "joint.viscous.coefficient": 0.0,
+    }
+    other = joints.paper(stiffness=1.5, hub_damping=0.004, efficiency=0.621, inductance=0.18e-3)
+    changed = dict(zip(other.parameter_names, other.values, strict=True))
+    assert set(changed) - set(values) == {"hub.motor.inductance"}
+    assert {n for n in values if changed[n] != values[n]} == {
+        "joint.spring.stiffness",
+        "hub.viscous.coefficient",
+        "hub.motor.efficiency",
+    }
+
+
+@pytest.mark.parametrize(
+    "joint",
+    [joints.paper(), joints.paper(inductance=1e-4), joints.quanser_2002(), joints.quanser_2010()],
+)
+def test_what_a_fit_moves(joint):
+    assert joint.free_names == (
+        "hub.inertia.inertia",
+        "joint.spring.stiffness",
+        "hub.motor.torque_constant",
+        "hub.viscous.coefficient",
+        "joint.viscous.coefficient",
+    )
+    assert joint.channels == ("theta", "alpha")
+    assert set(joint.port_vectors) == {"hub", "joint", "arm"}
+
+
+def test_the_makers_presets():
+    old, new = joints.quanser_2002(), joints.quanser_2010(arm=3, spring=3, hub_anchor="C")
+    assert old.effect("spring", "joint").stiffness == pytest.approx(1.0142, abs=5e-5)
+    assert old.effect("viscous", "hub").coefficient == 0.004
+    assert new.effect("spring", "joint").stiffness == pytest.approx(1.7712, abs=5e-5)
+    assert new.effect("viscous", "hub").coefficient == 0.015
+    assert new.effect("inertia", "arm").inertia == joints.arm_inertia(3)
+    motor = new.effect("motor", "hub")
+    assert motor.efficiency == pytest.approx(0.621)
+    assert (motor.torque_constant, motor.back_emf) == pytest.approx((7.68e-3, 7.68e-3), abs=5e-6)
+    assert joints.quanser_2010(inductance=1.8e-4).effect("motor", "hub").inductance == 1.8e-4
+
+
+def test_single_inertia_answers_like_a_first_order_lag():
+    """Speed of a servo under a voltage: gain 1 / (km Kg), time constant J / (damping)."""
+    servo = joints.single_inertia(0.0021, damping=0.01)
+    space = linearise(servo)
+    drive, damping = 0.2065, 0.2065 * 0.00767 * 70 + 0.01
+    np.testing.assert_allclose(space.A, [[0, 1], [0, -damping / 0.0021]], rtol=1e-12)
+    np.testing.assert_allclose(space.B, [0, drive / 0.0021], rtol=1e-12)
+    assert servo.channels == ("theta",)
+    assert servo.free_names == ("hub.inertia.inertia", "hub.viscous.coefficient")
+
+
+def test_single_inertia_stands_for_a_linear_axis():
+    drive = Motor(torque_constant=35.15, back_emf=0.0, resistance=1.0, gear_ratio=1.0)
+    axis = joints.single_inertia(95.1, motor=drive, damping=203.5, channel="q", port="axis")
+    space = linearise(axis)
+    np.testing.assert_allclose(space.A[1, 1], -203.5 / 95.1, rtol=1e-12)
+    np.testing.assert_allclose(space.B[1], 35.15 / 95.1, rtol=1e-12)
+    assert axis.channels == ("q",) and axis.effect("motor", "axis").at == "axis"

@@ -1,0 +1,175 @@
+"""The same run from every kind of file."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+
+from rotflex_jax.data import load, save_csv
+from rotflex_jax.data.excitation import noise
+from rotflex_jax.recording import Recording
+
+Ts = 0.004
+N = 200
+U = noise(N, Ts, seed=7)
+Y = np.column_stack([np.cumsum(U) * Ts, 0.1 * np.sin(np.arange(N) / 9)])
+T = Ts * np.arange(N)
+TABLE = np.column_stack([T, U, Y])
+
+
+def write_text(
+    path: Path,
+    header: str = "t,voltage,theta,alpha",
+    delimiter: str = ",",
+    table: np.ndarray = TABLE,
+    comma: bool = False,
+) -> Path:
+    rows = [delimiter.join(f"{x:.17g}" for x in row) for row in table]
+    text = "\n".join(rows).replace(".", ",") if comma else "\n".join(rows)
+    path.write_text(header + "\n" + text + "\n", encoding="utf-8")
+    return path
+
+
+def assert_is_the_run(recording: Recording) -> None:
+    np.testing.assert_allclose(recording.u, U, rtol=1e-14)
+    np.testing.assert_allclose(recording.y, Y, rtol=1e-14, atol=1e-16)
+    assert recording.Ts == pytest.approx(Ts, rel=1e-12)
+    assert recording.channels == ("theta", "alpha")
+
+
+def write_hdf5(path: Path, values: dict) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in values.items():
+            file.create_dataset(name, data=np.atleast_2d(value))
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+        file.create_dataset("note", data=np.array([[104], [105]], dtype=np.uint16))
+        file["note"].attrs["MATLAB_class"] = np.bytes_("char")
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, written by a test".ljust(512))
+
+
+COLUMNS = {"t": T, "voltage": U, "theta": Y[:, 0], "alpha": Y[:, 1]}
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "run.csv": write_text,
+    "run.tsv": lambda path: write_text(path, "t\tvoltage\ttheta\talpha", "\t"),
+    "run.txt": lambda path: write_text(path, "t  voltage theta alpha", "  "),
+    "run.npz": lambda path: np.savez(path, **COLUMNS),
+    "run.mat": lambda path: scipy.io.savemat(path, COLUMNS),
+    "run.7.3.mat": lambda path: write_hdf5(path, COLUMNS),
+    "run.parquet": lambda path: pd.DataFrame(COLUMNS).to_parquet(path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_format_gives_the_same_run(name: str, tmp_path: Path) -> None:
+    WRITERS[name](tmp_path / name)
+    for path in (tmp_path / name, str(tmp_path / name)):
+        recording = load(path)
+        assert_is_the_run(recording)
+        assert recording.source == name
+
+
+def test_dataframe_is_taken_as_it_is() -> None:
+    assert_is_the_run(load(pd.DataFrame(COLUMNS)))
+    nullable = pd.DataFrame(COLUMNS).convert_dtypes()
+    assert_is_the_run(load(nullable))
+
+
+@pytest.mark.parametrize(
+    ("header", "delimiter", "comma"),
+    [
+        ("t;voltage;theta;alpha", ";", False),
+        ("t;voltage;theta;alpha", ";", True),
+        ("t|voltage|theta|alpha", "|", False),
+        ('"t","voltage","theta","alpha"', ",", False),
+        (" t , voltage , theta , alpha ", ",", False),
+        ("% t\tvoltage\ttheta\talpha", "\t", False),
+        ("# made by hand\n#\nt,voltage,theta,alpha", ",", False),
+        ("# made by hand\n# t,voltage,theta,alpha", ",", False),
+        ("\ufefft,voltage,theta,alpha", ",", False),
+        ("\nt,voltage,theta,alpha", ",", False),
+    ],
+)
+def test_text_of_many_hands(header: str, delimiter: str, comma: bool, tmp_path: Path) -> None:
+    path = write_text(tmp_path / "run.csv", header, delimiter, comma=comma)
+    assert_is_the_run(load(path))
+
+
+def test_windows_line_ends(tmp_path: Path) -> None:
+    path = write_text(tmp_path / "run.csv")
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n") + b"\r\n\r\n")
+    assert_is_the_run(load(path))
+
+
+def test_columns_of_other_names(tmp_path: Path) -> None:
+    path = write_text(tmp_path / "run.csv", "zeit,vm,hub angle,tip")
+    named: dict[str, Any] = {"time": "zeit", "input": "vm"}
+    assert_is_the_run(load(path, outputs=["hub angle", "tip"], **named))
+    other = load(path, outputs={"position": "tip"}, **named)
+    assert other.channels == ("position",)
+    np.testing.assert_allclose(other.y[:, 0], Y[:, 1])
+    single = load(path, outputs="hub angle", **named)
+    assert single.channels == ("theta",)
+
+
+def test_other_columns_may_hold_what_they_like(tmp_path: Path) -> None:
+    frame = pd.DataFrame(COLUMNS)
+    frame["remark"] = "fine"
+    frame["spare"] = np.nan
+    frame.to_csv(tmp_path / "run.csv", index=False)
+    assert_is_the_run(load(tmp_path / "run.csv"))
+
+
+def test_degrees_become_radians(tmp_path: Path) -> None:
+    table = np.column_stack([T, U, np.rad2deg(Y)])
+    assert_is_the_run(load(write_text(tmp_path / "run.csv", table=table), degrees=True))
+
+
+def test_sampling_period_from_the_argument_the_column_or_both(tmp_path: Path) -> None:
+    path = write_text(tmp_path / "bare.csv", "voltage,theta,alpha", table=TABLE[:, 1:])
+    recording = load(path, Ts=Ts)
+    assert_is_the_run(recording)
+    assert recording.start == 0.0
+    assert_is_the_run(load(write_text(tmp_path / "both.csv"), Ts=Ts))
+
+
+def test_clock_that_starts_late_is_kept_and_rounding_forgiven(tmp_path: Path) -> None:
+    table = TABLE.copy()
+    table[:, 0] = np.round(1.7e9 + T, 3)
+    recording = load(write_text(tmp_path / "run.csv", table=table))
+    assert recording.start == 1.7e9
+    assert recording.Ts == Ts
+
+
+def test_matrices_and_structures_have_columns(tmp_path: Path) -> None:
+    log = {"log": {"u": U, "angles": Y}, "clock": np.column_stack([T, U]), "gain": 3.0}
+    scipy.io.savemat(tmp_path / "run.mat", log)
+    recording = load(
+        tmp_path / "run.mat",
+        time="clock[0]",
+        input="log.u",
+        outputs=("log.angles[0]", "log.angles[1]"),
+    )
+    assert_is_the_run(recording)
+
+
+def test_accepted_faults_reach_the_recording(tmp_path: Path) -> None:
+    table = TABLE.copy()
+    table[:, 2] = 0.3
+    recording = load(write_text(tmp_path / "run.csv", table=table), accept=("constant",))
+    assert [finding.kind for finding in recording.findings] == ["constant"]
+
+
+def test_what_is_saved_is_loaded_again_bit_by_bit(tmp_path: Path) -> None:
+    recording = Recording(u=U, y=Y, Ts=Ts, start=2.0)
+    again = load(save_csv(recording, tmp_path / "run.csv"))
+    np.testing.assert_array_equal(again.u, recording.u)
+    np.testing.assert_array_equal(again.y, recording.y)
+    assert (again.Ts, again.start) == (recording.Ts, recording.start)
+    assert (tmp_path / "run.csv").read_text().startswith("t,voltage,theta,alpha\n2,")

@@ -1,0 +1,83 @@
+"""Metrics against their formulas, worked out by hand."""
+
+import numpy as np
+import pytest
+
+from rotflex_jax import metrics
+from rotflex_jax.errors import InputError
+from rotflex_jax.recording import Recording
+
+Y = np.array([[0.0, 10.0], [1.0, 10.0], [3.0, 14.0], [4.0, 14.0]])
+E = np.array([[1.0, 2.0], [-1.0, 2.0], [1.0, 2.0], [-3.0, 2.0]])
+
+BY_HAND = {
+    # mean of e^2 is (1 + 1 + 1 + 9) / 4 = 3 and 4; y is 2 and 12 in the mean
+    "rmse": [np.sqrt(3), 2.0],
+    "nrmse": [np.sqrt(12 / 10), 1.0],
+    "fit_percent": [100 * (1 - np.sqrt(12 / 10)), 0.0],
+    # e is -0.5 in the mean: its variance 3 - 0.25; a constant error has none
+    "vaf": [100 * (1 - 2.75 / 2.5), 100.0],
+    "mae": [1.5, 2.0],
+    "max_error": [3.0, 2.0],
+}
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_metric_equals_its_formula_by_hand(name: str) -> None:
+    np.testing.assert_allclose(getattr(metrics, name)(Y, Y - E), BY_HAND[name], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_one_channel_alone_gives_one_number(name: str) -> None:
+    value = getattr(metrics, name)(Y[:, 0], (Y - E)[:, 0])
+    assert np.ndim(value) == 0
+    assert value == pytest.approx(BY_HAND[name][0])
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_samples_that_the_model_may_see_do_not_count(name: str) -> None:
+    metric, y_hat = getattr(metrics, name), Y - E
+    scrambled = y_hat.copy()
+    scrambled[:2] = 1e6
+    np.testing.assert_array_equal(metric(Y, scrambled, n_init=2), metric(Y, y_hat, n_init=2))
+    assert not np.allclose(metric(Y, scrambled, n_init=1), metric(Y, y_hat, n_init=1))
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_recording_brings_its_channels_and_its_initial_samples(name: str) -> None:
+    rng = np.random.default_rng(0)
+    recording = Recording(u=rng.normal(size=80), y=0.1 * rng.normal(size=(80, 2)), Ts=0.01)
+    y_hat = recording.y + 0.1 * rng.normal(size=(80, 2))
+    metric = getattr(metrics, name)
+    values = metric(recording, y_hat)
+    assert list(values) == ["theta", "alpha"]
+    assert all(type(value) is float for value in values.values())
+    np.testing.assert_array_equal(
+        list(values.values()), metric(recording.y, y_hat, recording.n_init)
+    )
+
+
+def test_single_precision_stays_single() -> None:
+    assert metrics.rmse(Y.astype(np.float32), (Y - E).astype(np.float32)).dtype == np.float32
+
+
+def test_channel_at_rest_has_no_fit_but_an_error() -> None:
+    rest = np.column_stack([np.ones(5), np.arange(5.0)])
+    fit = metrics.fit_percent(rest, rest + 0.5)
+    assert np.isnan(fit[0])
+    assert np.isfinite(fit[1])
+    assert metrics.rmse(rest, rest + 0.5) == pytest.approx([0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "phrase"),
+    [
+        ((Y, Y[:3]), "same shape"),
+        ((Y, Y[:, 0]), "same shape"),
+        ((Y, Y, 4), "4 of 4 samples"),
+        ((Y, Y, -1), "-1 of 4 samples"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(arguments: tuple, phrase: str) -> None:
+    with pytest.raises(InputError, match=phrase):
+        metrics.rmse(*arguments)

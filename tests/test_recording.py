@@ -1,0 +1,248 @@
+"""A recording: its defaults, its parts, and what it says about the quality of its data."""
+
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from rotflex_jax.data.excitation import noise, prbs, steps
+from rotflex_jax.errors import InputError
+from rotflex_jax.recording import Finding, Recording
+from rotflex_jax.recording.sensor import quantisation_step
+
+Ts = 0.002
+COUNT = 2 * np.pi / 4096
+
+
+def swinging(N: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A voltage and two smooth angles that follow it: a filtered integral, and its change."""
+    u = noise(N, Ts, seed=seed)
+    speed = np.zeros(N)
+    for k in range(N - 1):
+        speed[k + 1] = speed[k] + Ts * (60 * u[k] - 30 * speed[k])
+    theta = np.cumsum(speed) * Ts
+    alpha = np.convolve(speed, np.sin(np.arange(100) / 16) * np.exp(-np.arange(100) / 30), "full")
+    return u, np.column_stack([theta, 1e-2 * alpha[:N]])
+
+
+def stop_and_go(rests: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """A hub that dry friction brings to rest, time and again at the very ends of its motion."""
+    s = np.linspace(0, 1, 101)
+    rise = np.where(s < 0.5, 2 * s**2, 1 - 2 * (1 - s) ** 2)
+    away, push = np.append(rise, np.ones(650)), np.append(2 * np.sign(0.5 - s), np.full(650, 0.1))
+    theta = np.concatenate([away, 1 - away] * rests)
+    return np.concatenate([push, -push] * rests), 0.5 * theta
+
+
+def kinds(recording: Recording) -> dict[tuple[str, str], Finding]:
+    return {(finding.kind, finding.channel): finding for finding in recording.findings}
+
+
+def test_defaults_are_those_of_the_joint() -> None:
+    u, y = swinging()
+    recording = Recording(u=u, y=y, Ts=Ts)
+    assert recording.channels == ("theta", "alpha")
+    assert recording.units == ("rad", "rad")
+    assert (recording.N, recording.duration, recording.n_init) == (4000, pytest.approx(8.0), 100)
+    np.testing.assert_allclose(recording.t[[0, 1, -1]], [0.0, 0.002, 7.998])
+    np.testing.assert_array_equal(recording.channel("alpha"), y[:, 1])
+    assert recording.findings == ()
+    with pytest.raises(InputError, match="no channel 'beta'; it has theta, alpha"):
+        recording.channel("beta")
+
+
+@pytest.mark.parametrize(
+    ("N", "period", "n_init"), [(4000, 0.002, 100), (200, 0.1, 10), (60, 0.002, 15), (52, 1.0, 10)]
+)
+def test_initial_samples_are_a_fifth_of_a_second_within_limits(
+    N: int, period: float, n_init: int
+) -> None:
+    u, y = swinging(N)
+    assert Recording(u=u, y=y, Ts=period).n_init == n_init
+
+
+def test_one_output_is_theta_and_may_come_without_a_second_axis() -> None:
+    u, y = swinging()
+    recording = Recording(u=u[:, None], y=y[:, 0], Ts=np.float32(0.5))
+    assert recording.channels == ("theta",)
+    assert recording.y.shape == (4000, 1)
+    assert recording.u.shape == (4000,)
+    assert type(recording.Ts) is float
+
+
+def test_precision_is_kept_and_whole_numbers_become_double() -> None:
+    u, y = swinging()
+    single = Recording(u=u.astype(np.float32), y=y.astype(np.float32), Ts=Ts)
+    assert single.u.dtype == single.y.dtype == single.slice(0, 100).y.dtype == np.float32
+    mixed = Recording(u=np.round(10 * u).astype(int), y=y.astype(np.float32), Ts=Ts)
+    assert mixed.u.dtype == mixed.y.dtype == np.float64
+
+
+def test_data_are_copied_and_cannot_be_changed() -> None:
+    u, y = swinging()
+    recording = Recording(u=u, y=y, Ts=Ts)
+    u[0] = y[0, 0] = 7.0
+    assert recording.u[0] != 7.0
+    assert recording.y[0, 0] != 7.0
+    with pytest.raises(ValueError, match="read-only"):
+        recording.y[0, 0] = 7.0
+    with pytest.raises(AttributeError):
+        recording.Ts = 1.0  # pyright: ignore
+    assert pickle.loads(pickle.dumps(recording)).channels == recording.channels
+
+
+def test_split_cuts_in_the_order_of_time_and_keeps_the_clock() -> None:
+    u, y = swinging()
+    recording = Recording(u=u, y=y, Ts=Ts, start=1.0, n_init=50, source="here")
+    for train, test in (recording.split(0.7), recording.split(), recording.split(seconds=5.6)):
+        assert (train.N, test.N) == (2800, 1200)
+        np.testing.assert_array_equal(np.concatenate([train.y, test.y]), y)
+        np.testing.assert_array_equal(np.concatenate([train.u, test.u]), u)
+        np.testing.assert_allclose(np.concatenate([train.t, test.t]), recording.t)
+        assert (test.n_init, test.source, test.resolution) == (50, "here", recording.resolution)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options"),
+    [((0.0,), {}), ((1.0,), {}), ((-0.5,), {}), ((), {"seconds": 8.0}), ((0.5,), {"seconds": 1.0})],
+)
+def test_split_without_two_parts_is_refused(arguments: tuple, options: dict) -> None:
+    u, y = swinging()
+    with pytest.raises(InputError, match=r"split|both given"):
+        Recording(u=u, y=y, Ts=Ts).split(*arguments, **options)
+
+
+def test_part_at_rest_is_no_error_and_says_so() -> None:
+    u, theta = stop_and_go()
+    recording = Recording(u=u, y=theta, Ts=Ts)
+    rest = recording.slice(200, 240)
+    assert {key: finding.severity for key, finding in kinds(rest).items()} == {
+        ("short", "time"): "warning",
+        ("constant_input", "voltage"): "warning",
+        ("constant", "theta"): "warning",
+    }
+    assert rest.n_init == 10
+    with pytest.raises(InputError, match="within its"):
+        recording.slice(10, 10)
+
+
+def test_decimation_keeps_the_impulse_of_the_input_and_the_measured_outputs() -> None:
+    u, y = swinging(1003)
+    slow = Recording(u=u, y=y, Ts=Ts, n_init=100).decimate(5)
+    assert (slow.N, slow.Ts, slow.n_init) == (200, pytest.approx(0.01), 20)
+    np.testing.assert_array_equal(slow.y, y[:1000:5])
+    np.testing.assert_allclose(np.sum(slow.u) * slow.Ts, np.sum(u[:1000]) * Ts)
+    with pytest.raises(InputError, match="whole number"):
+        slow.decimate(0)
+
+
+def test_quantisation_is_named_with_its_step() -> None:
+    u, y = swinging()
+    recording = Recording(u=u, y=COUNT * np.round(y / COUNT), Ts=Ts)
+    assert recording.resolution == pytest.approx({"theta": COUNT, "alpha": COUNT})
+    finding = kinds(recording)["quantised", "theta"]
+    assert finding.severity == "note"
+    assert "0.001534 rad (0.08789 deg)" in finding.message
+    assert recording.slice(0, 60).resolution == recording.resolution
+
+
+def test_known_resolution_is_believed() -> None:
+    u, y = swinging()
+    recording = Recording(u=u, y=y, Ts=Ts, resolution={"theta": 1e-3})
+    assert recording.resolution == {"theta": 1e-3, "alpha": None}
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_step_is_found_whatever_its_unit_offset_and_rounding(scale: float) -> None:
+    _, y = swinging()
+    levels = np.round(y[:, 0] / COUNT)
+    step = COUNT * scale
+    assert quantisation_step(levels * step) == pytest.approx(step)
+    assert quantisation_step(levels * step + 0.3 * step) == pytest.approx(step)
+    assert quantisation_step((levels * step).astype(np.float32)) == pytest.approx(step, rel=1e-5)
+    assert quantisation_step(2 * levels * step) == pytest.approx(2 * step)
+    in_degrees = np.rad2deg(levels * COUNT)
+    assert quantisation_step(np.round(in_degrees, 3)) == pytest.approx(360 / 4096, rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_free_numbers_have_no_step(seed: int) -> None:
+    _, y = swinging(seed=seed)
+    assert quantisation_step(y[:, 0]) is None
+    assert quantisation_step(np.repeat(y[:, 1], 3)) is None
+    assert quantisation_step(steps(4000, Ts, seed=seed)) is None
+    held = np.maximum.accumulate(y[:, 0])  # exactly still for long stretches
+    assert quantisation_step(held) is None
+
+
+def test_rest_at_the_end_of_the_motion_is_not_saturation() -> None:
+    u, theta = stop_and_go()
+    assert np.sum(theta == theta.max()) > 1000
+    for y in (theta, COUNT * np.round(theta / COUNT)):
+        assert ("saturated", "theta") not in kinds(Recording(u=u, y=y, Ts=Ts))
+
+
+@pytest.mark.parametrize("step", [0.0, COUNT])
+@pytest.mark.parametrize("seed", range(4))
+def test_sensor_that_cuts_off_is_refused_unless_accepted(seed: int, step: float) -> None:
+    u, y = swinging(seed=seed)
+    y = step * np.round(y / step) if step else y
+    Recording(u=u, y=y, Ts=Ts)
+    limit = 0.5 * np.max(np.abs(y[:, 1]))
+    y[:, 1] = np.clip(y[:, 1], -limit, limit)
+    with pytest.raises(InputError, match=r"'alpha' is exactly .* saturated"):
+        Recording(u=u, y=y, Ts=Ts)
+    accepted = Recording(u=u, y=y, Ts=Ts, accept="saturated")
+    assert kinds(accepted)["saturated", "alpha"].severity == "warning"
+
+
+def test_sensor_that_stays_at_its_limit_while_it_is_driven_is_saturated() -> None:
+    u, y = swinging(seed=1)
+    theta = y[:, 0] + np.linspace(0, 3, len(u))
+    Recording(u=u, y=theta, Ts=Ts)
+    with pytest.raises(InputError, match="saturated"):
+        Recording(u=u, y=np.minimum(theta, theta[1500]), Ts=Ts)
+
+
+def test_one_sided_sensor_is_named_rectified() -> None:
+    u, y = swinging()
+    y[:, 1] = np.maximum(y[:, 1], 0.0)
+    assert kinds(Recording(u=u, y=y, Ts=Ts))["rectified", "alpha"].severity == "warning"
+
+
+def test_clipped_voltage_is_named_and_fine() -> None:
+    u, y = swinging()
+    clipped = kinds(Recording(u=np.clip(u, -1, 1), y=y, Ts=Ts))["clipped_input", "voltage"]
+    assert clipped.severity == "note"
+    assert "limit, -1 and 1 V" in clipped.message
+
+
+@pytest.mark.parametrize("u", [prbs(4000, Ts), steps(4000, Ts)], ids=["prbs", "steps"])
+def test_held_voltage_is_no_clipped_one(u: np.ndarray) -> None:
+    assert kinds(Recording(u=u, y=swinging()[1], Ts=Ts)) == {}
+
+
+def test_units_are_doubted_by_size() -> None:
+    u, y = swinging()
+    assert (
+        "looks like degrees"
+        in kinds(Recording(u=u, y=np.rad2deg(y), Ts=Ts))["units", "theta"].message
+    )
+    assert "millivolts" in kinds(Recording(u=1000 * u, y=y, Ts=Ts))["units", "voltage"].message
+    assert kinds(Recording(u=u, y=1000 * y, Ts=Ts, units=("mm", "mm"))) == {}
+
+
+def test_measured_joint_loads_without_a_doubt(measured: Callable[[str], list[Recording]]) -> None:
+    for recording in measured("rotflex"):
+        assert set(kinds(recording)) == {("quantised", "theta"), ("quantised", "alpha")}
+        found = [quantisation_step(recording.channel(name)) for name in ("theta", "alpha")]
+        assert found == pytest.approx([COUNT, COUNT])
+
+
+def test_measured_joint_cut_off_is_seen(measured: Callable[[str], list[Recording]]) -> None:
+    recording = measured("rotflex")[0]
+    limit = 0.6 * np.max(recording.y[:, 0])
+    y = np.clip(recording.y, -limit, limit)
+    with pytest.raises(InputError, match=r"'theta' is exactly .* saturated"):
+        Recording(u=recording.u, y=y, Ts=recording.Ts)
