@@ -72,6 +72,7 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "no alpha": (text(alpha=None), {}, r"no column 'alpha'; it has t, voltage, theta: .*outputs="),
     "no voltage": (text(voltage=None), {}, r"no column 'voltage'; it has .* with input="),
     "no time": (text(t=None), {}, r"no column 't'.* or give the sampling period with Ts="),
+    "one line": (b"t,voltage\n0,1\n", {}, "no column 'theta'; it has t, voltage: name"),
     "no such column": (text(), {"input": "u"}, r"no column 'u'; it has t, voltage, theta, alpha"),
     "no such time": (text(), {"time": "clock"}, "no column 'clock'"),
     "column twice": (
@@ -339,6 +340,10 @@ ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
     "short": ({"u": U[:49], "y": Y[:49]}, "at least 50 samples, but has 49"),
     "empty": ({"u": [], "y": np.empty((0, 2))}, r"have \(0,\) and \(0, 2\)"),
     "constant": ({"y": np.column_stack([Y[:, 0], np.full(N, 0.1)])}, "'alpha' never changes"),
+    "constant but for rounding": (
+        {"y": np.column_stack([Y[:, 0], np.where(U > 0, 0.3, 0.1 + 0.2)])},
+        "'alpha' never changes",
+    ),
     "fault": ({"accept": ("nan",)}, "but has 'nan'"),
 }
 

@@ -97,6 +97,7 @@ def test_random_steps_keep_their_levels_and_times() -> None:
 def test_sweep_passes_through_the_band_at_a_constant_rate_in_octaves() -> None:
     u = sweep(100_000, 1e-4, band=(1.0, 16.0), amplitude=2.0)
     assert np.max(np.abs(u)) == pytest.approx(2.0, rel=1e-3)
+    assert u[0] == 0.0
     rising = np.flatnonzero((u[:-1] < 0) & (u[1:] >= 0)) * 1e-4
     middle, frequency = 0.5 * (rising[:-1] + rising[1:]), 1 / np.diff(rising)
     np.testing.assert_allclose(frequency, 16.0 ** (middle / 10.0), rtol=0.02)

@@ -159,6 +159,13 @@ def test_matrices_and_structures_have_columns(tmp_path: Path) -> None:
     assert_is_the_run(recording)
 
 
+def test_matrix_of_matlab_7_3_is_not_transposed(tmp_path: Path) -> None:
+    # HDF5 sees what MATLAB stores column by column with its axes exchanged.
+    write_hdf5(tmp_path / "run.mat", {"log": TABLE.T})
+    outputs = ("log[2]", "log[3]")
+    assert_is_the_run(load(tmp_path / "run.mat", time="log[0]", input="log[1]", outputs=outputs))
+
+
 def test_accepted_faults_reach_the_recording(tmp_path: Path) -> None:
     table = TABLE.copy()
     table[:, 2] = 0.3
@@ -167,9 +174,9 @@ def test_accepted_faults_reach_the_recording(tmp_path: Path) -> None:
 
 
 def test_what_is_saved_is_loaded_again_bit_by_bit(tmp_path: Path) -> None:
-    recording = Recording(u=U, y=Y, Ts=Ts, start=2.0)
+    recording = Recording(u=U, y=Y, Ts=Ts, start=86400.5)
     again = load(save_csv(recording, tmp_path / "run.csv"))
     np.testing.assert_array_equal(again.u, recording.u)
     np.testing.assert_array_equal(again.y, recording.y)
     assert (again.Ts, again.start) == (recording.Ts, recording.start)
-    assert (tmp_path / "run.csv").read_text().startswith("t,voltage,theta,alpha\n2,")
+    assert (tmp_path / "run.csv").read_text().startswith("t,voltage,theta,alpha\n86400.5,")

@@ -106,6 +106,21 @@ def test_restarted_runs_do_not_hide_where_an_error_arises(moving) -> None:
     assert not any("arises while the deflection" in w.statement for w in blind)
 
 
+def test_noise_at_standstill_is_no_reversal() -> None:
+    N, Ts = 3000, 0.004
+    t = Ts * np.arange(N)
+    theta = np.where(t < 4.0, 0.3 * np.sin(np.pi * t), 0.0)  # turns at 0.5, 1.5, 2.5, 3.5 s, rests
+    rng = np.random.default_rng(0)
+    y = np.column_stack([theta, 0.1 * np.sin(9 * t)]) + 1e-3 * rng.standard_normal((N, 2))
+    rec = Recording(u=np.sin(t), y=y, Ts=Ts)
+    noise = {"theta": 1e-3, "alpha": 1e-3}
+    view = next(v for v in views(rec, rec.channels, noise, None) if v.kind == "reversal")
+    just_after = np.flatnonzero(np.diff(view.bins, prepend=view.bins[0]) < 0)
+    # The fifth is where the motion stops dead and the filter swings.
+    assert rec.t[just_after[:4]] == pytest.approx([0.5, 1.5, 2.5, 3.5], abs=0.03)
+    assert len(just_after) <= 5
+
+
 def test_time_is_named(moving) -> None:
     e = white(moving)
     e[3000:, 1] *= 3.0

@@ -85,8 +85,9 @@ def test_data_are_copied_and_cannot_be_changed() -> None:
     u[0] = y[0, 0] = 7.0
     assert recording.u[0] != 7.0
     assert recording.y[0, 0] != 7.0
-    with pytest.raises(ValueError, match="read-only"):
-        recording.y[0, 0] = 7.0
+    for array in (recording.u, recording.y, recording.slice(0, 100).y):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 7.0
     with pytest.raises(AttributeError):
         recording.Ts = 1.0  # pyright: ignore
     assert pickle.loads(pickle.dumps(recording)).channels == recording.channels
@@ -162,6 +163,12 @@ def test_step_is_found_whatever_its_unit_offset_and_rounding(scale: float) -> No
     assert quantisation_step(levels * step + 0.3 * step) == pytest.approx(step)
     assert quantisation_step((levels * step).astype(np.float32)) == pytest.approx(step, rel=1e-5)
     assert quantisation_step(2 * levels * step) == pytest.approx(2 * step)
+    # The same level twice, a rounding error apart, is no level of its own.
+    far_off = 1000 * step * (np.arange(4000) % 2)
+    assert quantisation_step(levels * step + far_off - far_off / 3 * 3) == pytest.approx(step)
+    # No two neighbouring levels: the smallest gap is two steps.
+    sparse = np.cumsum(np.tile([2, 3], 20))[np.arange(4000) % 40]
+    assert quantisation_step(sparse * step) == pytest.approx(step)
     in_degrees = np.rad2deg(levels * COUNT)
     assert quantisation_step(np.round(in_degrees, 3)) == pytest.approx(360 / 4096, rel=1e-4)
 
@@ -183,6 +190,13 @@ def test_rest_at_the_end_of_the_motion_is_not_saturation() -> None:
         assert ("saturated", "theta") not in kinds(Recording(u=u, y=y, Ts=Ts))
 
 
+def test_turning_point_on_one_step_of_the_encoder_is_not_saturation() -> None:
+    u, _ = swinging()
+    zigzag = np.abs(np.arange(4000) % 1000 - 500) * COUNT / 3.5
+    recording = Recording(u=u, y=COUNT * np.round(zigzag / COUNT), Ts=Ts)
+    assert set(kinds(recording)) == {("quantised", "theta")}
+
+
 @pytest.mark.parametrize("step", [0.0, COUNT])
 @pytest.mark.parametrize("seed", range(4))
 def test_sensor_that_cuts_off_is_refused_unless_accepted(seed: int, step: float) -> None:
@@ -199,10 +213,17 @@ def test_sensor_that_cuts_off_is_refused_unless_accepted(seed: int, step: float)
 
 def test_sensor_that_stays_at_its_limit_while_it_is_driven_is_saturated() -> None:
     u, y = swinging(seed=1)
-    theta = y[:, 0] + np.linspace(0, 3, len(u))
+    theta = y[:, 0] + np.linspace(0, 60, len(u))  # drifts into the limit and never comes back
     Recording(u=u, y=theta, Ts=Ts)
     with pytest.raises(InputError, match="saturated"):
         Recording(u=u, y=np.minimum(theta, theta[1500]), Ts=Ts)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_rest_against_a_strong_push_one_way_proves_nothing(sign: float) -> None:
+    u, theta = stop_and_go()
+    u = np.where(theta == theta.max(), 2.0 * sign, u)
+    assert ("saturated", "theta") not in kinds(Recording(u=u, y=theta, Ts=Ts))
 
 
 def test_one_sided_sensor_is_named_rectified() -> None:

@@ -305,6 +305,27 @@ def test_step_converges_to_true_sticking(case):
     assert errors[1] < errors[0] / 50  # a first-order rule would gain 16
 
 
+@pytest.mark.parametrize("case", ["hub", "hub and joint", "all three"])
+def test_motion_is_continuous_in_the_friction_level(case):
+    """No jump as sticks and reversals move from sample to sample: fits differentiate through them."""
+    joint = with_all(paper(), *FRICTION[case][0])
+    at = joint.parameter_names.index("hub.coulomb.level")
+    u, N = noise(300, seed=3), 1000
+    with double_precision():
+        start, values = jnp.zeros(4), jnp.asarray(joint.values)
+        gates = jnp.ones(len(joint.effects))
+
+        def theta(level):
+            v = values.at[at].set(level)
+            run = (joint.structure, Exponential(), v, gates, start, jnp.asarray(u))
+            return free_run(*run, jnp.asarray(0.004))[1][:, 0]
+
+        levels = jnp.linspace(0.03, 0.0306, N)
+        moved = np.diff(np.asarray(jax.jit(jax.vmap(theta))(levels)), axis=0)
+    assert np.abs(moved).max() < 1e-5  # the whole range moves it by N times less than a millirad
+    assert np.abs(np.diff(moved, axis=0)).max() < 2e-7
+
+
 def test_smoothed_runge_kutta_converges_to_true_sticking():
     mine, exact = FRICTION["hub and joint"]
     u, Ts = noise(250), 0.004

@@ -107,8 +107,7 @@ def multisine(
     for _ in range(300 if optimise_crest else 0):
         limit = 0.85 * np.max(np.abs(u))
         u = signal(np.angle(np.fft.rfft(np.clip(u, -limit, limit))[harmonics]))
-        if np.max(np.abs(u)) < np.max(np.abs(best)):
-            best = u
+        best = min(best, u, key=lambda signal: np.max(np.abs(signal)))
     return np.tile(best, int(periods))
 
 
@@ -215,8 +214,8 @@ def pulse(
     start, stop = round(delay / Ts), round((delay + width) / Ts)
     if not 0 <= start < stop <= N:
         raise InputError(
-            f"The pulse must lie within the {N * Ts:g} s of the signal, but lasts from {delay:g} to "
-            f"{delay + width:g} s; change `delay`, `width` or `N`."
+            f"The pulse must lie within the {N * Ts:g} s of the signal, but lasts from {delay:g} "
+            f"to {delay + width:g} s; change `delay`, `width` or `N`."
         )
     u = np.zeros(N)
     u[start:stop] = amplitude

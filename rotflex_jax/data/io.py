@@ -119,20 +119,22 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def _outputs(outputs: str | Sequence[str] | Mapping[str, str] | None) -> dict[str, str]:
+def _outputs(outputs: Any) -> dict[str, str]:
     """Channel name to column name."""
     if outputs is None:
         return {"theta": "theta", "alpha": "alpha"}
-    if isinstance(outputs, Mapping) and outputs:
-        return dict(outputs)
-    several = isinstance(outputs, Sequence) and not isinstance(outputs, str)
-    names = list(outputs) if several else [outputs]
-    if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
+    chosen: dict[str, Any]
+    if isinstance(outputs, Mapping):
+        chosen = dict(outputs)
+    else:
+        names = list(outputs) if isinstance(outputs, list | tuple) else [outputs]
+        chosen = dict(zip(("theta", "alpha"), names, strict=False)) if len(names) <= 2 else {}
+    if not chosen or len(set(map(str, chosen.values()))) < len(chosen):
         raise InputError(
             f"Argument `outputs` must name the column of theta, then that of alpha, but is "
-            f"{names}; for other channels give a mapping such as {{'position': 'column'}}."
+            f"{outputs!r}; for other channels give a mapping such as {{'position': 'column'}}."
         )
-    return dict(zip(("theta", "alpha"), names, strict=False))
+    return chosen
 
 
 def _column(table: Table, name: str, argument: str, wrong: Mapping[str, str]) -> np.ndarray:

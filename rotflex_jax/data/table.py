@@ -37,7 +37,8 @@ class Table:
         """
         if isinstance(name, str) and name in self.columns:
             return self.columns[name]
-        there = [key for key, values in self.columns.items() if len(values) > 1]
+        longer = [key for key, values in self.columns.items() if len(values) > 1]
+        there = longer or list(self.columns)  # settings of one value are not worth offering
         names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         raise InputError(
             f"{self.label} has no column {name!r}; it has {names or 'none'}: "

@@ -3,9 +3,8 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.signal import savgol_filter
 
-from rotflex_jax.discover.looks import half_width, views
+from rotflex_jax.discover.looks import missing_acceleration, views
 from rotflex_jax.discover.places import Finding, in_frequency, in_time, in_view, information
 from rotflex_jax.discover.result import Where
 from rotflex_jax.errors import InputError
@@ -95,17 +94,10 @@ def _made(
     error: np.ndarray, recording: Recording, window_seconds: float | None
 ) -> np.ndarray | None:
     """Squared acceleration of an error (N,): where it is made, wherever it is carried to."""
-    half = half_width(recording)
-    if not half:
-        return None
-    squared = np.asarray(savgol_filter(error, 2 * half + 1, 2, deriv=2)) ** 2
-    seen = np.ones(len(error), bool)
-    restarts = [0, len(error)]
-    if window_seconds is not None:
-        restarts += window_starts(recording, window_seconds)[0].tolist()
-    for k in restarts:
-        seen[max(0, k - half) : k + half + 1] = False
-    if not seen.any() or not np.sum(squared[seen]) > 0.0:
+    starts = [] if window_seconds is None else window_starts(recording, window_seconds)[0].tolist()
+    acceleration, seen = missing_acceleration(error, recording, starts)
+    squared = acceleration**2
+    if not np.sum(squared[seen]) > 0.0:
         return None
     # What cannot be judged counts as the average does.
     return np.where(seen, squared, squared[seen].mean())

@@ -46,6 +46,30 @@ def half_width(recording: Recording) -> int:
     return half if 4 * half < recording.N else 0
 
 
+def missing_acceleration(
+    error: np.ndarray, recording: Recording, starts: Sequence[int] = (), order: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed acceleration of an error: what the model lacks there, wherever it is carried to.
+
+    Args:
+        error: Of one channel (N,) [unit].
+        recording: Gives the sampling.
+        starts: Samples at which the free run started anew; a jump there is no physics.
+        order: Of the derivative; 1 for a channel that measures a speed.
+
+    Returns:
+        Acceleration (N,) [unit/s^2], and where it can be judged; nowhere in a very short recording.
+    """
+    half, seen = half_width(recording), np.ones(len(error), bool)
+    if not half:
+        return np.zeros(len(error)), ~seen
+    window = 2 * half + 1
+    smooth = savgol_filter(error, window, 2, deriv=order, delta=recording.Ts)
+    for k in (0, *starts, len(error)):
+        seen[max(0, k - half) : k + half + 1] = False
+    return np.asarray(smooth), seen
+
+
 def views(
     recording: Recording,
     channels: Sequence[str],

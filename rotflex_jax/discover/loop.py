@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.decide import choose, describe, held_out, samples_of
+from rotflex_jax.discover.decide import TRAIN_NATS, choose, describe, held_out, samples_of
 from rotflex_jax.discover.lanes import Bench, Hypothesis
 from rotflex_jax.discover.locate import locate
 from rotflex_jax.discover.refit import Judge, refit
@@ -87,6 +87,7 @@ def discover(
     base = held_out(away, now, first)
     ranking: list[Score] = []
     taken: list[tuple[Place, float]] = []
+    passed = [base.hypothesis]
     equivalents: dict[Place, list[Place]] = {}
     samples = samples_of(judge.bench)
     for number in range(rounds):
@@ -114,12 +115,14 @@ def discover(
         equivalents[place] = [t.place for t in rivals if t.place]
         say(f"added {place[0]} at {place[1]}")
         base = dataclasses.replace(winner, place=None, numbers=0)
+        passed.append(base.hypothesis)
 
     say("checking that each effect is needed")
-    final, worth = _eliminated(judge, base.hypothesis, samples)
-    order = sorted(final.places, key=lambda p: -worth[p])
+    final, worth = _eliminated(judge, base.hypothesis, [p for p, _ in taken], samples)
+    order = [p for p, _ in taken if p in final.places]
+    order += sorted(set(final.places) - set(order), key=lambda p: -worth[p])
     scribe = Scribe(judge, away, model, trained, unseen, window_seconds)
-    hypotheses = _ladder(judge, final, order)
+    hypotheses = _ladder(judge, final, order, passed)
     say("simulating the held-out recordings")
     stages = [scribe.stage(h, held_out(away, h, first)) for h in hypotheses]
     steps = [
@@ -129,7 +132,7 @@ def discover(
             equivalent=tuple(equivalents.get(place, [])),
             parameters=scribe.own_estimates(stage, place),
             stage=stage,
-            score=dict(taken).get(place, worth[place]),
+            score=dict(taken)[place] if place in dict(taken) else worth[place],
             held_out_gain_nats=stage.log_likelihood - before.log_likelihood,
             sentence=stage.model.mechanism.effect(*place).sentence(),
             equation=CATALOG[place[0]].equation,
@@ -176,11 +179,13 @@ def _baseline(
         process_noise={},
         whitener=Whitener(np.eye(1, 1).repeat(C, 0), np.diag(1 / judge.noise)),
     )
-    unit = judge.torque**2 * float(judge.bench.data.Ts[0])
-    horizons = [dict.fromkeys(judge.ports, unit * f) for f in (1e-1, 1e-4, 1e-9)]
-    # A distant start is safe only with a short horizon: all paths begin with it.
-    short = refit(judge, [judge.with_process_noise(start, horizons[0])], turns=0)[0]
-    paths = refit(judge, [judge.with_process_noise(short, q) for q in horizons], wide=True)
+    least, most = judge.horizon
+    intensities = (most, np.sqrt(least * most), least)
+    # A distant start is safe only with a short horizon: all paths begin with one.
+    near = judge.with_process_noise(start, dict.fromkeys(judge.ports, 100 * most))
+    near = refit(judge, [near], turns=0)[0]
+    paths = [judge.with_process_noise(near, dict.fromkeys(judge.ports, q)) for q in intensities]
+    paths = refit(judge, paths, wide=True)
     return max(paths, key=lambda h: h.log_likelihood)
 
 
@@ -225,28 +230,43 @@ def _without(judge: Judge, h: Hypothesis, place: Place) -> Hypothesis:
     )
 
 
-def _eliminated(judge: Judge, h: Hypothesis, samples: float) -> tuple[Hypothesis, dict[Place, float]]:
-    """Drop, one at a time, what the model does as well without; the rest with what each is worth [nat]."""
+def _eliminated(
+    judge: Judge, h: Hypothesis, added: list[Place], samples: float
+) -> tuple[Hypothesis, dict[Place, float]]:
+    """Drop, one at a time, what the model does as well without.
+
+    The effect added last has just shown that it is needed; earlier ones may have become needless, and
+    calibrations have shown nothing yet.
+
+    Returns:
+        The model with what is needed, and what each effect on trial is worth [nat].
+    """
     s = judge.bench.supermodel
-    while h.places:
-        rivals = refit(judge, [_without(judge, h, p) for p in h.places], turns=1)
-        worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(h.places, rivals, strict=True)}
+    while on_trial := [p for p in h.places if p not in added[-1:]]:
+        rivals = refit(judge, [_without(judge, h, p) for p in on_trial], turns=1)
+        worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)}
         each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
-        needed = {p: 8.0 + 0.5 * each[p] * np.log(samples) for p in worth}
-        weakest = min(worth, key=lambda p: worth[p] - needed[p])
-        if worth[weakest] >= needed[weakest]:
+        surplus = {p: worth[p] - TRAIN_NATS - 0.5 * each[p] * np.log(samples) for p in worth}
+        weakest = min(surplus, key=lambda p: surplus[p])
+        if surplus[weakest] >= 0:
             return h, worth
-        h = rivals[h.places.index(weakest)]
+        h = rivals[on_trial.index(weakest)]
     return h, {}
 
 
-def _ladder(judge: Judge, final: Hypothesis, order: list[Place]) -> list[Hypothesis]:
-    """The baseline alone, then with one more effect at a time, each refitted; the final model last."""
+def _ladder(
+    judge: Judge, final: Hypothesis, order: list[Place], passed: list[Hypothesis]
+) -> list[Hypothesis]:
+    """The baseline alone, then with one more effect at a time, each refitted; the final model last.
+
+    A rung that the search has been on, calibrations apart, starts from there.
+    """
     below = []
     for k in range(len(order)):
-        h = final
-        for place in order[k:]:
+        wanted = set(order[:k])
+        known = [h for h in passed if wanted - set(CALIBRATIONS) == set(h.places) - set(CALIBRATIONS)]
+        h = known[0] if known and wanted <= set(known[0].places) else final
+        for place in set(h.places) - wanted:
             h = _without(judge, h, place)
         below.append(h)
-    fitted = refit(judge, below, wide=True, turns=2) if below else []
-    return [*fitted, final]
+    return [*(refit(judge, below, turns=1) if below else []), final]

@@ -165,10 +165,10 @@ def in_frequency(channel: str, error: np.ndarray, recording: Recording, unit: st
 def percent(share: float) -> str:
     """A share for a sentence.
 
-    >>> percent(0.784), percent(0.0042), percent(0.9997)
-    ('78 %', '0.4 %', '99.9 %')
+    >>> percent(0.784), percent(0.0042), percent(0.998), percent(1.0)
+    ('78 %', '0.4 %', '99.8 %', 'all')
     """
     p = 100 * float(share)
     if p >= 99.5:
-        return "99.9 %" if p < 99.95 else "all"
+        return f"{p:.1f} %" if p < 99.95 else "all"
     return f"{p:.0f} %" if p >= 1 else f"{max(p, 0.1):.1f} %"

@@ -1,6 +1,7 @@
 """Maximum-likelihood refits of hypotheses, several at once: parameters, first states, process noise."""
 
 import dataclasses
+import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,6 +16,9 @@ from rotflex_jax.mechanism.assembly import Layout
 NATS = 0.3
 # Largest step of an unconstrained coordinate: a factor e of a positive parameter.
 LONGEST = 1.0
+# Largest process torque, as a share of the intensity that a torque as large as the motor's, drawn anew
+# at each sample, would have.
+HORIZON = float(os.environ.get("QCAP", "1e-3"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +42,17 @@ class Judge:
         s = self.bench.supermodel
         most = len(s.baseline_free) + len(s.local) + 2 * len(s.baseline.coordinates) + 7
         return -(-most // 4) * 4
+
+    @property
+    def horizon(self) -> tuple[float, float]:
+        """Least and largest intensity of process torques that is tried [(N m)^2 s].
+
+        The least is a free run in all but name. The largest keeps the memory of the predictor long
+        against the sampling period: a predictor that forgets within a few samples follows any motion
+        and no longer tells one model from another, whatever its likelihood.
+        """
+        unit = self.torque**2 * float(self.bench.data.Ts[0])
+        return 1e-9 * unit, HORIZON * unit
 
     def with_process_noise(self, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
         """The hypothesis with gains for another process noise."""
@@ -155,19 +170,18 @@ def _grid(center: dict[str, float], factors: Sequence[float]) -> list[dict[str, 
 
 
 def choose_process_noise(judge: Judge, h: Hypothesis, wide: bool = False) -> Hypothesis:
-    """The process noise under which the innovations are likeliest, as if they were white in time.
+    """The process noise under which the innovations are likeliest, within `judge.horizon`.
 
     Zero is a free run, a large intensity follows the data within a few samples. Where the model is right
     it falls to the smallest value of the grid by itself; where it does not, something is missing.
     """
-    unit = judge.torque**2 * float(judge.bench.data.Ts[0])
-    floor, most = 1e-9 * unit, 1e1 * unit
+    least, most = judge.horizon
     if wide:
-        trials = _grid(dict.fromkeys(judge.ports, unit), (1e-9, 1e-7, 1e-5, 1e-3, 1e-1))
-        h = _likeliest(judge, h, trials)
+        levels = np.geomspace(least, most, 4) / most
+        h = _likeliest(judge, h, _grid(dict.fromkeys(judge.ports, most), levels))
     for factor in (10.0, 10**0.5):
         trials = _grid(h.process_noise, (1 / factor, 1.0, factor))
-        trials = [{p: min(max(v, floor), most) for p, v in t.items()} for t in trials]
+        trials = [{p: min(max(v, least), most) for p, v in t.items()} for t in trials]
         h = _likeliest(judge, h, trials)
     return h
 

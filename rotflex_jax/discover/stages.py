@@ -75,8 +75,7 @@ class Scribe:
     def _process_noise_nats(self, h: Hypothesis) -> float:
         """Log-likelihood that process torques gain over a free run with the same parameters."""
         judge = self.judge
-        unit = judge.torque**2 * float(judge.bench.data.Ts[0])
-        still = judge.with_process_noise(h, dict.fromkeys(judge.ports, 1e-9 * unit))
+        still = judge.with_process_noise(h, dict.fromkeys(judge.ports, judge.horizon[0]))
         e = judge.bench.innovations([h.lane(judge.bench), still.lane(judge.bench)])
         seen = judge.bench.data.seen
         with_noise, without = (log_likelihood(x, seen, judge.noise, 0) for x in e)

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
-ORDER = 10
+import os
+ORDER = int(os.environ.get("ORDER","0"))
 
 
 @dataclasses.dataclass(frozen=True)

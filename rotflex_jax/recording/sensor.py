@@ -102,7 +102,7 @@ def _passing_times(
             continue
         first, last = at_end[0], at_end[-1]
         nearest = np.searchsorted(beyond, first)
-        # The end is reached half a sample before the first there, left half a sample after the last.
+        # The end is reached half a sample before the first there, and left half a sample late.
         arriving = first - start + 0.5, first - beyond[nearest - 1] - 0.5
         leaving = stop - last - 0.5, beyond[nearest] - last - 0.5
         for side, (near, full) in enumerate((arriving, leaving)):

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator
 
 from rotflex_jax.discover.result import Discovery
 from rotflex_jax.parameters import Estimate
@@ -17,6 +17,7 @@ from rotflex_jax.report.style import (
     NOISE,
     blank,
     legend_above,
+    plain_ticks,
     stage_colours,
     styled,
 )
@@ -77,21 +78,19 @@ def ranking(discovery: Discovery) -> Figure | None:
     ax.set_xlim(3 * low if low < -10 else low - 8 if low < 0 else 0.0, 4 * high)
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("penalised score [nat], logarithmic beyond ±10")
-    order = [label for label in groups]
-    _ordered_legend(figure, ax, order)
+    plain_ticks(ax.xaxis)
+    handles, labels = ax.get_legend_handles_labels()
+    seen = dict(zip(labels, handles, strict=True))
+    kept = [label for label in groups if label in seen]
+    figure.legend([seen[k] for k in kept], kept, loc="outside upper left", ncols=len(kept))
     return figure
 
 
-def _ordered_legend(figure: Figure, ax: Axes, order: list[str]) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    seen = dict(zip(labels, handles, strict=True))
-    kept = [label for label in order if label in seen]
-    figure.legend([seen[k] for k in kept], kept, loc="outside upper left", ncols=len(kept))
-
-
 @styled
-def staircase(discovery: Discovery) -> Figure:
-    """Held-out error of every stage against the noise of the sensor."""
+def staircase(discovery: Discovery) -> Figure | None:
+    """Held-out error of every stage against the noise of the sensor; none without a round."""
+    if not discovery.rounds:
+        return None
     by_channel, labels = units(discovery), stage_labels(discovery)
     colours = stage_colours(len(labels))
     figure = blank(10.0, 3.6)
@@ -118,12 +117,13 @@ def staircase(discovery: Discovery) -> Figure:
             ax.annotate(
                 plain_number(value),
                 (k, value),
-                (-8, -3),
+                (-7, -10),
                 textcoords="offset points",
                 ha="right",
                 va="center",
                 fontsize=8.5,
                 color=INK,
+                path_effects=[withStroke(linewidth=3, foreground="white")],
             )
         # Markers in the legend speak of the kind of run; their colours, of the stage.
         ax.plot([], [], "o", color=MUTED, ms=7, label=f"run anew every {seconds:g} s")
@@ -135,18 +135,18 @@ def staircase(discovery: Discovery) -> Figure:
             ax.axhline(floor, color=NOISE, lw=1.1, ls=(0, (4, 2)), label="sensor noise")
         ax.set_yscale("log")
         values = [v for v in (*windows, *whole, floor) if v > 0 and math.isfinite(v)] or [1.0]
-        ax.set_ylim(min(values) / 1.8, 1.8 * max(values))
+        ax.set_ylim(min(values) / 2.2, 1.8 * max(values))
         ax.set_xlim(-0.55, len(labels) - 0.55)
         ax.set_xticks(x, [label.replace(" at ", "\nat ") for label in labels])
         ax.tick_params(axis="x", length=0)
         for text, colour in zip(ax.get_xticklabels(), colours, strict=True):
             text.set_color(colour)
             text.set_fontweight("bold")
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-        ax.yaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=20))
+        plain_ticks(ax.yaxis)
         ax.grid(axis="x", visible=False)
         ax.set_title(channel)
-        ax.set_xlabel("model [stage]")
+        ax.set_xlabel("model after each round [–]")
         ax.set_ylabel(f"held-out rms error [{read}]")
     legend_above(figure, axes)
     return figure
@@ -199,11 +199,8 @@ def parameters(discovery: Discovery) -> Figure | None:
     ax.set_ylabel("parameter [–]")
     ax.set_xlabel("difference from the final estimate [%]")
     ax.set_xscale("symlog", linthresh=10.0, linscale=0.8)
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+g}" if v else "0"))
-    ax.xaxis.set_major_locator(MaxNLocator(9)) if _reach(ax) <= 10 else None
+    if max(abs(v) for v in ax.get_xlim()) <= 12:
+        ax.set_xscale("linear")
+    plain_ticks(ax.xaxis)
     legend_above(figure, [ax])
     return figure
-
-
-def _reach(ax: Axes) -> float:
-    return max(abs(v) for v in ax.get_xlim())

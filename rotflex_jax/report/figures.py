@@ -83,12 +83,15 @@ def _captions(discovery: Discovery) -> dict[str, tuple[str, str]]:
             "Spectral density of the held-out error, with the level of white sensor noise.",
         ),
         "map": (
-            f"Rms error of {channel} where the machine was at each speed and position; blank where "
-            "it hardly ever was." + (" Both maps have the same colours." if both else ""),
-            "Map of the held-out error over speed and position.",
+            f"Left: error of {channel} at each speed and position; blank where the machine hardly "
+            "ever was. Right of it: the mean acceleration that the model lacks there. A pattern is "
+            "the picture of a missing force, less what other parameters took over; speckles are "
+            "noise" + ("; after the last round none should be left." if both else "."),
+            "Maps of the held-out error and of the missing acceleration over speed and position.",
         ),
         "profiles": (
-            "Bars above the black line mark where the baseline makes more than its share of error.",
+            "Bars above the black line mark where the baseline makes more than its share of error; "
+            "the outermost take what lies beyond.",
             "Share of the error by bins, against the share that an even spread would have.",
         ),
         "ranking": (

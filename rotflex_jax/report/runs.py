@@ -14,9 +14,7 @@ from rotflex_jax.report.style import (
     BASELINE,
     FAINT,
     FINAL,
-    INK,
     MEASURED,
-    MUTED,
     NOISE,
     blank,
     legend_above,
@@ -66,7 +64,7 @@ def shown(discovery: Discovery) -> Shown:
 
 
 def worst_window(discovery: Discovery) -> tuple[int, int]:
-    """First and last sample of the window where the baseline is worst, in multiples of the noise."""
+    """First sample and end of the window where the baseline is worst, in multiples of the noise."""
     s = shown(discovery)
     floor = np.array([discovery.noise_floor.get(c) or 1.0 for c in units(discovery)])
     loss = np.sum(((s.measured - s.baseline) / floor) ** 2, axis=1)
@@ -78,7 +76,7 @@ def worst_window(discovery: Discovery) -> tuple[int, int]:
 
 @styled
 def overlay(discovery: Discovery) -> Figure:
-    """Measured and simulated outputs on held-out data, whole and in the worst window, with errors."""
+    """Measured and simulated outputs on held-out data, with errors; the worst window enlarged."""
     s, by_channel = shown(discovery), units(discovery)
     first, last = worst_window(discovery)
     t = s.recording.t
@@ -102,7 +100,7 @@ def overlay(discovery: Discovery) -> Figure:
             _lines(above, below, s, c, part, scale)
             floor = scale * discovery.noise_floor.get(channel, 0.0)
             if floor:
-                below.axhspan(-2 * floor, 2 * floor, color=FAINT, lw=0, label="± 2 sensor noise")
+                below.axhspan(-2 * floor, 2 * floor, color=FAINT, lw=0, label="± 2 σ of the sensor")
             above.set_ylabel(f"{channel} [{read}]")
             below.set_ylabel(f"error [{read}]")
         for row in (2 * c, 2 * c + 1):
@@ -150,21 +148,19 @@ def spectra(discovery: Discovery) -> Figure:
         f = np.zeros(0)
         for run, colour, label in runs:
             error = scale * (s.measured[:, c] - run[:, c])
-            # Some eight stretches of the recording are averaged, half overlapping.
-            f, density = welch(error, 1 / Ts, nperseg=max(16, N // 5), detrend=False)
+            # Nine stretches of the recording or more, half overlapping, are averaged.
+            length = min(4096, max(16, N // 5))
+            f, density = welch(error, 1 / Ts, nperseg=length, detrend="constant")
             size = np.sqrt(np.maximum(density, np.finfo(float).tiny))
             ax.loglog(f[1:], size[1:], color=colour, lw=1.3, label=label)
         floor = discovery.noise_floor.get(channel, 0.0)
         if floor > 0:
             level = scale * floor * np.sqrt(2 * Ts)
             ax.axhline(level, color=NOISE, lw=1.1, ls=(0, (4, 2)), label="white sensor noise")
-            ax.set_ylim(bottom=level / 30)
+            ax.set_ylim(level / 8, max(ax.get_ylim()[1], 12 * level))
         ax.set_xlim(f[1], f[-1])
         ax.set_title(channel)
         ax.set_xlabel("frequency [Hz]")
         ax.set_ylabel(f"density of the error [{read}/√Hz]")
     legend_above(figure, axes)
     return figure
-
-
-__all__ = ["INK", "MUTED", "Shown", "overlay", "shown", "spectra", "worst_window"]

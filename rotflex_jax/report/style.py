@@ -4,21 +4,24 @@ import base64
 import functools
 import io
 from collections.abc import Callable, Iterable
-from typing import Any, ParamSpec
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 P = ParamSpec("P")
+Drawn = TypeVar("Drawn", bound=Figure | None)
 
 INK, MUTED, FAINT = "#1f2933", "#66727f", "#d5dbe1"
 MEASURED, BASELINE, FINAL, NOISE = "#9aa5b1", "#c8452f", "#0f6f86", "#5b6570"
 BETWEEN = ("#d98e04", "#7a5aa6", "#5f8f3a", "#b5587f")
 
-_LOOK: dict[str, Any] = {
+_LOOK: Any = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
@@ -58,11 +61,11 @@ def stage_colours(count: int) -> tuple[str, ...]:
     return (BASELINE, *between, FINAL)
 
 
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
     """A function that draws in this look and leaves matplotlib's settings as they were."""
 
     @functools.wraps(draw)
-    def inside(*args: P.args, **kwargs: P.kwargs) -> Figure:
+    def inside(*args: P.args, **kwargs: P.kwargs) -> Drawn:
         with matplotlib.rc_context(_LOOK):
             return draw(*args, **kwargs)
 
@@ -102,6 +105,15 @@ def thinned(t: np.ndarray, y: np.ndarray, most: int = 1600) -> tuple[np.ndarray,
     pick = np.sort(np.stack([rows.argmin(1), rows.argmax(1)], axis=1), axis=1) + first[:, None]
     pick = np.append(pick.ravel(), len(y) - 1)
     return t[pick], y[pick]
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Ticks as numbers without powers of ten."""
+    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:,g}".translate(_SIGNS)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+_SIGNS = str.maketrans({",": "\u202f", "-": "−"})
 
 
 def data_address(figure: Figure) -> str:

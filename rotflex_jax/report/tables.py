@@ -126,12 +126,18 @@ def summary_table(discovery: Discovery) -> Table:
         A table; a notebook shows it by itself.
     """
     seconds = f"{discovery.baseline.window_seconds:g} s"
-    table = Table(title=escape(discovery.sentence), title_justify="left", title_style="bold")
-    table.add_column("")
-    for heading in channel_headings(discovery):
-        table.add_column(escape(f"{heading}, {seconds} runs"), justify="right")
-    for heading in channel_headings(discovery):
-        table.add_column(escape(f"{heading}, one run"), justify="right")
+    table = Table(
+        title=escape(discovery.sentence),
+        title_justify="left",
+        title_style="bold",
+        box=None,
+        pad_edge=False,
+        header_style="bold",
+    )
+    table.add_column("", no_wrap=True)
+    for kind in (f"runs of {seconds}", "one long run"):
+        for heading in channel_headings(discovery):
+            table.add_column(escape(f"{heading}\n{kind}"), justify="right")
     for row in error_rows(discovery):
         cells = (*row.windows, *row.whole)
         styled = (f"[green]{c.value}[/green]" if c.reached else c.value for c in cells)
@@ -142,7 +148,7 @@ def summary_table(discovery: Discovery) -> Table:
 
 
 def parameter_table(discovery: Discovery) -> Table:
-    """Parameters with 95 % intervals, of the baseline and of the final model, for `rich.print`.
+    """Parameters of the final model with 95 % intervals, for `rich.print`.
 
     Args:
         discovery: What was found.
@@ -150,16 +156,15 @@ def parameter_table(discovery: Discovery) -> Table:
     Returns:
         A table; a notebook shows it by itself.
     """
-    table = Table()
-    table.add_column("parameter")
-    for label in dict.fromkeys(("baseline", "final" if discovery.rounds else "baseline")):
-        table.add_column(label, justify="right")
-        table.add_column("95 %")
-    table.add_column("unit")
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("95 %", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
     for row in parameter_rows(discovery):
-        cells: list[str] = []
-        for stage in dict.fromkeys((0, len(row.stages) - 1)):
-            cell = row.stages[stage]
-            cells += [cell[0], "held" if row.held else cell[1]] if cell else ["", ""]
-        table.add_row(escape(row.name), *cells, escape(row.unit), style="dim" if row.held else "")
+        last = row.stages[-1]
+        if last is not None:
+            interval = "held" if row.held else last[1]
+            style = "dim" if row.held else ""
+            table.add_row(escape(row.name), last[0], interval, escape(row.unit), style=style)
     return table

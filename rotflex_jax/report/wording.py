@@ -36,15 +36,27 @@ def effect_title(effect: str) -> str:
 
 
 def sentence(text: str) -> str:
-    """A text with a capital letter at its start and a full stop at its end.
+    """A text as a sentence in print: capital letter, full stop, names and units not torn apart.
 
-    >>> sentence("the hub sticks")
-    'The hub sticks.'
+    >>> sentence("cubic_spring explains it")
+    'Cubic spring explains it.'
     """
     text = text.strip()
+    for name in CATALOG:
+        text = re.sub(rf"\b{name}\b", name.replace("_", " "), text)
     if text and text[-1] not in ".!?":
         text += "."
-    return text[:1].upper() + text[1:]
+    return together(text[:1].upper() + text[1:])
+
+
+def together(text: str) -> str:
+    r"""A text whose numbers stay on a line with their units, powers as in print.
+
+    >>> together("0.03 N m at 2 deg").split(" ")
+    ['0.03\xa0N\xa0m', 'at', '2\xa0deg']
+    """
+    text = unit_text(text).replace("N m", "N\xa0m").replace("kg m", "kg\xa0m")
+    return re.sub(r"(?<=\d) (?=(?:N|V|deg|rad|Hz|ms|s|kg|A|%)(?![a-zA-Z]))", "\xa0", text)
 
 
 def equation(text: str) -> str:
@@ -87,6 +99,8 @@ def plain_number(value: float | None, digits: int = 3) -> str:
         mantissa, power = f"{value:.{digits - 1}e}".split("e")
         raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
         return f"{float(mantissa):g} × 10{raised}".replace("-", "−")
+    if abs(value) >= 1000:
+        return f"{value:,.0f}".replace(",", "\u202f").replace("-", "−")
     return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
 
 
@@ -147,8 +161,8 @@ def next_steps(discovery: Discovery) -> list[str]:
     steps: list[str] = []
     if discovery.verdict == "found":
         steps.append(
-            "Use the final model: it is `result.model`, and simulates any recording of this "
-            "machine with `result.model.simulate(recording)`."
+            "Use the final model: in Python it is result.model, and its method "
+            "simulate(recording) runs it on any recording of this machine."
         )
         steps.append(
             "Check it on a recording with another input; an effect that is real keeps its numbers."
@@ -170,7 +184,7 @@ def next_steps(discovery: Discovery) -> list[str]:
         steps.append("Until then the final model simulates well, whichever of them is the cause.")
     elif discovery.verdict == "unexplained":
         steps.append(
-            "Look at the places above where the model still fails; they say what kind of effect "
+            "Look at the places below where the model still fails; they say what kind of effect "
             "to think of."
         )
         steps.append(

@@ -1,0 +1,430 @@
+"""The report: complete, self-contained, readable, and safe against what users call their files."""
+
+import dataclasses
+import html.parser
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib import image
+from rich.console import Console
+
+from rotflex_jax.discover import locate
+from rotflex_jax.discover.result import VERDICTS, Discovery, Ranked, Round, Stage, Where
+from rotflex_jax.effects import Coulomb, CubicSpring
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints import paper, single_inertia
+from rotflex_jax.model import Model
+from rotflex_jax.parameters import Estimate
+from rotflex_jax.recording import Recording
+from rotflex_jax.report import parameter_table, summary_table, write_report
+from rotflex_jax.report.figures import pictures
+from rotflex_jax.report.html import render
+from rotflex_jax.report.wording import HEADLINES, next_steps
+
+NASTY = "bench <script>alert(1)</script> & 'co'.csv"
+NOISE = 5e-4
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+def moved(N: int = 2000, Ts: float = 0.005, source: str = NASTY, **named) -> Recording:
+    rng = np.random.default_rng(0)
+    t = Ts * np.arange(N)
+    theta = 0.4 * np.sin(2 * np.pi * 0.7 * t) + 0.1 * np.sin(2 * np.pi * 1.9 * t + 1)
+    alpha = 0.08 * np.sin(2 * np.pi * 3.1 * t) + 0.02 * np.sin(2 * np.pi * 0.5 * t)
+    y = np.column_stack([theta, alpha]) + NOISE * rng.standard_normal((N, 2))
+    return Recording(u=np.sin(5 * t) + 0.2 * t, y=y, Ts=Ts, source=source, **named)
+
+
+def stage(mechanism, test: Recording, error: np.ndarray, free: dict[str, float]) -> Stage:
+    nan = float("nan")
+    values = dict(zip(mechanism.parameter_names, mechanism.values, strict=True))
+    specs = dict(zip(mechanism.parameter_names, mechanism.parameter_specifications, strict=True))
+    estimates = tuple(
+        Estimate(n, v, free[n], (v - 1.96 * free[n], v + 1.96 * free[n]), specs[n].unit)
+        if n in free
+        else Estimate(n, float(v), nan, (nan, nan), specs[n].unit, free=False)
+        for n, v in values.items()
+    )
+    model = Model(mechanism)
+    channels = mechanism.channels
+    rms = dict(zip(channels, np.sqrt(np.mean(error**2, axis=0)).tolist(), strict=True))
+    y_hat = model.measured(test) - error
+    return Stage(
+        model=model,
+        estimates=estimates,
+        held_out_rmse={c: 1.5 * v for c, v in rms.items()},
+        held_out_rmse_windows=rms,
+        simulated=(y_hat,),
+        windowed=(y_hat,),
+        window_seconds=2.0,
+        process_noise={"hub": 1e-6},
+        process_noise_nats=10.0,
+        log_likelihood=-100.0,
+    )
+
+
+def two_rounds() -> Discovery:
+    """Friction and a hardening spring, as if they had been found."""
+    train, test = moved(), moved(1500)
+    rng = np.random.default_rng(1)
+    noise = NOISE * rng.standard_normal((test.N, 2))
+    swing = np.sin(2 * np.pi * 0.3 * test.t)[:, None]
+    joint = paper()
+    with_friction = joint + Coulomb(at="hub", level=0.03)
+    full = with_friction + CubicSpring(at="joint", stiffness=40.0)
+    free = {"hub.inertia.inertia": 2e-5, "joint.spring.stiffness": 0.004}
+    free_friction = free | {"hub.coulomb.level": 1e-4}
+    stages = (
+        stage(joint, test, noise + swing * [0.05, 0.01], free),
+        stage(with_friction, test, noise + swing * [0.004, 0.006], free_friction),
+        stage(full, test, noise, free_friction | {"joint.cubic_spring.stiffness": 0.3}),
+    )
+    rounds = (
+        Round(
+            effect="coulomb",
+            port="hub",
+            equivalent=(("stribeck", "hub"),),
+            parameters={"level": stages[1].estimates[-1]},
+            stage=stages[1],
+            score=18432.0,
+            held_out_gain_nats=5120.0,
+            sentence="the hub meets a constant friction torque of 0.03 N m",
+            equation="tau = -level * sign(speed), holds while |tau| <= level",
+        ),
+        Round(
+            effect="cubic_spring",
+            port="joint",
+            equivalent=(),
+            parameters={"stiffness": stages[2].estimates[-1]},
+            stage=stages[2],
+            score=9210.0,
+            held_out_gain_nats=7100.0,
+            sentence="the spring hardens <b>fast</b>",
+            equation="tau = -stiffness * position^3",
+        ),
+    )
+    where = Where(
+        "78 % of the theta error lies within 80 ms after the hub reverses, "
+        "where the machine spends 21 % of the time.",
+        0.78,
+        0.001,
+        "reversal",
+        "theta",
+        np.array([0.0, 0.02, 0.04, 0.08, 0.5]),
+        np.array([0.4, 0.2, 0.18, 0.22]),
+        np.array([0.05, 0.06, 0.1, 0.79]),
+        "s",
+    )
+    return Discovery(
+        verdict="ambiguous",
+        sentence="coulomb at hub and cubic_spring at joint explain the recording",
+        train=(train,),
+        test=(test,),
+        baseline=stages[0],
+        rounds=rounds,
+        ranking=(
+            Ranked("coulomb", "hub", 18432.0, True, 0.4, 0.1),
+            Ranked("stribeck", "hub", 18400.0, True, 0.4, 0.1),
+            Ranked("cubic_spring", "joint", 3.2, True, 0.3, 0.2),
+            Ranked("gravity", "arm", -6.0, False, 0.001, float("inf")),
+            Ranked("<i>own</i>", "hub", -9.0, True, 0.5, 1.0),
+        ),
+        where=(where,),
+        noise_floor={"theta": NOISE, "alpha": NOISE},
+        elapsed_s=12.3,
+        notes=("The <u>offset</u> of the voltage is significant.",),
+    )
+
+
+def nothing() -> Discovery:
+    full = two_rounds()
+    base = full.final
+    even = locate(
+        full.test[0], full.test[0].y - base.windowed[0], ("theta", "alpha"), full.noise_floor
+    )
+    return dataclasses.replace(
+        full,
+        verdict="nothing_missing",
+        sentence="Nothing is missing.",
+        baseline=base,
+        rounds=(),
+        where=even,
+        notes=(),
+    )
+
+
+def one_channel() -> Discovery:
+    """A single inertia in revolutions, nothing ranked, sensor noise unknown."""
+    both = moved()
+    test = Recording(u=both.u, y=both.y[:, 0], Ts=both.Ts, units=("rev",), source="")
+    error = 0.01 * np.sin(test.t)[:, None] + NOISE
+    base = stage(single_inertia(), test, error, {"hub.inertia.inertia": 1e-5})
+    where = locate(test, error, ("theta",), [0.0])
+    return Discovery(
+        "unexplained", "Something remains", (test,), (test,), base, (), (), where, {}, 1.0
+    )
+
+
+@pytest.fixture(scope="module")
+def discovery() -> Discovery:
+    return two_rounds()
+
+
+@pytest.fixture
+def undrawn(monkeypatch) -> None:
+    """Pages without figures, which take most of the time."""
+    monkeypatch.setattr("rotflex_jax.report.content.pictures", lambda discovery: {})
+
+
+@pytest.fixture(scope="module")
+def page(discovery) -> str:
+    return render(discovery)
+
+
+class Reader(html.parser.HTMLParser):
+    """Reads a page strictly: every element is closed, in order."""
+
+    VOID = ("meta", "img", "br", "link", "input", "hr")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.tags: list[str] = []
+        self.alternatives: list[str] = []
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.tags.append(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "srcset", "data")]
+        self.alternatives += [v for k, v in attrs if k == "alt"]
+
+    def handle_endtag(self, tag) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data) -> None:
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def read(page: str) -> Reader:
+    reader = Reader()
+    reader.feed(page)
+    reader.close()
+    assert reader.open == []
+    return reader
+
+
+def test_the_page_is_well_formed_and_needs_nothing_else(page) -> None:
+    reader = read(page)
+    assert reader.addresses
+    assert all(a.startswith("data:image/svg+xml;base64,") for a in reader.addresses)
+    assert not {"script", "link", "iframe", "object"} & set(reader.tags)
+    style = re.search(r"<style>(.*)</style>", page, re.DOTALL).group(1)
+    assert "url(" not in style
+    assert "@import" not in style
+    assert all(len(a) > 20 for a in reader.alternatives)
+    assert len(page) < 3e6
+
+
+def test_what_a_reader_must_learn_is_there(page, discovery) -> None:
+    text = read(page).text
+    assert HEADLINES["ambiguous"] in text
+    assert "Coulomb at hub and cubic spring at joint explain the recording." in text
+    assert "The hub meets a constant friction torque of 0.03 N m." in text
+    assert "τ = −stiffness · position³" in text
+    assert "These recordings cannot tell it from stribeck at hub." in text
+    assert "0.03000 N m" in text
+    assert "0.02980 … 0.03020" in text
+    assert "40.00 N m/rad³" in text
+    assert "theta [deg]" in text
+    # 0.05 sin: 0.0354 rad rms is 2.03 deg, 71 times the noise of 5e-4.
+    assert re.search(r"baseline 2\.0\d × 7[01]", text)
+    assert "78 % of the theta error lies within 80 ms after the hub reverses" in text
+    assert "Not excited means" in text
+    assert "1 of 5 candidates" in text
+    assert "What to do next" in text
+    assert "jax" in text
+
+
+def test_what_a_user_wrote_is_escaped(page) -> None:
+    text = read(page).text
+    assert NASTY in text
+    assert "The spring hardens <b>fast</b>." in text
+    assert "<i>own</i> at hub" in text
+    assert "The <u>offset</u>" in text
+    for tag in ("script", "b", "i", "u"):
+        assert tag not in read(page).tags
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_has_a_headline_and_a_next_step(discovery, verdict, undrawn) -> None:
+    other = dataclasses.replace(discovery, verdict=verdict)
+    assert next_steps(other)
+    text = read(render(other)).text
+    assert HEADLINES[verdict] in text
+    assert next_steps(other)[0][:30] in text
+
+
+def test_a_report_without_rounds_says_so(undrawn) -> None:
+    found = nothing()
+    assert "evenly" in found.where[0].statement
+    text = read(render(found)).text
+    assert "No effect was added" in text
+    assert "Where the error lives" in text
+    assert "staircase" not in pictures(found)
+
+
+def test_one_channel_in_another_unit_and_nothing_ranked(undrawn) -> None:
+    text = read(render(one_channel())).text
+    assert "theta [rev]" in text
+    assert "deg" not in text
+
+
+def test_the_final_model_is_located_where_something_remains(discovery, undrawn) -> None:
+    partly = dataclasses.replace(discovery, verdict="unexplained", rounds=discovery.rounds[:1])
+    text = read(render(partly)).text
+    assert "Where the final model still fails" in text
+    assert "Where the final model still fails" not in read(render(discovery)).text
+
+
+@pytest.mark.parametrize("made", [two_rounds, nothing, one_channel])
+def test_every_axis_has_a_label_with_a_unit(made) -> None:
+    drawn = pictures(made())
+    assert {"overlay", "spectra", "map"} <= set(drawn)
+    for name, picture in drawn.items():
+        assert picture.caption.endswith(".")
+        for ax in picture.figure.axes:
+            for axis in (ax.xaxis, ax.yaxis):
+                assert _has_unit(ax, axis), (name, ax.get_title(), axis.axis_name)
+
+
+def _has_unit(ax, axis) -> bool:
+    """Whether an axis, or one that it shares its scale with, has a label with a unit."""
+    if ax.get_label() == "<colorbar>":  # its thin side has no scale
+        axis = max((ax.xaxis, ax.yaxis), key=lambda side: len(side.get_label_text()))
+    name = f"{axis.axis_name}axis"
+    group = getattr(ax, f"get_shared_{axis.axis_name}_axes")()
+    labels = [getattr(other, name).get_label_text() for other in group.get_siblings(ax)]
+    return any(re.search(r"\[.+\]", label) for label in labels)
+
+
+def test_figures_leave_the_settings_of_matplotlib_alone(discovery) -> None:
+    import sys
+
+    before = dict(matplotlib.rcParams)
+    pictures(discovery)
+    assert dict(matplotlib.rcParams) == before
+    assert (
+        "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
+    )
+
+
+def test_degrees_are_drawn_where_angles_are_read(discovery) -> None:
+    axes = pictures(discovery)["staircase"].figure.axes
+    assert axes[0].get_ylabel() == "held-out rms error [deg]"
+    points = axes[0].lines[0].get_ydata()
+    assert points[0] == pytest.approx(np.rad2deg(discovery.baseline.held_out_rmse_windows["theta"]))
+
+
+def test_the_folder_is_made_and_holds_page_and_json(discovery, undrawn, tmp_path) -> None:
+    path = discovery.report(tmp_path / "new" / "folder")
+    assert path == tmp_path / "new" / "folder" / "report.html"
+    assert read(path.read_text(encoding="utf-8")).text
+    text = (path.parent / "result.json").read_text(encoding="utf-8")
+    assert json.loads(text) == discovery.to_dict()
+    write_report(discovery, path.parent)  # again, over what is there
+
+
+def test_a_file_is_not_taken_for_a_folder(discovery, undrawn, tmp_path) -> None:
+    file = tmp_path / "data.csv"
+    file.write_text("t,theta\n")
+    for place in (file, file / "below"):
+        with pytest.raises(InputError, match=r"data\.csv.* is a file"):
+            write_report(discovery, place)
+    assert file.read_text() == "t,theta\n"
+
+
+def test_a_folder_that_cannot_be_written_is_told(discovery, undrawn, tmp_path, monkeypatch) -> None:
+    def refuse(*args, **kwargs) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        write_report(discovery, tmp_path)
+
+
+def test_tables_for_a_terminal(discovery) -> None:
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(summary_table(discovery))
+    console.print(parameter_table(discovery))
+    console.file.close()
+    text = console.export_text()
+    assert "+ cubic spring at joint" in text
+    assert "theta [deg]" in text
+    assert "runs of 2 s" in text
+    assert "sensor noise" in text
+    assert "hub.coulomb.level" in text
+    assert "0.02980 … 0.03020" in text
+    assert "held" in text
+
+
+def test_long_recordings_keep_the_page_small(discovery) -> None:
+    test = moved(60_000, 0.002)
+    rng = np.random.default_rng(2)
+    stages = [
+        dataclasses.replace(
+            s, simulated=(), windowed=(test.y - 0.01 * rng.standard_normal(test.y.shape),)
+        )
+        for s in discovery.stages
+    ]
+    rounds = tuple(
+        dataclasses.replace(r, stage=s) for r, s in zip(discovery.rounds, stages[1:], strict=True)
+    )
+    long = dataclasses.replace(discovery, test=(test,), baseline=stages[0], rounds=rounds)
+    page = render(long)
+    assert len(page) < 3e6
+    assert "30 s of it are shown" in page
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_browser_shows_the_page_without_complaint(discovery, tmp_path) -> None:
+    path = discovery.report(tmp_path)
+    shot = tmp_path / "shot.png"
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--hide-scrollbars",
+        "--enable-logging=stderr",
+        f"--user-data-dir={tmp_path / 'profile'}",
+        "--window-size=1000,2400",
+        f"--screenshot={shot}",
+    ]
+    done = subprocess.run(
+        [str(CHROMIUM), *flags, path.as_uri()], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert "CONSOLE" not in done.stderr
+    picture = image.imread(shot)
+    assert picture.shape[:2] == (2400, 1000)
+    # Text and figures: many tones, in the lower half (where the figures are) too.
+    for half in (picture[:1200], picture[1200:]):
+        assert len(np.unique(half[..., :3].reshape(-1, 3).round(2), axis=0)) > 100
