@@ -9,6 +9,7 @@ Importing the package changes no setting of JAX and loads neither matplotlib nor
 """
 
 from rotflex_jax import data, effects, joints, metrics
+from rotflex_jax.compare import Comparison, compare
 from rotflex_jax.data import load
 from rotflex_jax.discover import Discovery, discover, locate
 from rotflex_jax.errors import InputError
@@ -21,6 +22,7 @@ from rotflex_jax.recording import Recording
 __version__ = "0.1.0"
 
 __all__ = [
+    "Comparison",
     "Discovery",
     "Exponential",
     "Fit",
@@ -29,6 +31,7 @@ __all__ = [
     "Model",
     "Recording",
     "SmoothRK4",
+    "compare",
     "data",
     "discover",
     "effects",

@@ -63,6 +63,18 @@ ReportFolder = Annotated[
     Path | None,
     typer.Option("--report", metavar="FOLDER", help="Write a self-contained HTML report here."),
 ]
+HeldOut = Annotated[
+    list[Path] | None,
+    typer.Option("--held-out", metavar="FILE", help="Recording to judge on; may be repeated."),
+]
+Share = Annotated[
+    float | None,
+    typer.Option("--split", metavar="SHARE", help="Share of each FILE to learn from: 0.7."),
+]
+MethodNames = Annotated[
+    str | None,
+    typer.Option("--methods", metavar="A,B", help="Methods to compare; all unless given."),
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +120,16 @@ class Columns:
             )
         except InputError as error:
             raise InputError(_as_options(str(error))) from None
+
+    def load_parts(
+        self, files: Sequence[Path], held_out: Sequence[Path], share: float
+    ) -> "tuple[list[Recording], list[Recording]]":
+        """What to learn from and what to judge on: files of its own, or the end of each file."""
+        train = [self.load(file) for file in files]
+        if held_out:
+            return train, [self.load(file) for file in held_out]
+        parts = [recording.split(share) for recording in train]
+        return [a for a, _ in parts], [b for _, b in parts]
 
 
 def _channels(outputs: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
@@ -180,6 +202,15 @@ def choose(name: str, choices: Iterable[str], what: str) -> str:
     close = difflib.get_close_matches(name, choices, n=1)
     hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
     raise InputError(f"There is no {what} called {name!r}; {hint}")
+
+
+def methods(text: str | None) -> list[str] | None:
+    """The names of methods in `arx,grey_box`; None for all."""
+    from rotflex_jax.compare.method import chosen
+
+    names = None if text is None else [n.strip() for n in text.split(",") if n.strip()]
+    chosen(names)
+    return names
 
 
 def joint(text: str) -> Any:

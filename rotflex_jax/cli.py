@@ -1,4 +1,4 @@
-"""The command line: `rotflex demo`, `discover`, `simulate`, `effects`, `data`.
+"""The command line: `rotflex demo`, `discover`, `compare`, `simulate`, `effects`, `data`.
 
 Exit status 0 on any verdict, 2 on bad input with one sentence on stderr. Everything heavy is
 imported inside the commands, so that `rotflex --help` answers at once.
@@ -6,13 +6,14 @@ imported inside the commands, so that `rotflex --help` answers at once.
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from rotflex_jax import arguments as given, terminal
+from rotflex_jax.data_commands import data_app
 from rotflex_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the physics a model of a rotary flexible joint is missing, from a recording of it.",
 )
-data_app = typer.Typer(help="Public recordings: list them, fetch them.")
 app.add_typer(data_app, name="data")
 
 # The class of every mistake in the arguments; typer does not export it by name.
@@ -72,12 +72,6 @@ def _start(
         print(context.get_help())
 
 
-@data_app.callback(invoke_without_command=True)
-def _start_data(context: typer.Context) -> None:
-    if context.invoked_subcommand is None:
-        print(context.get_help())
-
-
 @app.command()
 def demo(
     report: given.ReportFolder = Path("rotflex-demo"), json_file: given.JsonFile = None
@@ -94,14 +88,8 @@ def demo(
 def discover(
     files: given.Files,
     joint: given.JointName = "paper",
-    held_out: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="Recording to judge on; may be given several times."),
-    ] = None,
-    split: Annotated[
-        float | None,
-        typer.Option(metavar="SHARE", help="Share of each FILE to learn from; 0.7 unless given."),
-    ] = None,
+    held_out: given.HeldOut = None,
+    split: given.Share = None,
     input_column: given.InputColumn = None,
     output_columns: given.OutputColumns = None,
     degrees: given.Degrees = False,
@@ -117,12 +105,39 @@ def discover(
     given.check_writable(json_file=json_file, folder=report)
     mechanism = given.joint(joint)
     columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
-    train = [columns.load(file) for file in files]
-    test = [columns.load(file) for file in held_out or []]
-    if not test:
-        parts = [recording.split(share) for recording in train]
-        train, test = [part[0] for part in parts], [part[1] for part in parts]
+    train, test = columns.load_parts(files, held_out or [], share)
     _discover(mechanism, train, test, report, json_file)
+
+
+@app.command()
+def compare(
+    files: given.Files,
+    methods: given.MethodNames = None,
+    joint: given.JointName = "paper",
+    held_out: given.HeldOut = None,
+    split: given.Share = None,
+    input_column: given.InputColumn = None,
+    output_columns: given.OutputColumns = None,
+    degrees: given.Degrees = False,
+    Ts: given.SamplingPeriod = None,
+    time_column: given.TimeColumn = None,
+    accept: given.Accept = None,
+    json_file: given.JsonFile = None,
+) -> None:
+    """Run every method on the same data, judged by its free run over what it has not seen."""
+    share = given.check_split(split, held_out or [])
+    given.check_distinct(files, held_out or [])
+    given.check_writable(json_file=json_file)
+    mechanism, wanted = given.joint(joint), given.methods(methods)
+    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
+    train, test = columns.load_parts(files, held_out or [], share)
+    terminal.print_findings([*train, *test])
+    _quicken()
+    import rotflex_jax as rf
+
+    with terminal.progress("Comparing") as step:
+        result = rf.compare(train, wanted, mechanism=mechanism, test=test, progress=step)
+    _give(result, terminal.print_comparison, json_file)
 
 
 @app.command()
@@ -191,31 +206,6 @@ def effects(
         terminal.print_effects(descriptions)
 
 
-@data_app.command("list")
-def data_list() -> None:
-    """List the public recordings that can be fetched."""
-    from rotflex_jax.data.datasets import list_datasets
-
-    rows = [(d.name, d.about, d.units, d.licence, d.source) for d in list_datasets()]
-    terminal.print_rows(("name", "what", "units", "licence", "source"), rows)
-
-
-@data_app.command("fetch")
-def data_fetch(
-    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names that `list` shows.")],
-) -> None:
-    """Fetch public recordings into the user's cache folder, check their hash, print their paths."""
-    from rotflex_jax.data.datasets import DATASETS, fetch
-
-    for name in names:
-        given.choose(name, DATASETS, "data set")
-    for name in names:
-        with terminal.progress(f"Fetching {name}"):
-            paths = fetch(name)
-        for path in paths:
-            print(path)
-
-
 def _quicken() -> None:
     """Set up JAX for a program of its own; after the arguments, since an error needs no JAX."""
     from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
@@ -238,12 +228,17 @@ def _discover(
     with terminal.progress("Searching for missing effects") as step:
         result = rf.discover(mechanism, train, test, progress=step)
         page = None if report is None else result.report(report)
+    _give(result, terminal.print_discovery, json_file)
+    if page is not None:
+        terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
+
+
+def _give(result: Any, show: Callable[[Any], None], json_file: Path | None) -> None:
+    """A result as JSON on stdout, or for a person and as JSON in a file."""
     text = json.dumps(result.to_dict(), indent=2)
     if json_file == given.STDOUT:
         print(text)
-    else:
-        terminal.print_discovery(result)
-        if json_file is not None:
-            json_file.write_text(text + "\n", encoding="utf-8")
-    if page is not None:
-        terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
+        return
+    show(result)
+    if json_file is not None:
+        json_file.write_text(text + "\n", encoding="utf-8")

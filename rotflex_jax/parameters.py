@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,10 +96,12 @@ class Transform:
         low = np.where(np.isfinite(self.lower), self.lower, 0.0)
         span = np.where(boxed, self.upper - self.lower, 1.0)
         grown = np.exp(np.minimum(np.where(positive, z, 0.0), 60.0))
-        share = 1 / (1 + np.exp(-np.where(boxed, z, 0.0)))
+        share = expit(np.where(boxed, z, 0.0))
         p = np.where(positive, low + grown, z * self.typical)
         slope = np.where(positive, grown, self.typical)
-        return np.where(boxed, low + span * share, p), np.where(boxed, span * share * (1 - share), slope)
+        return np.where(boxed, low + span * share, p), np.where(
+            boxed, span * share * (1 - share), slope
+        )
 
     def unconstrain(self, p: np.ndarray) -> np.ndarray:
         """Unconstrained coordinates of physical values; a value on its bound starts just inside."""

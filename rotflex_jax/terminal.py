@@ -112,6 +112,13 @@ def print_discovery(result: Any) -> None:
         console.print(f"Note: {note}", markup=False)
 
 
+def print_comparison(result: Any) -> None:
+    """Methods side by side, best first."""
+    console = output()
+    console.print("Free runs over the held-out data", style="bold")
+    console.print(str(result), markup=False)
+
+
 def print_findings(recordings: Sequence[Any]) -> None:
     """What a user should look at before trusting a result, once each, on stderr."""
     seen: set[tuple[str, str, str]] = set()

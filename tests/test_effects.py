@@ -342,7 +342,7 @@ def test_a_users_own_effect_enters_the_catalogue_and_the_search():
 def test_candidates_cover_the_first_family():
     pairs = {(cls.name, port) for cls, port in candidates()}
     assert len(pairs) == len(candidates())
-    for name in ("coulomb", "coulomb_asymmetric", "stribeck", "dahl", "quadratic_drag", "viscous"):
+    for name in ("coulomb", "coulomb_asymmetric", "stribeck", "quadratic_drag", "viscous"):
         assert {(name, p) for p in ("hub", "arm", "joint")} <= pairs
     assert {p for n, p in pairs if n == "gravity"} == {"hub", "arm"}
     assert ("cubic_spring", "joint") in pairs and ("cubic_spring", "hub") not in pairs

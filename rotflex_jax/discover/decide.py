@@ -5,6 +5,7 @@ are reported together; a richer effect must beat the simpler one that it contain
 """
 
 import dataclasses
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -13,11 +14,16 @@ from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.residuals import Data
+from rotflex_jax.model import Model, window_starts
+from rotflex_jax.recording import Recording
 
 BLOCK_SECONDS = 0.5
 # An effect must gain this on held-out data [nat], beyond this many deviations of the block gains, and
-# this on the training data after half a log N per number that it needs.
-HELD_OUT_NATS, HELD_OUT_Z, TRAIN_NATS = 5.0, 1.5, 8.0
+# this on the training data after half a log N per number that it needs, beyond as many deviations.
+HELD_OUT_NATS, HELD_OUT_Z, TRAIN_NATS, TRAIN_Z = 5.0, 1.5, 8.0, 2.0
+# Mean log error of free runs over short windows: near the sensor noise it may rise by no more than the
+# first, elsewhere it must fall by the second.
+WINDOWS_WORSE, WINDOWS_BETTER = 0.02, 0.01
 # Two effects are told apart by this many deviations of their paired block differences.
 SEPARATE_Z = 2.0
 
@@ -29,12 +35,16 @@ class Trial:
     Attributes:
         hypothesis: Fitted to the training recordings.
         blocks: Held-out log-likelihood of each half second [nat].
+        adapted: The same physics, with first states and calibrations of the held-out recordings.
+        windows: Held-out error of short free runs, per channel.
         place: What it adds to the hypothesis it is compared with.
         numbers: How many numbers that takes.
     """
 
     hypothesis: Hypothesis
     blocks: np.ndarray
+    adapted: Hypothesis
+    windows: np.ndarray
     place: Place | None = None
     numbers: int = 0
 
@@ -44,34 +54,74 @@ class Trial:
         return float(np.sum(self.blocks))
 
 
-def lead(a: Trial, b: Trial) -> tuple[float, float]:
-    """By how many nats `a` leads `b` on held-out data, and how many deviations that is."""
-    d = a.blocks - b.blocks
+def lead(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """By how many nats blocks `a` lead blocks `b`, and how many deviations that is."""
+    d = a - b
     spread = float(np.std(d, ddof=1)) * np.sqrt(len(d)) if len(d) > 1 else np.inf
     return float(d.sum()), float(d.sum()) / max(spread, 1e-12)
 
 
-def held_out(judge: Judge, h: Hypothesis, first: np.ndarray) -> Trial:
+@dataclasses.dataclass(frozen=True)
+class Away:
+    """The held-out side.
+
+    Attributes:
+        judge: With the held-out recordings on its bench.
+        recordings: The same, as recordings.
+        first: First states to begin with (R, m).
+        seconds: Length of the windows of short free runs [s].
+    """
+
+    judge: Judge
+    recordings: Sequence[Recording]
+    first: np.ndarray
+    seconds: float
+
+    def runner(self, h: Hypothesis, places: Iterable[Place], recording: int) -> Model:
+        """A model of one held-out recording; all share the super-model's compiled code, gates apart."""
+        bench = self.judge.bench
+        s = bench.supermodel
+        mechanism = s.mechanism.with_values(h.values(bench)[recording])
+        return Model(mechanism, bench.solver, tuple(s.gates(places)))
+
+    def windows(self, runs: Sequence[np.ndarray]) -> np.ndarray:
+        """Root mean square error per channel of short free runs, their first samples not counted."""
+        data = self.judge.bench.data
+        total, count = np.zeros(data.y.shape[-1]), 0
+        for r, recording in enumerate(self.recordings):
+            counts = np.ones(recording.N, bool)
+            for start in window_starts(recording, self.seconds)[0]:
+                counts[start : start + recording.n_init] = False
+            e = (data.y[r, : recording.N] - runs[r])[counts]
+            total, count = total + np.sum(e**2, axis=0), count + len(e)
+        return np.sqrt(total / max(count, 1))
+
+
+def held_out(away: Away, h: Hypothesis) -> Trial:
     """Log-likelihood of held-out recordings under a trained hypothesis, in blocks.
 
     Physics, process noise and whitener are the trained ones. What belongs to one recording alone (first
     state, calibrations) is fitted to it, by Gauss-Newton with secant slopes.
 
     Args:
-        judge: With the held-out recordings on its bench.
+        away: The held-out recordings.
         h: Trained hypothesis.
-        first: First states to begin with (R, m).
     """
-    bench, R = judge.bench, len(first)
+    bench, R = away.judge.bench, len(away.first)
     own = np.tile(h.own.mean(axis=0), (R, 1))
-    now = dataclasses.replace(h, x0=first.copy(), own=own)
-    now = judge.with_process_noise(now, h.process_noise)
+    now = dataclasses.replace(h, x0=away.first.copy(), own=own)
+    now = away.judge.with_process_noise(now, h.process_noise)
     e = bench.innovations([now.lane(bench)])[0]
     for _ in range(10):
         gained, now, e = _settle(bench, now, e)
         if gained < 0.05:
             break
-    return Trial(h, _blocks(h.whitener.log_densities(e, bench.data.seen), bench.data))
+    blocks = in_blocks(h.whitener.log_densities(e, bench.data.seen), bench.data)
+    runs = [
+        away.runner(now, h.places, r).simulate_windows(recording, away.seconds)
+        for r, recording in enumerate(away.recordings)
+    ]
+    return Trial(h, blocks, now, away.windows(runs))
 
 
 def _settle(bench: Bench, h: Hypothesis, e: np.ndarray) -> tuple[float, Hypothesis, np.ndarray]:
@@ -117,7 +167,7 @@ def _nudged(h: Hypothesis, reach: float) -> list[Hypothesis]:
     return out
 
 
-def _blocks(density: np.ndarray, data: Data) -> np.ndarray:
+def in_blocks(density: np.ndarray, data: Data) -> np.ndarray:
     """Sums over blocks; the last, shorter block of each recording joins its neighbour."""
     out = []
     for row, seen, Ts in zip(density, data.seen, data.Ts, strict=True):
@@ -128,34 +178,72 @@ def _blocks(density: np.ndarray, data: Data) -> np.ndarray:
     return np.concatenate(out)
 
 
-def describe(trial: Trial, base: Trial) -> str:
+def describe(trial: Trial, base: Trial, data: Data) -> str:
     """One line: what a trial gained."""
     assert trial.place
-    nats, z = lead(trial, base)
-    train = trial.hypothesis.log_likelihood - base.hypothesis.log_likelihood
-    where = f"{trial.place[0]} at {trial.place[1]}"
-    return f"{where}: {nats:.0f} nats on held-out data (z {z:.1f}), {train:.0f} on training data"
+    nats, z = lead(trial.blocks, base.blocks)
+    train, train_z = _trained_lead(trial, base, data)
+    gain = np.exp(-_change(trial, base))
+    return (
+        f"{trial.place[0]} at {trial.place[1]}: {nats:.0f} nats on held-out data (z {z:.1f}), {train:.0f} "
+        f"on training data (z {train_z:.1f}), free runs {gain:.2f} times better"
+    )
 
 
-def admissible(trial: Trial, base: Trial, samples: float) -> bool:
-    """Whether what the trial adds is there beyond doubt."""
-    nats, z = lead(trial, base)
-    train = trial.hypothesis.log_likelihood - base.hypothesis.log_likelihood
-    needed = TRAIN_NATS + 0.5 * trial.numbers * np.log(samples)
-    return nats > HELD_OUT_NATS and z > HELD_OUT_Z and train > needed
+def _trained_lead(a: Trial, b: Trial, data: Data) -> tuple[float, float]:
+    return lead(in_blocks(a.hypothesis.densities, data), in_blocks(b.hypothesis.densities, data))
 
 
-def choose(trials: list[Trial], base: Trial, samples: float) -> tuple[Trial | None, list[Trial]]:
-    """The best admissible trial and those that cannot be told from it."""
-    open_ = [t for t in trials if admissible(t, base, samples)]
-    if not open_:
+def _change(trial: Trial, base: Trial) -> float:
+    """Mean log ratio of the errors of short free runs; negative where the trial is better."""
+    return float(np.mean(np.log(trial.windows / base.windows)))
+
+
+def admissible(trial: Trial, base: Trial, data: Data, noise: np.ndarray) -> bool:
+    """Whether what the trial adds is there beyond doubt.
+
+    Args:
+        trial: The richer hypothesis.
+        base: Without what it adds.
+        data: Training recordings.
+        noise: Deviation of the sensor noise per channel.
+    """
+    nats, z = lead(trial.blocks, base.blocks)
+    train, train_z = _trained_lead(trial, base, data)
+    needed = TRAIN_NATS + 0.5 * trial.numbers * np.log(samples_of(data))
+    # Likelihood speaks of the next samples, a user of free runs: neither may say no. Far from the sensor
+    # noise, an effect that leaves free runs as they were is a way to bend, not a discovery.
+    far = bool(np.any(base.windows > 2 * noise))
+    limit = -WINDOWS_BETTER if far else WINDOWS_WORSE
+    enough = nats > HELD_OUT_NATS and z > HELD_OUT_Z and train > needed and train_z > TRAIN_Z
+    return enough and _change(trial, base) < limit
+
+
+def choose(
+    trials: list[Trial], base: Trial, data: Data, noise: np.ndarray
+) -> tuple[Trial | None, list[Trial]]:
+    """The best admissible trial and those that cannot be told from it; arguments as in `admissible`."""
+    able = [t for t in trials if admissible(t, base, data, noise)]
+    if not able:
         return None, []
-    winner = max(open_, key=lambda t: t.held_out)
-    simpler = [t for t in open_ if _contained(t, winner) and not _clearly(winner, t, base)]
+    winner = max(able, key=lambda t: t.held_out)
+    simpler = [t for t in able if _contained(t, winner) and not _clearly(winner, t, base)]
     if simpler:
         winner = max(simpler, key=lambda t: t.held_out)
-    rivals = [t for t in open_ if t is not winner and not _contained(winner, t) and not _contained(t, winner)]
-    return winner, [t for t in rivals if lead(winner, t)[1] < SEPARATE_Z]
+    rivals = [
+        t
+        for t in able
+        if t is not winner and not _contained(winner, t) and not _contained(t, winner)
+    ]
+    return winner, [t for t in rivals if not told_apart(winner, t, data)]
+
+
+def told_apart(winner: Trial, rival: Trial, data: Data) -> bool:
+    """Whether all recordings together, block by block, prefer the winner beyond doubt."""
+    a, b = (
+        np.concatenate([t.blocks, in_blocks(t.hypothesis.densities, data)]) for t in (winner, rival)
+    )
+    return lead(a, b)[1] >= SEPARATE_Z
 
 
 def _contained(small: Trial, large: Trial) -> bool:
@@ -166,12 +254,12 @@ def _contained(small: Trial, large: Trial) -> bool:
 
 def _clearly(rich: Trial, simple: Trial, base: Trial) -> bool:
     """Whether the richer effect earns its extra numbers on held-out and on training data."""
-    nats, z = lead(rich, simple)
+    nats, z = lead(rich.blocks, simple.blocks)
     train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
-    share = nats / max(lead(rich, base)[0], 1e-9)
+    share = nats / max(lead(rich.blocks, base.blocks)[0], 1e-9)
     return nats > 10 and z > 2.5 and train > 20 and share > 0.003
 
 
-def samples_of(bench: Bench) -> float:
+def samples_of(data: Data) -> float:
     """Numbers measured."""
-    return float(np.sum(bench.data.seen)) * bench.data.y.shape[-1]
+    return float(np.sum(data.seen)) * data.y.shape[-1]

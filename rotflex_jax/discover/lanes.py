@@ -84,10 +84,16 @@ class Bench:
             data = jax.tree.map(jnp.asarray, self.data)
             for i in range(0, len(lanes), LANES):
                 part = lanes[i : i + LANES]
-                out.append(np.asarray(_innovations(structure, self.solver, _stacked(part), data))[: len(part)])
+                out.append(
+                    np.asarray(_innovations(structure, self.solver, _stacked(part), data))[
+                        : len(part)
+                    ]
+                )
         return np.concatenate(out)
 
-    def slopes(self, lanes: list[Lane], directions: list[Directions]) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(
+        self, lanes: list[Lane], directions: list[Directions]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Innovations (L, R, N, C) and their slopes (L, D, R, N, C)."""
         es, Js = [], []
         structure = self.supermodel.mechanism.structure
@@ -114,7 +120,7 @@ class Hypothesis:
         K: Gains (R, n, C).
         process_noise: Port -> intensity that gave `K`.
         whitener: Fixed while parameters move.
-        log_likelihood: Of the training recordings [nat].
+        densities: Log-likelihood of each training sample (R, N) [nat].
     """
 
     places: tuple[Place, ...]
@@ -126,7 +132,13 @@ class Hypothesis:
     K: np.ndarray
     process_noise: dict[str, float]
     whitener: Whitener
-    log_likelihood: float = -np.inf
+    densities: np.ndarray = dataclasses.field(default_factory=lambda: np.array(-np.inf))
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the training recordings [nat]."""
+        total = float(np.sum(self.densities))
+        return total if np.isfinite(total) else -np.inf
 
     def values(self, bench: Bench) -> np.ndarray:
         """Physical values (R, P)."""

@@ -6,7 +6,16 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.decide import TRAIN_NATS, choose, describe, held_out, samples_of
+from rotflex_jax.discover.decide import (
+    TRAIN_NATS,
+    Away,
+    Trial,
+    choose,
+    describe,
+    held_out,
+    samples_of,
+    told_apart,
+)
 from rotflex_jax.discover.lanes import Bench, Hypothesis
 from rotflex_jax.discover.locate import locate
 from rotflex_jax.discover.refit import Judge, refit
@@ -16,7 +25,7 @@ from rotflex_jax.discover.score import Score, scores
 from rotflex_jax.discover.stages import Scribe
 from rotflex_jax.discover.supermodel import CALIBRATIONS, Place, SuperModel, build
 from rotflex_jax.discover.verdict import judge_end
-from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.discover.whiten import Whitener, log_likelihood
 from rotflex_jax.effects import CATALOG, candidates as first_family
 from rotflex_jax.effects.kinds import Effect
 from rotflex_jax.errors import InputError
@@ -79,17 +88,21 @@ def discover(
     noise = sensor_noise((*trained, *unseen), model)
     ports = tuple(everywhere(model.mechanism, 1.0))
     judge = Judge(Bench(supermodel, model.solver, data), noise, torque, ports)
-    away = Judge(Bench(supermodel, model.solver, stack(unseen, model)), noise, torque, ports)
-    first = first_states(model, unseen)
+    away = Away(
+        Judge(Bench(supermodel, model.solver, stack(unseen, model)), noise, torque, ports),
+        unseen,
+        first_states(model, unseen),
+        window_seconds,
+    )
 
     say("fitting the model as it is")
     now = _baseline(judge, supermodel, model, trained)
-    base = held_out(away, now, first)
+    base = held_out(away, now)
     ranking: list[Score] = []
     taken: list[tuple[Place, float]] = []
     passed = [base.hypothesis]
     equivalents: dict[Place, list[Place]] = {}
-    samples = samples_of(judge.bench)
+    samples = samples_of(data)
     for number in range(rounds):
         say(f"round {number + 1}: scoring {len(supermodel.candidates) - len(taken)} candidates")
         listed = scores(judge, base.hypothesis)
@@ -98,15 +111,15 @@ def discover(
         if not promising:
             break
         say("refitting " + ", ".join(f"{s.place[0]} at {s.place[1]}" for s in promising))
-        refitted = refit(judge, [_with(judge, base.hypothesis, s) for s in promising])
+        refitted = _refitted(judge, base.hypothesis, promising)
         trials = [
-            dataclasses.replace(held_out(away, h, first), place=s.place, numbers=len(s.start))
+            dataclasses.replace(held_out(away, h), place=s.place, numbers=len(s.start))
             for h, s in zip(refitted, promising, strict=True)
             if _physical(judge, h, s.place)
         ]
         for t in trials:
-            say("  " + describe(t, base))
-        winner, rivals = choose(trials, base, samples)
+            say("  " + describe(t, base, data))
+        winner, rivals = choose(trials, base, data, noise)
         if winner is None or winner.place is None:
             break
         place = winner.place
@@ -121,15 +134,17 @@ def discover(
     final, worth = _eliminated(judge, base.hypothesis, [p for p, _ in taken], samples)
     order = [p for p, _ in taken if p in final.places]
     order += sorted(set(final.places) - set(order), key=lambda p: -worth[p])
-    scribe = Scribe(judge, away, model, trained, unseen, window_seconds)
-    hypotheses = _ladder(judge, final, order, passed)
+    order, own = _carried_over(away, held_out(away, final), order)
+    kept = _still_rivals(judge, away, final, equivalents, [p for p in order if p in dict(taken)])
     say("simulating the held-out recordings")
-    stages = [scribe.stage(h, held_out(away, h, first)) for h in hypotheses]
+    trials = [held_out(away, h) for h in _ladder(judge, final, order, own, passed)]
+    scribe = Scribe(judge, away)
+    stages = [scribe.stage(t, order[:k]) for k, t in enumerate(trials)]
     steps = [
         Round(
             effect=place[0],
             port=place[1],
-            equivalent=tuple(equivalents.get(place, [])),
+            equivalent=tuple(kept.get(place, [])),
             parameters=scribe.own_estimates(stage, place),
             stage=stage,
             score=dict(taken)[place] if place in dict(taken) else worth[place],
@@ -139,8 +154,8 @@ def discover(
         )
         for place, before, stage in zip(order, stages, stages[1:], strict=False)
     ]
-    longest = max(range(len(unseen)), key=lambda i: unseen[i].N)
-    residual = model.measured(unseen[longest]) - stages[0].windowed[longest]
+    longest = max((*trained, *unseen), key=lambda r: r.N)
+    residual = model.measured(longest) - stages[0].model.simulate_windows(longest, window_seconds)
     floor = dict(zip(model.mechanism.channels, noise.tolist(), strict=True))
     verdict, sentence = judge_end(steps, stages[-1], floor, ranking, unseen)
     return Discovery(
@@ -153,9 +168,17 @@ def discover(
         ranking=tuple(
             Ranked(*s.place, s.nats, s.excited, s.unconfounded, s.smallest) for s in ranking
         ),
-        where=locate(unseen[longest], residual, model.mechanism.channels, noise),
+        where=locate(
+            longest,
+            residual,
+            model.mechanism.channels,
+            noise,
+            model.mechanism,
+            window_seconds=window_seconds,
+        ),
         noise_floor=floor,
         elapsed_s=time.perf_counter() - began,
+        notes=_notes(judge, away, trials[-1], own),
     )
 
 
@@ -189,17 +212,45 @@ def _baseline(
     return max(paths, key=lambda h: h.log_likelihood)
 
 
-def _with(judge: Judge, h: Hypothesis, score: Score) -> Hypothesis:
-    """The hypothesis with one more effect, started where the score test points."""
+# Shares of the amplitude that the score test asks for at which a refit may start.
+SHARES = (1.0, 0.4, 0.1, 0.02)
+
+
+def _refitted(judge: Judge, base: Hypothesis, promising: list[Score]) -> list[Hypothesis]:
+    """The base with each candidate added and refitted, never likelier without than with it.
+
+    First order overshoots where an effect is strongly nonlinear, so a refit starts at the likeliest of
+    several shares of the amplitude; one that still ends below the base starts again from next to nothing.
+    """
+    starts = [[_with(judge, base, s, share) for share in SHARES] for s in promising]
+    lanes = [h.lane(judge.bench) for row in starts for h in row]
+    es = judge.bench.innovations(lanes).reshape(len(starts), len(SHARES), *judge.bench.data.y.shape)
+    seen = judge.bench.data.seen
+    likely = [
+        [log_likelihood(e, seen, judge.noise) if np.all(np.isfinite(e)) else -np.inf for e in row]
+        for row in es
+    ]
+    chosen = [row[int(np.argmax(ll))] for row, ll in zip(starts, likely, strict=True)]
+    refitted = refit(judge, chosen)
+    worse = [i for i, h in enumerate(refitted) if h.log_likelihood < base.log_likelihood]
+    if worse:
+        again = refit(judge, [starts[i][-1] for i in worse])
+        for i, h in zip(worse, again, strict=True):
+            refitted[i] = h if h.log_likelihood > base.log_likelihood else starts[i][-1]
+    return refitted
+
+
+def _with(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesis:
+    """The hypothesis with one more effect, at a share of the amplitude that the score test points to."""
     s = judge.bench.supermodel
     c = s.candidates[score.place]
     specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
     size = np.abs(np.array(c.probes[0])).max(axis=0)
-    start = score.start.copy()
+    start = np.where(c.amplitudes, share * score.start, score.start)
     for k, spec in enumerate(specs):
         # A bound at zero is the end of a logarithm: begin a little inside.
         if np.isfinite(spec.lower):
-            start[k] = max(start[k], spec.lower + 0.05 * max(size[k], 1e-12))
+            start[k] = max(start[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
     z = h.z.copy()
     z[list(c.parameters)] = Transform.of(specs).unconstrain(start)
     return dataclasses.replace(
@@ -213,7 +264,8 @@ def _physical(judge: Judge, h: Hypothesis, place: Place) -> bool:
     values = h.values(judge.bench).mean(axis=0)
     specs = s.mechanism.parameter_specifications
     return all(
-        specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(place)
+        specs[i].physical[0] <= values[i] <= specs[i].physical[1]
+        for i in s.parameter_indices(place)
     )
 
 
@@ -244,8 +296,12 @@ def _eliminated(
     s = judge.bench.supermodel
     while on_trial := [p for p in h.places if p not in added[-1:]]:
         rivals = refit(judge, [_without(judge, h, p) for p in on_trial], turns=1)
-        worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)}
-        each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
+        worth = {
+            p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)
+        }
+        each = {
+            p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth
+        }
         surplus = {p: worth[p] - TRAIN_NATS - 0.5 * each[p] * np.log(samples) for p in worth}
         weakest = min(surplus, key=lambda p: surplus[p])
         if surplus[weakest] >= 0:
@@ -254,19 +310,105 @@ def _eliminated(
     return h, {}
 
 
+def _still_rivals(
+    judge: Judge,
+    away: Away,
+    final: Hypothesis,
+    rivals: dict[Place, list[Place]],
+    found: list[Place],
+) -> dict[Place, list[Place]]:
+    """Rivals that the final model, with one of them in the place of a found effect, cannot exclude.
+
+    What looked alike in a round may be told apart once the other effects are in the model; a rival that
+    was itself found in another round is no rival.
+    """
+    s = judge.bench.supermodel
+    open_ = {p: [r for r in rivals[p] if r not in found] for p in found}
+    pairs = [(p, r) for p in found for r in open_[p]]
+    if not pairs or len(found) == 1:
+        return open_
+    swapped = []
+    for p, r in pairs:
+        c = s.candidates[r]
+        start = Score(r, 0.0, np.array(c.probes[0]).max(axis=0), True, 1.0, 1.0)
+        swapped.append(_with(judge, _without(judge, final, p), start, 0.4))
+    best = held_out(away, final)
+    trials = [held_out(away, h) for h in refit(judge, swapped)]
+    same = {
+        pr for pr, t in zip(pairs, trials, strict=True) if not told_apart(best, t, judge.bench.data)
+    }
+    return {p: [r for r in open_[p] if (p, r) in same] for p in found}
+
+
+def _carried_over(away: Away, final: Trial, order: list[Place]) -> tuple[list[Place], list[Place]]:
+    """Effects of the machine, and calibrations that belong to the training recordings alone.
+
+    A calibration is one of the machine if its trained value makes the held-out free runs better.
+    """
+    kept, own = list(order), []
+    for place in [p for p in order if p in CALIBRATIONS]:
+        with_it, without = (
+            away.windows(
+                [
+                    away.runner(_trained(final, away), places, r).simulate_windows(
+                        recording, away.seconds
+                    )
+                    for r, recording in enumerate(away.recordings)
+                ]
+            )
+            for places in (kept, [p for p in kept if p != place])
+        )
+        if float(np.mean(np.log(with_it / without))) >= 0:
+            kept.remove(place)
+            own.append(place)
+    return kept, own
+
+
+def _trained(trial: Trial, away: Away) -> Hypothesis:
+    """The trained hypothesis shaped for the held-out recordings, calibrations as trained."""
+    h = trial.hypothesis
+    R = len(away.recordings)
+    return dataclasses.replace(trial.adapted, own=np.tile(h.own.mean(axis=0), (R, 1)))
+
+
 def _ladder(
-    judge: Judge, final: Hypothesis, order: list[Place], passed: list[Hypothesis]
+    judge: Judge,
+    final: Hypothesis,
+    order: list[Place],
+    own: list[Place],
+    passed: list[Hypothesis],
 ) -> list[Hypothesis]:
     """The baseline alone, then with one more effect at a time, each refitted; the final model last.
 
-    A rung that the search has been on, calibrations apart, starts from there.
+    A rung that the search has been on, calibrations apart, starts from there. Calibrations that belong
+    to recordings (`own`) are on every rung.
     """
     below = []
     for k in range(len(order)):
-        wanted = set(order[:k])
-        known = [h for h in passed if wanted - set(CALIBRATIONS) == set(h.places) - set(CALIBRATIONS)]
+        wanted = {*order[:k], *own}
+        known = [
+            h for h in passed if wanted - set(CALIBRATIONS) == set(h.places) - set(CALIBRATIONS)
+        ]
         h = known[0] if known and wanted <= set(known[0].places) else final
         for place in set(h.places) - wanted:
             h = _without(judge, h, place)
         below.append(h)
     return [*(refit(judge, below, turns=1) if below else []), final]
+
+
+def _notes(judge: Judge, away: Away, final: Trial, own: list[Place]) -> tuple[str, ...]:
+    """What differs between recordings, in sentences."""
+    out = []
+    s = judge.bench.supermodel
+    for place in own:
+        for i in s.parameter_indices(place):
+            unit = s.mechanism.parameter_specifications[i].unit
+            trained = final.hypothesis.values(judge.bench)[:, i]
+            unseen = final.adapted.values(away.judge.bench)[:, i]
+            numbers = [", ".join(f"{v:+.3g} {unit}" for v in row) for row in (trained, unseen)]
+            out.append(
+                f"{CATALOG[place[0]].title} at {place[1]} belongs to each recording, not to the machine: "
+                f"{numbers[0]} in the training data, {numbers[1]} in the held-out data; it was fitted, "
+                f"but not carried over."
+            )
+    return tuple(out)

@@ -1,7 +1,6 @@
 """Maximum-likelihood refits of hypotheses, several at once: parameters, first states, process noise."""
 
 import dataclasses
-import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,7 +17,7 @@ NATS = 0.3
 LONGEST = 1.0
 # Largest process torque, as a share of the intensity that a torque as large as the motor's, drawn anew
 # at each sample, would have.
-HORIZON = float(os.environ.get("QCAP", "1e-3"))
+HORIZON = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,8 +74,7 @@ class Judge:
         """The hypothesis with the whitener and likelihood that its innovations (R, N, C) give."""
         seen = self.bench.data.seen
         whitener = fit_whitener(e, seen, self.noise)
-        ll = float(np.sum(whitener.log_densities(e, seen)))
-        return dataclasses.replace(h, whitener=whitener, log_likelihood=ll if np.isfinite(ll) else -np.inf)
+        return dataclasses.replace(h, whitener=whitener, densities=whitener.log_densities(e, seen))
 
 
 def normal_equations(h: Hypothesis, w: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +106,9 @@ def _moved(h: Hypothesis, step: np.ndarray) -> Hypothesis:
     return dataclasses.replace(h, z=z, own=own, x0=h.x0 + rest[:, local:])
 
 
-def levenberg_marquardt(judge: Judge, hypotheses: list[Hypothesis], steps: int = 8) -> list[Hypothesis]:
+def levenberg_marquardt(
+    judge: Judge, hypotheses: list[Hypothesis], steps: int = 8
+) -> list[Hypothesis]:
     """Fit all hypotheses, whiteners and process noise held; returns them with new whiteners."""
     bench, seen = judge.bench, judge.bench.data.seen
     count = max(judge.directions(), max(h.moved for h in hypotheses))
@@ -163,9 +163,17 @@ def _grid(center: dict[str, float], factors: Sequence[float]) -> list[dict[str, 
     """All combinations of factors on two axes; on more, one axis at a time."""
     ports = list(center)
     if len(ports) <= 2:
-        mesh = np.stack(np.meshgrid(*[factors] * len(ports), indexing="ij"), -1).reshape(-1, len(ports))
+        mesh = np.stack(np.meshgrid(*[factors] * len(ports), indexing="ij"), -1).reshape(
+            -1, len(ports)
+        )
     else:
-        mesh = np.array([[f if i == j else 1.0 for j in range(len(ports))] for i in range(len(ports)) for f in factors])
+        mesh = np.array(
+            [
+                [f if i == j else 1.0 for j in range(len(ports))]
+                for i in range(len(ports))
+                for f in factors
+            ]
+        )
     return [{p: center[p] * f for p, f in zip(ports, row, strict=True)} for row in mesh]
 
 
@@ -191,12 +199,16 @@ def _likeliest(judge: Judge, h: Hypothesis, trials: list[dict[str, float]]) -> H
     gains = judge.gains(h, trials)
     lane = h.lane(judge.bench)
     es = judge.bench.innovations([lane._replace(K=K) for K in gains])
-    scores = [log_likelihood(e, seen, judge.noise, 0) if np.all(np.isfinite(e)) else -np.inf for e in es]
+    scores = [
+        log_likelihood(e, seen, judge.noise, 0) if np.all(np.isfinite(e)) else -np.inf for e in es
+    ]
     best = int(np.argmax(scores))
     return judge.judged(dataclasses.replace(h, K=gains[best], process_noise=trials[best]), es[best])
 
 
-def refit(judge: Judge, hypotheses: list[Hypothesis], wide: bool = False, turns: int = 3) -> list[Hypothesis]:
+def refit(
+    judge: Judge, hypotheses: list[Hypothesis], wide: bool = False, turns: int = 3
+) -> list[Hypothesis]:
     """Alternate parameters and process noise until the likelihood settles."""
     now = levenberg_marquardt(judge, hypotheses)
     settled = [False] * len(now)

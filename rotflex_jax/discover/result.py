@@ -47,7 +47,10 @@ class Stage:
         """The two held-out errors as plain JSON."""
         return {
             "held_out_rmse": _plain(self.held_out_rmse),
-            "held_out_rmse_windows": {"seconds": self.window_seconds, **_plain(self.held_out_rmse_windows)},
+            "held_out_rmse_windows": {
+                "seconds": self.window_seconds,
+                **_plain(self.held_out_rmse_windows),
+            },
         }
 
 

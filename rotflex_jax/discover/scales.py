@@ -12,7 +12,9 @@ from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
 
-def motion(mechanism: Mechanism, y: np.ndarray, Ts: float, smooth: float = 0.03) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def motion(
+    mechanism: Mechanism, y: np.ndarray, Ts: float, smooth: float = 0.03
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Port -> (position, speed) by smoothing measured outputs (N, C) over `smooth` seconds.
 
     Ports that the measured positions do not determine are left out.
@@ -52,6 +54,8 @@ def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict
         out[port] = Scale(voltage, max(speed, 1e-6), max(position, 1e-6), torque)
     whole = Scale(voltage, 1.0, 1.0, torque)
     for channel in mechanism.channels:
-        y = np.concatenate([model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings])
+        y = np.concatenate(
+            [model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings]
+        )
         out[channel] = Scale(voltage, 1.0, max(float(np.std(y)), 1e-9), torque)
     return out | {"input": whole}

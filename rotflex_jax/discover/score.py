@@ -73,7 +73,10 @@ def scores(judge: Judge, h: Hypothesis) -> list[Score]:
     count = max(judge.directions(), h.moved)
     nuisance = h.directions(bench, count)
     probes = [
-        _Probe(c, s, m) for c in candidates for s, group in enumerate(c.probes) for m in range(len(group))
+        _Probe(c, s, m)
+        for c in candidates
+        for s, group in enumerate(c.probes)
+        for m in range(len(group))
     ]
     # Alternatives that differ in amplitudes only share a lane; shapes need lanes of their own.
     batches: list[tuple[int, list[_Probe]]] = []

@@ -5,17 +5,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.decide import Trial
+from rotflex_jax.discover.decide import Away, Trial
 from rotflex_jax.discover.lanes import Hypothesis, constrain
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.discover.whiten import log_likelihood
 from rotflex_jax.fit.covariance import sandwich
-from rotflex_jax.metrics import rmse
-from rotflex_jax.model import Model, window_starts
+from rotflex_jax.model import Model
 from rotflex_jax.parameters import Estimate
-from rotflex_jax.recording import Recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,53 +22,51 @@ class Scribe:
 
     Attributes:
         judge: With the training recordings.
-        away: With the held-out recordings.
-        model: The user's.
-        train: Training recordings.
-        test: Held-out recordings.
-        window_seconds: Length of the short held-out runs [s].
+        away: The held-out recordings.
     """
 
     judge: Judge
-    away: Judge
-    model: Model
-    train: Sequence[Recording]
-    test: Sequence[Recording]
-    window_seconds: float
+    away: Away
 
-    def stage(self, h: Hypothesis, trial: Trial) -> Stage:
-        """A stage of the loop from a trained hypothesis and its held-out likelihood."""
-        s = self.judge.bench.supermodel
-        values = h.values(self.judge.bench).mean(axis=0)
-        # All stages run in the super-model, gates apart, and so share its compiled code.
-        runner = Model(s.mechanism.with_values(values), self.model.solver, tuple(s.gates(h.places)))
-        simulated = tuple(runner.simulate(r) for r in self.test)
-        windowed = tuple(runner.simulate_windows(r, self.window_seconds) for r in self.test)
+    def stage(self, trial: Trial, places: Sequence[Place]) -> Stage:
+        """A stage of the loop.
+
+        Args:
+            trial: Trained hypothesis and its held-out likelihood.
+            places: What the stage's model has; calibrations that belong to the training recordings alone
+                are in the hypothesis, but not here.
+        """
+        h, away = trial.hypothesis, self.away
+        bench = self.judge.bench
+        values = h.values(bench).mean(axis=0)
+        trained = dataclasses.replace(
+            h, x0=away.first, own=np.tile(h.own.mean(axis=0), (len(away.first), 1))
+        )
+        runners = [away.runner(trained, places, r) for r in range(len(away.recordings))]
+        pairs = list(zip(runners, away.recordings, strict=True))
+        simulated = tuple(runner.simulate(r) for runner, r in pairs)
+        windowed = tuple(runner.simulate_windows(r, away.seconds) for runner, r in pairs)
+        channels = bench.supermodel.baseline.channels
+        errors = [
+            y_hat - runner.measured(r) for y_hat, (runner, r) in zip(simulated, pairs, strict=True)
+        ]
+        whole = np.concatenate(
+            [e[r.n_init :] for e, r in zip(errors, away.recordings, strict=True)]
+        )
         return Stage(
-            model=Model(s.clean(values, h.places), self.model.solver),
+            model=Model(bench.supermodel.clean(values, places), bench.solver),
             estimates=self.estimates(h),
-            held_out_rmse=self._errors(simulated, whole=True),
-            held_out_rmse_windows=self._errors(windowed, whole=False),
+            held_out_rmse=dict(
+                zip(channels, np.sqrt(np.mean(whole**2, axis=0)).tolist(), strict=True)
+            ),
+            held_out_rmse_windows=dict(zip(channels, away.windows(windowed).tolist(), strict=True)),
             simulated=simulated,
             windowed=windowed,
-            window_seconds=self.window_seconds,
+            window_seconds=away.seconds,
             process_noise=h.process_noise,
             process_noise_nats=self._process_noise_nats(h),
             log_likelihood=trial.held_out,
         )
-
-    def _errors(self, runs: Sequence[np.ndarray], whole: bool) -> dict[str, float]:
-        """Root mean square error per channel over all held-out samples that no run was started from."""
-        channels = self.model.mechanism.channels
-        measured, modelled = [], []
-        for r, y_hat in zip(self.test, runs, strict=True):
-            counts = np.ones(r.N, bool)
-            for start in [0] if whole else window_starts(r, self.window_seconds)[0]:
-                counts[start : start + r.n_init] = False
-            measured.append(self.model.measured(r)[counts])
-            modelled.append(y_hat[counts])
-        errors = rmse(np.concatenate(measured), np.concatenate(modelled))
-        return dict(zip(channels, np.asarray(errors).tolist(), strict=True))
 
     def _process_noise_nats(self, h: Hypothesis) -> float:
         """Log-likelihood that process torques gain over a free run with the same parameters."""
@@ -84,7 +80,9 @@ class Scribe:
     def estimates(self, h: Hypothesis) -> tuple[Estimate, ...]:
         """Parameters of the baseline and of what was added, intervals robust to correlated residuals."""
         bench, s = self.judge.bench, self.judge.bench.supermodel
-        e, J = bench.slopes([h.lane(bench)], [h.directions(bench, max(self.judge.directions(), h.moved))])
+        e, J = bench.slopes(
+            [h.lane(bench)], [h.directions(bench, max(self.judge.directions(), h.moved))]
+        )
         seen = bench.data.seen
         w = h.whitener(e[0], seen)
         W = h.whitener(J[0, : h.moved], seen)
@@ -122,7 +120,11 @@ class Scribe:
             note = "" if low <= value <= high else "outside its physical range"
             if i in h.local and R > 1:
                 note = "mean of " + ", ".join(f"{v:.3g}" for v in values[:, i])
-            out.append(Estimate(name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note))
+            out.append(
+                Estimate(
+                    name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note
+                )
+            )
         return tuple(out)
 
     def own_estimates(self, stage: Stage, place: Place) -> dict[str, Estimate]:

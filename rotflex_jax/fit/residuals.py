@@ -136,7 +136,9 @@ def first_states(model: Model, recordings: Sequence[Recording]) -> np.ndarray:
     """First positions and speeds (R, 2 n): straight lines through the first samples, where a fit starts."""
     heads = [model.measured(r)[: r.n_init].astype(float) for r in recordings]
     structure = model.mechanism.structure
-    return np.array([rough_state(structure, y, r.Ts) for y, r in zip(heads, recordings, strict=True)])
+    return np.array(
+        [rough_state(structure, y, r.Ts) for y, r in zip(heads, recordings, strict=True)]
+    )
 
 
 def sensor_noise(recordings: Sequence[Recording], model: Model) -> np.ndarray:

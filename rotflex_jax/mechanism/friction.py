@@ -29,7 +29,9 @@ class Contact(NamedTuple):
     crossed: jax.Array
 
 
-def contact(v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array) -> Contact:
+def contact(
+    v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array
+) -> Contact:
     """Independent contacts.
 
     Args:
@@ -74,7 +76,9 @@ def solve_masked(matrix: jax.Array, mask: jax.Array, rhs: jax.Array, other: jax.
     return jnp.stack([r[k] for r in rows])
 
 
-def contacts(v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array) -> Contact:
+def contacts(
+    v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array
+) -> Contact:
     """Contacts that are coupled through the mechanism.
 
     Sweeps decide which contacts rest; those are then solved for together, and the others answer.

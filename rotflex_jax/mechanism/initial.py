@@ -59,7 +59,9 @@ def _refine(structure, solver, values, gates, guess, u, y, scale, Ts):  # noqa: 
         H = jnp.einsum("wik,wjk->wij", J, J)
         # A trace of damping also decides what a stretch cannot tell: such directions stay put.
         D = jnp.diagonal(H, axis1=1, axis2=2) * damping[:, None] + 1e-9 * jnp.max(H)
-        step = jnp.linalg.solve(H + D[:, :, None] * jnp.eye(m)[None], -jnp.einsum("wik,wk->wi", J, r)[..., None])
+        step = jnp.linalg.solve(
+            H + D[:, :, None] * jnp.eye(m)[None], -jnp.einsum("wik,wk->wi", J, r)[..., None]
+        )
         moved = jnp.where(better[:, None], s + step[..., 0], (s + kept) / 2)
         return moved, damping, jnp.minimum(cost, previous), kept
 

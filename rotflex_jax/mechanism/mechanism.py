@@ -57,7 +57,9 @@ class Mechanism:
         put("coordinates", tuple(self.coordinates))
         put("ports", tuple((k, tuple(float(c) for c in v)) for k, v in ports.items()))
         put("effects", tuple(self.effects))
-        outputs = {k: v if isinstance(v, tuple) else (v, "position") for k, v in dict(self.outputs).items()}
+        outputs = {
+            k: v if isinstance(v, tuple) else (v, "position") for k, v in dict(self.outputs).items()
+        }
         put("outputs", tuple(outputs.items()))
         put("trusted", frozenset(self.trusted))
         self._check()
@@ -142,7 +144,9 @@ class Mechanism:
         for e in self.effects:
             if (e.name, e.at) == (name, at):
                 return e
-        raise InputError(f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first.")
+        raise InputError(
+            f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first."
+        )
 
     # -- parameters --------------------------------------------------------------------------------
 
@@ -166,7 +170,9 @@ class Mechanism:
         """Parameters that a fit moves: all but the trusted ones."""
         return tuple(n for n in self.parameter_names if n not in self.trusted)
 
-    def with_values(self, values: Mapping[str, float] | Sequence[Any] | np.ndarray | jax.Array) -> Self:
+    def with_values(
+        self, values: Mapping[str, float] | Sequence[Any] | np.ndarray | jax.Array
+    ) -> Self:
         """The same mechanism with other numbers, given by full name or as the whole vector."""
         if isinstance(values, Mapping):
             for name in values:
@@ -228,4 +234,3 @@ class Mechanism:
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
                 lines.append(f"  {full} = {number} {specifications(e)[name].unit}{held}")
         return "\n".join(lines)
-

@@ -46,7 +46,9 @@ class SmoothRK4:
         eq = equations(structure.with_values(values), gates)
         return SmoothConstants(values, gates, Ts / self.substeps, eq)
 
-    def advance(self, structure: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants) -> jax.Array:
+    def advance(
+        self, structure: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants
+    ) -> jax.Array:
         """State one sample later under the held voltage `v` [V]."""
         mechanism = structure.with_values(c.values)
 
@@ -59,7 +61,9 @@ class SmoothRK4:
 
         return jax.lax.fori_loop(0, self.substeps, step, x)
 
-    def _flow(self, mechanism: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants) -> jax.Array:
+    def _flow(
+        self, mechanism: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants
+    ) -> jax.Array:
         layout, eq = Layout.of(mechanism.structure), c.equations
         L, z = x[: layout.linear], x[layout.linear :]
         dL = apply(eq.A, L) + along(eq.B, v)

@@ -40,7 +40,9 @@ class Exponential:
     order: int = 2
     substeps: int = 1
 
-    def prepare(self, structure: Mechanism, values: jax.Array, gates: jax.Array, Ts: jax.Array) -> Constants:
+    def prepare(
+        self, structure: Mechanism, values: jax.Array, gates: jax.Array, Ts: jax.Array
+    ) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
         return constants(structure, values, gates, Ts / self.substeps)
 
@@ -60,7 +62,9 @@ class Exponential:
         return jax.lax.fori_loop(0, self.substeps, body, x)
 
 
-def _advance(mechanism: Mechanism, x: jax.Array, v: jax.Array, c: Constants, order: int) -> jax.Array:
+def _advance(
+    mechanism: Mechanism, x: jax.Array, v: jax.Array, c: Constants, order: int
+) -> jax.Array:
     layout = Layout.of(mechanism.structure)
     L, z = x[: layout.linear], x[layout.linear :]
     start = apply(c.E, L) + along(c.input, v)
@@ -104,7 +108,9 @@ def port_motion(layout: Layout, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return apply(P, x[: layout.n]), apply(P, x[layout.n : 2 * layout.n])
 
 
-def _torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
+def _torques(
+    mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array
+) -> jax.Array:
     """Smooth torques at the torque ports."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
@@ -118,7 +124,9 @@ def _torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gat
     return jnp.stack(total)
 
 
-def _remember(mechanism: Mechanism, z: jax.Array, x: jax.Array, v: jax.Array, h: jax.Array) -> jax.Array:
+def _remember(
+    mechanism: Mechanism, z: jax.Array, x: jax.Array, v: jax.Array, h: jax.Array
+) -> jax.Array:
     """Memories after `h`, port motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
     layout = Layout.of(mechanism.structure)
     found = effects_of(mechanism, Memory)
@@ -137,7 +145,9 @@ def _remember(mechanism: Mechanism, z: jax.Array, x: jax.Array, v: jax.Array, h:
     return jnp.stack(new)
 
 
-def _levels(mechanism: Mechanism, x: jax.Array, end: jax.Array, gates: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _levels(
+    mechanism: Mechanism, x: jax.Array, end: jax.Array, gates: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Friction levels against positive and negative motion of each friction port."""
     layout = Layout.of(mechanism.structure)
     position, before = port_motion(layout, x)

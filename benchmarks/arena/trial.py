@@ -1,0 +1,112 @@
+"""One benchmark record from the arena: search, oracle, marks. Imports JAX, so workers import it."""
+
+from __future__ import annotations
+
+import math
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import rotflex_jax as rf
+from arena.hidden import ABSORBED, DEFAULTS, Place
+from arena.records import make_record
+from arena.scoring import parameter_errors, renamed, scored, visible
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.model import Model, window_starts
+
+SPLIT, WINDOW, FS = 0.7, 2.0, 500.0
+
+
+def recording(job: dict[str, Any]) -> tuple[rf.Recording, dict[str, Any]]:
+    """The recording of a job, and its truth."""
+    places = [tuple(p) for p in job["effects"]]
+    r = make_record(places, kind=job["kind"], seed=job["seed"], seconds=job["seconds"], fs=FS)
+    return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena"), r["truth"]
+
+
+def windows_error(model: Model, test: rf.Recording) -> dict[str, float]:
+    """Root mean square error of short free runs per channel, what a run may see not counted."""
+    counts = np.ones(test.N, bool)
+    for start in window_starts(test, WINDOW)[0]:
+        counts[start : start + test.n_init] = False
+    e = (model.measured(test) - model.simulate_windows(test, WINDOW))[counts]
+    return dict(zip(model.mechanism.channels, np.sqrt(np.mean(e**2, axis=0)).tolist(), strict=True))
+
+
+def oracle(places: list[Place], train: rf.Recording, test: rf.Recording) -> dict[str, Any]:
+    """The true structure, fitted from half the default sizes and never told the true numbers."""
+    m = rf.joints.paper()
+    for place in places:
+        if place in ABSORBED:
+            continue
+        half = {n: (v if n in ("speed", "phase") else v / 2) for n, v in DEFAULTS[place].items()}
+        m = m + CATALOG[place[0]](at=place[1], **renamed(place, half))
+    fitted = rf.fit(m, train)
+    return {"windows": windows_error(fitted.model, test), "status": fitted.status}
+
+
+def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Searches one record and marks the answer; a failure is a row with its error.
+
+    Args:
+        job: `effects`, `kind`, `seed`, `seconds`.
+        tell: called with lines of progress.
+
+    Returns:
+        A row for JSON.
+    """
+    row: dict[str, Any] = dict(job)
+    lines: list[str] = []
+
+    def say(line: str) -> None:
+        lines.append(line)
+        tell(line)
+
+    try:
+        rec, truth = recording(job)
+        hidden = {(e["effect"], e["port"]): e["parameters"] for e in truth["effects"]}
+        wanted = visible(hidden, job["kind"])
+        train, test = rec.split(SPLIT)
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = rf.discover(rf.joints.paper(), train, test, window_seconds=WINDOW, progress=say)
+        row["wall_s"] = time.perf_counter() - wall
+        row["cpu_s"] = time.process_time() - cpu
+        rounds = [(r.effect, r.port) for r in result.rounds]
+        equivalents = [list(r.equivalent) for r in result.rounds]
+        row.update(
+            scored(wanted, rounds, equivalents, result.verdict),
+            wanted=[list(p) for p in wanted],
+            verdict=result.verdict,
+            sentence=result.sentence,
+            rounds=[
+                {
+                    "effect": r.effect,
+                    "port": r.port,
+                    "equivalent": [list(p) for p in r.equivalent],
+                    "nats": r.held_out_gain_nats,
+                    "score": r.score,
+                }
+                for r in result.rounds
+            ],
+            notes=list(result.notes),
+            ranking=[[s.effect, s.port, _finite(s.score), s.excited] for s in result.ranking[:8]],
+            parameters=parameter_errors(hidden, {e.name: e for e in result.final.estimates}),
+            windows=result.final.held_out_rmse_windows,
+            windows_baseline=result.baseline.held_out_rmse_windows,
+            noise_floor=result.noise_floor,
+        )
+        best = oracle(list(hidden), train, test)
+        row["oracle"] = best
+        row["over_oracle"] = {c: row["windows"][c] / v for c, v in best["windows"].items()}
+    except Exception as problem:  # the benchmark reports it and goes on
+        row["error"] = f"{type(problem).__name__}: {problem}"
+        row["traceback"] = traceback.format_exc()
+    row["lines"] = lines
+    return row
+
+
+def _finite(x: float) -> float | None:
+    return float(x) if math.isfinite(x) else None

@@ -1,0 +1,113 @@
+"""Unconstrained coordinates and physical values: one to one, and no bound is ever left."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from rotflex_jax.parameters import Estimate, Specification, Transform, parameter
+from rotflex_jax.precision import double_precision
+
+FREE = Specification(unit="N m", typical=0.02)
+POSITIVE = Specification(unit="kg m^2", typical=0.002, lower=0.0)
+RAISED = Specification(unit="ohm", typical=2.6, lower=0.5)
+BOXED = Specification(unit="rad", typical=1.0, lower=-0.5, upper=3.0)
+CAPPED = Specification(unit="V", typical=1.0, upper=5.0)
+ALL = (FREE, POSITIVE, RAISED, BOXED)
+
+
+def constrain(specs, z):
+    with double_precision():
+        return np.asarray(Transform.of(specs).constrain(jnp.asarray(z, float)))
+
+
+def inside(spec: Specification) -> st.SearchStrategy[float]:
+    """Values away from the bounds, where the way back is exact."""
+    if math.isfinite(spec.lower) and math.isfinite(spec.upper):
+        span = spec.upper - spec.lower
+        return st.floats(spec.lower + 0.01 * span, spec.upper - 0.01 * span)
+    if math.isfinite(spec.lower):
+        return st.floats(-2, 6).map(lambda k: spec.lower + spec.typical * 10**k)
+    return st.floats(-1e4, 1e4).map(lambda k: spec.typical * k)
+
+
+@settings(deadline=None, max_examples=60, derandomize=True)
+@given(st.tuples(*map(inside, ALL)))
+def test_there_and_back(p):
+    z = Transform.of(ALL).unconstrain(np.array(p))
+    np.testing.assert_allclose(constrain(ALL, z), p, rtol=1e-9, atol=1e-12)
+
+
+@settings(deadline=None, max_examples=60, derandomize=True)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=4, max_size=4))
+def test_bounds_are_never_left(z):
+    for p in (constrain(ALL, z), Transform.of(ALL).physical(np.array(z))[0]):
+        assert np.isfinite(p).all()
+        for value, spec in zip(p, ALL, strict=True):
+            assert spec.lower <= value <= spec.upper
+
+
+@settings(deadline=None, max_examples=40, derandomize=True)
+@given(st.lists(st.floats(-50, 50), min_size=4, max_size=4))
+def test_physical_is_constrain_with_its_derivative(z):
+    transform, z = Transform.of(ALL), np.array(z)
+    with double_precision():
+        point = jnp.asarray(z)
+        p, slope = jax.jvp(transform.constrain, (point,), (jnp.ones_like(point),))
+    mine, its_slope = transform.physical(z)
+    np.testing.assert_allclose(mine, p, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(its_slope, slope, rtol=1e-10, atol=1e-18)
+
+
+def test_closed_forms():
+    """ln 2 above the bound doubles the way to it; a third of a box is at the logit of a third."""
+    z = np.array([1.5, np.log(2.0), np.log(2.0), np.log(0.5)])
+    np.testing.assert_allclose(constrain(ALL, z), [0.03, 2.0, 2.5, -0.5 + 3.5 / 3], rtol=1e-12)
+    # Far from the bound of 0.5 as well as near it.
+    near = Transform.of([RAISED]).unconstrain(np.array([0.6]))
+    np.testing.assert_allclose(near, np.log(0.1), rtol=1e-12)
+
+
+def test_several_sets_side_by_side():
+    transform, z = Transform.of(ALL), np.random.default_rng(0).normal(size=(2, 3, 4))
+    rows = np.array([[transform.physical(row) for row in block] for block in z])
+    together = np.stack(transform.physical(z), axis=2)
+    np.testing.assert_array_equal(together, rows)
+
+
+def test_a_value_on_its_bound_starts_where_it_can_move():
+    specs = (POSITIVE, BOXED, BOXED)
+    z = Transform.of(specs).unconstrain(np.array([0.0, -0.5, 3.0]))
+    p, slope = Transform.of(specs).physical(z)
+    assert 0 < p[0] <= 1e-3 * POSITIVE.typical * (1 + 1e-9)
+    np.testing.assert_allclose(p[1:], [-0.5, 3.0], atol=0.004)
+    assert (slope > 0).all()
+
+
+def test_single_precision_stays_single():
+    p = Transform.of(ALL).constrain(jnp.zeros(4, jnp.float32))
+    assert p.dtype == jnp.float32
+
+
+def test_the_typical_size_follows_the_default():
+    made = [parameter(d, unit="V").metadata["parameter"].typical for d in (0.25, -3.0, 0.0, None)]
+    assert made == [0.25, 3.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_an_estimate_says_what_it_is(free):
+    nan = float("nan")
+    std, ci = (0.1, (1.8, 2.2)) if free else (nan, (nan, nan))
+    estimate = Estimate("hub.coulomb.level", 2.0, std, ci, "N m", free=free)
+    assert ("held" in str(estimate)) is not free
+    assert str(estimate).startswith("hub.coulomb.level = 2 N m")
+    told = estimate.to_dict()
+    assert told == {
+        "value": 2.0,
+        "std": 0.1 if free else None,
+        "ci95": [1.8, 2.2] if free else None,
+        "unit": "N m",
+    }
