@@ -46,14 +46,10 @@ SamplingPeriod = Annotated[
     float | None,
     typer.Option("--Ts", metavar="SECONDS", help="Sampling period, where no column has the time."),
 ]
-TimeColumn = Annotated[
-    str | None, typer.Option("--time", metavar="COLUMN", help="Column of the time [s].")
-]
+TimeColumn = Annotated[str | None, typer.Option("--time", metavar="COLUMN", help="Column of the time [s].")]
 Accept = Annotated[
     list[str] | None,
-    typer.Option(
-        "--accept", metavar="FAULT", help="Accept a named fault of the data, such as saturated."
-    ),
+    typer.Option("--accept", metavar="FAULT", help="Accept a named fault of the data, such as saturated."),
 ]
 JsonFile = Annotated[
     Path | None,
@@ -70,10 +66,6 @@ HeldOut = Annotated[
 Share = Annotated[
     float | None,
     typer.Option("--split", metavar="SHARE", help="Share of each FILE to learn from: 0.7."),
-]
-MethodNames = Annotated[
-    str | None,
-    typer.Option("--methods", metavar="A,B", help="Methods to compare; all unless given."),
 ]
 
 
@@ -142,9 +134,7 @@ def _channels(outputs: Sequence[str]) -> Sequence[str] | Mapping[str, str] | Non
 def _as_options(sentence: str) -> str:
     """A sentence about arguments of `rotflex_jax.load`, told in options of the command line."""
     sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
-    sentence = sentence.replace("degrees=True", "--degrees").replace(
-        "degrees=False", "no --degrees"
-    )
+    sentence = sentence.replace("degrees=True", "--degrees").replace("degrees=False", "no --degrees")
     sentence = re.sub(r"\b(input|time|Ts)=(?=\d)", r"--\1 ", sentence)
     sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
     sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
@@ -202,15 +192,6 @@ def choose(name: str, choices: Iterable[str], what: str) -> str:
     close = difflib.get_close_matches(name, choices, n=1)
     hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
     raise InputError(f"There is no {what} called {name!r}; {hint}")
-
-
-def methods(text: str | None) -> list[str] | None:
-    """The names of methods in `arx,grey_box`; None for all."""
-    from rotflex_jax.compare.method import chosen
-
-    names = None if text is None else [n.strip() for n in text.split(",") if n.strip()]
-    chosen(names)
-    return names
 
 
 def joint(text: str) -> Any:

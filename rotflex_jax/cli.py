@@ -73,9 +73,7 @@ def _start(
 
 
 @app.command()
-def demo(
-    report: given.ReportFolder = Path("rotflex-demo"), json_file: given.JsonFile = None
-) -> None:
+def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.JsonFile = None) -> None:
     """Show the loop on a recording that comes with the package, up to its report."""
     given.check_writable(json_file=json_file, folder=report)
     from rotflex_jax.data.datasets import demo_recording
@@ -112,7 +110,9 @@ def discover(
 @app.command()
 def compare(
     files: given.Files,
-    methods: given.MethodNames = None,
+    methods: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Methods to compare; all unless given.")
+    ] = None,
     joint: given.JointName = "paper",
     held_out: given.HeldOut = None,
     split: given.Share = None,
@@ -128,7 +128,10 @@ def compare(
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, held_out or [])
     given.check_writable(json_file=json_file)
-    mechanism, wanted = given.joint(joint), given.methods(methods)
+    mechanism, names = given.joint(joint), methods if methods is None else methods.split(",")
+    from rotflex_jax.compare.method import chosen
+
+    wanted = chosen(names)  # an unknown one is refused before any file is read
     columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
     train, test = columns.load_parts(files, held_out or [], share)
     terminal.print_findings([*train, *test])
@@ -146,9 +149,7 @@ def simulate(
     joint: given.JointName = "paper",
     add: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="EFFECT@PORT", help="Add an effect: coulomb@hub or coulomb@hub:level=0.03."
-        ),
+        typer.Option(metavar="EFFECT@PORT", help="Add an effect: coulomb@hub or coulomb@hub:level=0.03."),
     ] = None,
     fit: Annotated[
         list[Path] | None,

@@ -25,9 +25,7 @@ from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 
 _free = jax.jit(free_run, static_argnums=(0, 1))
-_free_many = jax.jit(
-    jax.vmap(free_run, in_axes=(None, None, None, None, 0, 0, None)), static_argnums=(0, 1)
-)
+_free_many = jax.jit(jax.vmap(free_run, in_axes=(None, None, None, None, 0, 0, None)), static_argnums=(0, 1))
 _predict = jax.jit(predictor_run, static_argnums=(0, 1))
 
 

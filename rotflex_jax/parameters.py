@@ -47,11 +47,7 @@ def specifications(owner: Any) -> dict[str, Specification]:
 
     A parameter whose value is None belongs to a part that the instance lacks and is left out.
     """
-    found = {
-        f.name: f.metadata["parameter"]
-        for f in dataclasses.fields(owner)
-        if "parameter" in f.metadata
-    }
+    found = {f.name: f.metadata["parameter"] for f in dataclasses.fields(owner) if "parameter" in f.metadata}
     if isinstance(owner, type):
         return found
     return {name: spec for name, spec in found.items() if getattr(owner, name) is not None}
@@ -99,9 +95,7 @@ class Transform:
         share = expit(np.where(boxed, z, 0.0))
         p = np.where(positive, low + grown, z * self.typical)
         slope = np.where(positive, grown, self.typical)
-        return np.where(boxed, low + span * share, p), np.where(
-            boxed, span * share * (1 - share), slope
-        )
+        return np.where(boxed, low + span * share, p), np.where(boxed, span * share * (1 - share), slope)
 
     def unconstrain(self, p: np.ndarray) -> np.ndarray:
         """Unconstrained coordinates of physical values; a value on its bound starts just inside."""

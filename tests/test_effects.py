@@ -203,9 +203,7 @@ def test_derivatives_equal_central_differences(cls):
     slopes = np.array(jax.jit(jax.jacfwd(flat))(jnp.asarray(at)))
     for i in range(len(at)):
         h = 1e-5 * max(abs(at[i]), 1e-3)
-        up, down = (
-            np.array(flat_jit(jnp.asarray(at + s * h * np.eye(len(at))[i]))) for s in (1, -1)
-        )
+        up, down = (np.array(flat_jit(jnp.asarray(at + s * h * np.eye(len(at))[i]))) for s in (1, -1))
         np.testing.assert_allclose(slopes[:, i], (up - down) / (2 * h), rtol=1e-6, atol=1e-7)
 
 
@@ -218,9 +216,7 @@ def test_jit_vmap_and_arrays_agree_with_one_point(cls):
     mapped = jax.jit(jax.vmap(lambda g: law(effect, numbers, g, 2 * g, 3 * g, g / 4)))(grid)
     np.testing.assert_allclose(mapped, one_by_one, rtol=1e-14, atol=1e-16)
     if isinstance(effect, Force):
-        np.testing.assert_allclose(
-            effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, 0], rtol=1e-14
-        )
+        np.testing.assert_allclose(effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, 0], rtol=1e-14)
     if isinstance(effect, Sensing):
         np.testing.assert_allclose(effect.measure(grid), one_by_one[:, 0], rtol=1e-14)
 
@@ -296,6 +292,21 @@ def test_bad_parameters_are_named(cls):
                 cls(at=cls.ports[0], **{name: value})
     with pytest.raises(InputError, match="name of a port"):
         cls(at=0.3)
+
+
+def test_what_may_be_negative():
+    """Only what has a sign by nature, and damping, which is what the motor's own leaves over."""
+    negative = {f"{c.name}.{n}" for c in CLASSES for n, s in c.declared().items() if s.lower < 0}
+    assert negative == {
+        "viscous.coefficient",
+        "cubic_spring.stiffness",
+        "quadratic_spring.stiffness",
+        "gravity.sine",
+        "gravity.cosine",
+        "voltage_offset.offset",
+        "sensor_bias.bias",
+        "sensor_gain.error",
+    }
 
 
 def test_every_file_registers_and_knows_no_sibling():

@@ -1,5 +1,7 @@
 """The steady gain against SciPy's Riccati solver, and its process noise against quadrature."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
@@ -14,18 +16,19 @@ VECTORS = {"hub": [1.0, 0.0], "joint": [0.0, 1.0], "arm": [1.0, 1.0]}
 M = np.array([[0.0021 + 0.0059, 0.0059], [0.0059, 0.0059]])
 
 
-def quadrature(A: np.ndarray, g: np.ndarray, Ts: float, pieces: int = 40) -> np.ndarray:
-    """The integral of exp(A s) g g' exp(A' s) over a sample, by Gauss and Legendre on pieces.
+def quadrature(A: np.ndarray, g: np.ndarray, Ts: float) -> np.ndarray:
+    """The integral of exp(A s) g g' exp(A' s) over a sample, by Gauss and Legendre.
 
-    The pieces are shorter near zero, where a fast pole acts.
+    Where a pole is fast, on pieces that are shorter near zero.
     """
     nodes, weights = np.polynomial.legendre.leggauss(12)
-    edges = np.concatenate([[0.0], Ts * np.geomspace(1e-4, 1.0, pieces)])
+    fast = np.abs(np.linalg.eigvals(A)).max() * Ts > 5
+    edges = np.concatenate([[0.0], Ts * np.geomspace(1e-3, 1.0, 20)]) if fast else [0.0, Ts]
     total = np.zeros_like(A)
-    for a, b in zip(edges, edges[1:], strict=False):
-        for s, w in zip((a + b) / 2 + (b - a) / 2 * nodes, (b - a) / 2 * weights, strict=True):
-            x = expm(A * s) @ g
-            total += w * np.outer(x, x)
+    for a, b in itertools.pairwise(edges):
+        s = (a + b) / 2 + (b - a) / 2 * nodes
+        x = expm(A * s[:, None, None]) @ g
+        total += np.einsum("s,si,sj->ij", (b - a) / 2 * weights, x, x)
     return total
 
 
@@ -38,7 +41,7 @@ def pushed(joint, port: str) -> np.ndarray:
 
 def expected(joint, intensity, noise, Ts) -> np.ndarray:
     space = linearise(joint)
-    Q = sum(q * quadrature(space.A, pushed(joint, port), Ts) for port, q in intensity.items())
+    Q = sum(q * quadrature(space.A, pushed(joint, port), Ts) for port, q in intensity.items() if q)
     R = np.diag(noise**2)
     Ad = expm(space.A * Ts)
     # In units of the noise, so that SciPy solves a well-scaled problem.
@@ -96,7 +99,7 @@ def test_more_disturbance_trusts_the_sensor_more():
     joint = single_inertia(0.002)
     q = np.geomspace(1e-10, 1e3, 8)
     K = kalman_gains(joint, [{"hub": v} for v in q], np.array([1e-4]), 0.01)[:, 0, 0]
-    assert (np.diff(K) > 0).all() and 0 < K[0] and 0.99 < K[-1] < 1
+    assert (np.diff(K) > 0).all() and K[0] > 0 and 0.99 < K[-1] < 1
 
 
 def test_memories_are_not_corrected():
@@ -114,7 +117,7 @@ def test_the_filter_reaches_the_variance_that_the_equation_promises():
     Ad, C = expm(space.A * Ts), space.C
     K = kalman_gains(joint, [intensity], NOISE, Ts)[0]
     Q = sum(q * quadrature(space.A, pushed(joint, p), Ts) for p, q in intensity.items())
-    rng, N = np.random.default_rng(0), 6000
+    rng, N = np.random.default_rng(0), 4000
     w = rng.multivariate_normal(np.zeros(4), Q, N, tol=1e-6)
     v = rng.normal(size=(N, 2)) * NOISE
     x, hat, e = np.zeros(4), np.zeros(4), np.empty((N, 2))
@@ -126,6 +129,6 @@ def test_the_filter_reaches_the_variance_that_the_equation_promises():
     # S = (1 - C K)^-1 R for the optimal gain.
     S = np.linalg.solve(np.eye(2) - C @ K, np.diag(NOISE**2))
     scale = np.sqrt(np.outer(np.diag(S), np.diag(S)))
-    np.testing.assert_allclose(e.T @ e / len(e) / scale, S / scale, atol=0.06)
+    np.testing.assert_allclose(e.T @ e / len(e) / scale, S / scale, atol=0.08)
     after = e[1:].T @ e[:-1] / len(e) / scale  # white: no correlation with the sample before
-    np.testing.assert_allclose(after, 0.0, atol=0.06)
+    np.testing.assert_allclose(after, 0.0, atol=0.08)

@@ -131,7 +131,7 @@ def last_deflection(joint: Mechanism) -> jax.Array:
 
 
 def test_jit_and_gradient_pass_through_a_mechanism():
-    joint = paper(hub_damping=0.004) + fx.CubicSpring("joint", coefficient=20.0)
+    joint = paper(hub_damping=0.004) + fx.CubicSpring("joint", 20.0)
     with double_precision():
         value = float(jax.jit(last_deflection)(joint))
         gradient = jax.jit(jax.grad(last_deflection))(joint)

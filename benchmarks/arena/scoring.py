@@ -96,6 +96,8 @@ def parameter_errors(
 ) -> dict[str, dict[str, Any]]:
     """True values beside the estimates of the same full name; effects not found are left out.
 
+    So are effects that only add to a constant of the baseline: they have no number of their own.
+
     Args:
         hidden: parameters under the arena's names.
         estimates: full name `port.effect.parameter` -> object with `value` and `ci95`.
@@ -105,6 +107,8 @@ def parameter_errors(
     """
     table = {}
     for place, values in hidden.items():
+        if place in ABSORBED:
+            continue
         for name, true in renamed(place, values).items():
             full = f"{place[1]}.{place[0]}.{name}"
             if full not in estimates:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rotflex_jax.compare.method import Fitted, Progress, register
+from rotflex_jax.compare.method import Fitted, Progress
 from rotflex_jax.errors import InputError
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
@@ -134,6 +134,3 @@ def _free_run_cost(equation: Difference, recordings: Sequence[Recording]) -> flo
         e = [(r.y - equation.simulate(r))[r.n_init :] for r in recordings]
         cost = float(np.mean(np.log(np.sqrt(np.mean(np.concatenate(e) ** 2, axis=0)))))
     return np.inf if np.isnan(cost) else cost
-
-
-register(ARX())

@@ -52,9 +52,7 @@ def seconds_of(simulator: Simulator, recordings: Sequence[Recording]) -> float:
     return time.perf_counter() - began
 
 
-def left_the_range(
-    runs: Sequence[np.ndarray], recordings: Sequence[Recording], reach: np.ndarray
-) -> str:
+def left_the_range(runs: Sequence[np.ndarray], recordings: Sequence[Recording], reach: np.ndarray) -> str:
     """In words when the first run diverged; "" where none did.
 
     Args:
@@ -74,9 +72,7 @@ def left_the_range(
     return ""
 
 
-def errors(
-    recordings: Sequence[Recording], runs: Sequence[np.ndarray]
-) -> dict[str, dict[str, float]]:
+def errors(recordings: Sequence[Recording], runs: Sequence[np.ndarray]) -> dict[str, dict[str, float]]:
     """Metric -> channel -> value, over all recordings together, after the samples of `n_init`."""
     y = np.concatenate([r.y[r.n_init :] for r in recordings]).astype(float)
     y_hat = np.concatenate([run[r.n_init :] for r, run in zip(recordings, runs, strict=True)])

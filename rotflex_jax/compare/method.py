@@ -84,8 +84,7 @@ def register(method: Method) -> Method:
     _check(method)
     if METHODS.get(method.name, method) != method:
         raise InputError(
-            f"A method named {method.name!r} was registered, but there is one already; choose "
-            "another name."
+            f"A method named {method.name!r} was registered, but there is one already; choose another name."
         )
     METHODS[method.name] = method
     return method
@@ -112,6 +111,7 @@ def chosen(methods: Iterable[str | Method] | None) -> tuple[Method, ...]:
 
 
 def _named(name: str) -> Method:
+    name = name.strip()
     if name in METHODS:
         return METHODS[name]
     close = difflib.get_close_matches(name, METHODS, n=1)

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from rotflex_jax.compare.method import Fitted, Progress, register
+from rotflex_jax.compare.method import Fitted, Progress
 from rotflex_jax.discover import discover
 from rotflex_jax.discover.refit import HORIZON
 from rotflex_jax.effects.kinds import Linear
@@ -116,7 +116,3 @@ def _fitted(
         raise RuntimeError(found.status)
     stopped = "" if found.status == "converged" else f"fit {found.status}"
     return Fitted(found.model, len(found.free_names), "; ".join(filter(None, (note, stopped))))
-
-
-for _method in (Textbook(), LinearPart(), GreyBox(), GreyBoxPredictor(), Discovered()):
-    register(_method)

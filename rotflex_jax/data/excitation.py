@@ -19,9 +19,7 @@ Voltage = Float[np.ndarray, " N"]
 Seed = int | np.random.Generator
 
 
-def noise(
-    N: int, Ts: float, *, rms: float = 1.0, bandwidth: float = 5.0, seed: Seed = 0
-) -> Voltage:
+def noise(N: int, Ts: float, *, rms: float = 1.0, bandwidth: float = 5.0, seed: Seed = 0) -> Voltage:
     """Gaussian noise through a first-order filter, stationary from the first sample.
 
     u[k] = a u[k-1] + sqrt(1 - a^2) w[k],  a = exp(-2 pi bandwidth Ts),  w ~ N(0, rms^2)
@@ -111,9 +109,7 @@ def multisine(
     return np.tile(best, int(periods))
 
 
-def prbs(
-    N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed: Seed = 0
-) -> Voltage:
+def prbs(N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed: Seed = 0) -> Voltage:
     """A maximum-length pseudo-random binary sequence: two levels, each bit held for a while.
 
     As long as needed not to repeat. Not for a dead zone or a saturation: two levels hide them.
@@ -170,9 +166,7 @@ def steps(
     return np.repeat(rng.uniform(-amplitude, amplitude, most), times)[:N]
 
 
-def sweep(
-    N: int, Ts: float, *, band: tuple[float, float] = (0.1, 12.0), amplitude: float = 1.0
-) -> Voltage:
+def sweep(N: int, Ts: float, *, band: tuple[float, float] = (0.1, 12.0), amplitude: float = 1.0) -> Voltage:
     """A sine whose frequency rises exponentially, the same time for every octave.
 
     u(t) = A sin(2 pi f0 T (r^(t / T) - 1) / ln(r)),  r = f1 / f0,  T = N Ts
@@ -194,9 +188,7 @@ def sweep(
     return amplitude * np.sin(2 * np.pi * cycles)
 
 
-def pulse(
-    N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, delay: float = 0.1
-) -> Voltage:
+def pulse(N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, delay: float = 0.1) -> Voltage:
     """One rectangular pulse, nothing before and after: the free motion afterwards shows friction.
 
     Args:

@@ -142,8 +142,7 @@ def _column(table: Table, name: str, argument: str, wrong: Mapping[str, str]) ->
     label = f"{table.label}: column {name!r}"
     for unit in _words(name) & set(wrong):
         raise InputError(
-            f"{label} is in {unit} by its name, but {wrong[unit]} are needed; "
-            "convert and rename it."
+            f"{label} is in {unit} by its name, but {wrong[unit]} are needed; convert and rename it."
         )
     numbers = real_numbers(values, label, table.where, table.first)
     finite(numbers, label, table.where, table.first)
@@ -184,8 +183,7 @@ def _timing(
     measured = even_spacing(t.astype(float), label, table.where, table.first)
     if Ts is not None and abs(measured - Ts) > 0.01 * Ts:
         raise InputError(
-            f"{label} advances by {measured:g} s, but Ts={Ts:g} was given; "
-            "leave Ts out, or correct it."
+            f"{label} advances by {measured:g} s, but Ts={Ts:g} was given; leave Ts out, or correct it."
         )
     if measured >= 0.5 and not any_unit:
         raise InputError(

@@ -74,9 +74,7 @@ def load_silverbox(path: str | os.PathLike[str]) -> list[Recording]:
         "arrow": (100, 40575),
         "arrow without extrapolation": (100, 32100),
     }
-    return [
-        replace(whole.slice(i, j), source=f"{file.name}, {part}") for part, (i, j) in ranges.items()
-    ]
+    return [replace(whole.slice(i, j), source=f"{file.name}, {part}") for part, (i, j) in ranges.items()]
 
 
 def load_rotary_arm(path: str | os.PathLike[str]) -> Recording:

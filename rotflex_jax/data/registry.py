@@ -83,12 +83,8 @@ DATASETS = {
                 "c83f7dd7fd718625b863fa37bc18bdbd42ec5741",
                 "Lab4",
                 {
-                    "PDControllerA.mat": (
-                        "5d6650cb7f19bdbeac7e8e22ee0c7eb23fe3ca4052206db089867d923a240618"
-                    ),
-                    "PDControllerB.mat": (
-                        "5082ba05204282835ab09e9fcc2e1d1ac4fb309626df2ea4b9b36fef10816034"
-                    ),
+                    "PDControllerA.mat": ("5d6650cb7f19bdbeac7e8e22ee0c7eb23fe3ca4052206db089867d923a240618"),
+                    "PDControllerB.mat": ("5082ba05204282835ab09e9fcc2e1d1ac4fb309626df2ea4b9b36fef10816034"),
                 },
             ),
             reader=load_rotflex,
@@ -105,9 +101,7 @@ DATASETS = {
                 "956aa7ecd73061b0321c6f6098d74c9e4a7ce67a",
                 "examples/EMPS/data",
                 {
-                    "DATA_EMPS.mat": (
-                        "6cf6814ae14618795da0101aae2bb97ff0c6351b0501b5492751b02b07facf7e"
-                    ),
+                    "DATA_EMPS.mat": ("6cf6814ae14618795da0101aae2bb97ff0c6351b0501b5492751b02b07facf7e"),
                     "DATA_EMPS_PULSES.mat": (
                         "0eab75bb1f6b16228ee78791343a88bf9bfd9a51036ac9807d7b5fc11c0e1704"
                     ),
@@ -126,11 +120,7 @@ DATASETS = {
                 "biaslab/nsi-silverbox",
                 "728f07e4539d4f7da76a4778b52a756260b488ac",
                 "data/Silverbox",
-                {
-                    "SNLS80mV.mat": (
-                        "5c7413a52255af0cb4e2f93fb6903beb92b08965ba1e6ad0a6ffedfed8477ed4"
-                    )
-                },
+                {"SNLS80mV.mat": ("5c7413a52255af0cb4e2f93fb6903beb92b08965ba1e6ad0a6ffedfed8477ed4")},
             ),
             reader=load_silverbox,
         ),
@@ -146,18 +136,10 @@ DATASETS = {
                 "3f455292387be8bbcfbeaebeceec5cd6bb74021a",
                 "Lab 6: Rotary Arm",
                 {
-                    "flexarm_K1_6": (
-                        "8ca16bf31c8b422888a2cbec0c96b6f50bd96201802b88bf212269246a0b4a89"
-                    ),
-                    "rigidarm_K1_6": (
-                        "cef3913bd8839f215918dee1bbcca5d9e600b0d66ed60a0876f4f5912582fb30"
-                    ),
-                    "rigidarm_K1_8": (
-                        "60afa85806050e34d36f12da5ba6c5de071b8ece0d520ec73a42c286e100cc96"
-                    ),
-                    "rigidarm_k1k3_6": (
-                        "ce1387528cc4e3fd9f081c566489ea3ea9cfee2c03fe10ec70a1070fead2428a"
-                    ),
+                    "flexarm_K1_6": ("8ca16bf31c8b422888a2cbec0c96b6f50bd96201802b88bf212269246a0b4a89"),
+                    "rigidarm_K1_6": ("cef3913bd8839f215918dee1bbcca5d9e600b0d66ed60a0876f4f5912582fb30"),
+                    "rigidarm_K1_8": ("60afa85806050e34d36f12da5ba6c5de071b8ece0d520ec73a42c286e100cc96"),
+                    "rigidarm_k1k3_6": ("ce1387528cc4e3fd9f081c566489ea3ea9cfee2c03fe10ec70a1070fead2428a"),
                 },
             ),
             reader=load_rotary_arm,

@@ -41,8 +41,7 @@ class Table:
         there = longer or list(self.columns)  # settings of one value are not worth offering
         names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         raise InputError(
-            f"{self.label} has no column {name!r}; it has {names or 'none'}: "
-            f"name the right one with {what}."
+            f"{self.label} has no column {name!r}; it has {names or 'none'}: name the right one with {what}."
         )
 
 
@@ -65,6 +64,5 @@ def unreadable(path: Path, what: str, error: Exception) -> InputError:
     """The error for a file that is not what its ending says."""
     reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return InputError(
-        f"{path.name} cannot be read as {what} ({reason[:120]}); "
-        "it may be damaged: export it again."
+        f"{path.name} cannot be read as {what} ({reason[:120]}); it may be damaged: export it again."
     )

@@ -230,19 +230,13 @@ def choose(
     simpler = [t for t in able if _contained(t, winner) and not _clearly(winner, t, base)]
     if simpler:
         winner = max(simpler, key=lambda t: t.held_out)
-    rivals = [
-        t
-        for t in able
-        if t is not winner and not _contained(winner, t) and not _contained(t, winner)
-    ]
+    rivals = [t for t in able if t is not winner and not _contained(winner, t) and not _contained(t, winner)]
     return winner, [t for t in rivals if not told_apart(winner, t, data)]
 
 
 def told_apart(winner: Trial, rival: Trial, data: Data) -> bool:
     """Whether all recordings together, block by block, prefer the winner beyond doubt."""
-    a, b = (
-        np.concatenate([t.blocks, in_blocks(t.hypothesis.densities, data)]) for t in (winner, rival)
-    )
+    a, b = (np.concatenate([t.blocks, in_blocks(t.hypothesis.densities, data)]) for t in (winner, rival))
     return lead(a, b)[1] >= SEPARATE_Z
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,18 +23,18 @@ LANES = 6
 class Lane(NamedTuple):
     """Numbers of one hypothesis for all recordings; stacked, a leading axis is added."""
 
-    values: np.ndarray  # (R, P)
-    x0: np.ndarray  # (R, m)
-    gates: np.ndarray  # (E,)
-    K: np.ndarray  # (R, n, C)
+    values: Any  # (R, P)
+    x0: Any  # (R, m)
+    gates: Any  # (E,)
+    K: Any  # (R, n, C)
 
 
 class Directions(NamedTuple):
     """Tangents (D, ...) in which a lane is differentiated."""
 
-    values: np.ndarray  # (D, R, P)
-    x0: np.ndarray  # (D, m), the same in every recording
-    gates: np.ndarray  # (D, E)
+    values: Any  # (D, R, P)
+    x0: Any  # (D, m), the same in every recording
+    gates: Any  # (D, E)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -85,15 +85,11 @@ class Bench:
             for i in range(0, len(lanes), LANES):
                 part = lanes[i : i + LANES]
                 out.append(
-                    np.asarray(_innovations(structure, self.solver, _stacked(part), data))[
-                        : len(part)
-                    ]
+                    np.asarray(_innovations(structure, self.solver, _stacked(part), data))[: len(part)]
                 )
         return np.concatenate(out)
 
-    def slopes(
-        self, lanes: list[Lane], directions: list[Directions]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, lanes: list[Lane], directions: list[Directions]) -> tuple[np.ndarray, np.ndarray]:
         """Innovations (L, R, N, C) and their slopes (L, D, R, N, C)."""
         es, Js = [], []
         structure = self.supermodel.mechanism.structure

@@ -81,18 +81,12 @@ def locate(
         found.append(in_frequency(channel, error, recording, unit))
         energies = {"lies": error**2, "arises": _made(error, recording, window_seconds)}
         found += [in_view(channel, energies, view) for view in sorted_by]
-    telling = [
-        f for f in _significant(found) if f.share >= max(f.expected + EXCESS, FACTOR * f.expected)
-    ]
-    telling.sort(
-        key=lambda f: (f.where.kind == "frequency", -float(information(f.share, f.expected)))
-    )
+    telling = [f for f in _significant(found) if f.share >= max(f.expected + EXCESS, FACTOR * f.expected)]
+    telling.sort(key=lambda f: (f.where.kind == "frequency", -float(information(f.share, f.expected))))
     return tuple(f.where for f in telling) or (_evenly(e, channels, noise),)
 
 
-def _made(
-    error: np.ndarray, recording: Recording, window_seconds: float | None
-) -> np.ndarray | None:
+def _made(error: np.ndarray, recording: Recording, window_seconds: float | None) -> np.ndarray | None:
     """Squared acceleration of an error (N,): where it is made, wherever it is carried to."""
     starts = [] if window_seconds is None else window_starts(recording, window_seconds)[0].tolist()
     acceleration, seen = missing_acceleration(error, recording, starts)

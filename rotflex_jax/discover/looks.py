@@ -159,9 +159,7 @@ def _beyond(what: str) -> dict[str, str]:
     }
 
 
-def _sides(
-    kind: str, x: np.ndarray, unit: str, error: float, phrases: dict[str, str]
-) -> View | None:
+def _sides(kind: str, x: np.ndarray, unit: str, error: float, phrases: dict[str, str]) -> View | None:
     """Looks at small and large values, either side; none where nothing moves beyond the noise."""
     reach = float(np.quantile(np.abs(x), 0.98))
     if reach <= 5 * error or reach == 0.0:

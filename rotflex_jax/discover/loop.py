@@ -31,7 +31,7 @@ from rotflex_jax.effects.kinds import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import everywhere, torque_scale
 from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
-from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
@@ -87,9 +87,13 @@ def discover(
     supermodel = build(model.mechanism, wanted, scales(model, trained, torque))
     noise = sensor_noise((*trained, *unseen), model)
     ports = tuple(everywhere(model.mechanism, 1.0))
-    judge = Judge(Bench(supermodel, model.solver, data), noise, torque, ports)
+    # The super-model has friction contacts at every port, of which few are ever switched on.
+    solver = (
+        dataclasses.replace(model.solver, passes=2) if isinstance(model.solver, Exponential) else model.solver
+    )
+    judge = Judge(Bench(supermodel, solver, data), noise, torque, ports)
     away = Away(
-        Judge(Bench(supermodel, model.solver, stack(unseen, model)), noise, torque, ports),
+        Judge(Bench(supermodel, solver, stack(unseen, model)), noise, torque, ports),
         unseen,
         first_states(model, unseen),
         window_seconds,
@@ -138,7 +142,7 @@ def discover(
     kept = _still_rivals(judge, away, final, equivalents, [p for p in order if p in dict(taken)])
     say("simulating the held-out recordings")
     trials = [held_out(away, h) for h in _ladder(judge, final, order, own, passed)]
-    scribe = Scribe(judge, away)
+    scribe = Scribe(judge, away, model.solver)
     stages = [scribe.stage(t, order[:k]) for k, t in enumerate(trials)]
     steps = [
         Round(
@@ -165,9 +169,7 @@ def discover(
         test=unseen,
         baseline=stages[0],
         rounds=tuple(steps),
-        ranking=tuple(
-            Ranked(*s.place, s.nats, s.excited, s.unconfounded, s.smallest) for s in ranking
-        ),
+        ranking=tuple(Ranked(*s.place, s.nats, s.excited, s.unconfounded, s.smallest) for s in ranking),
         where=locate(
             longest,
             residual,
@@ -182,9 +184,7 @@ def discover(
     )
 
 
-def _baseline(
-    judge: Judge, s: SuperModel, model: Model, trained: Sequence[Recording]
-) -> Hypothesis:
+def _baseline(judge: Judge, s: SuperModel, model: Model, trained: Sequence[Recording]) -> Hypothesis:
     """The user's model with calibrations, fitted from a short, a middle and an endless horizon."""
     R, C = len(trained), len(s.mechanism.channels)
     specs = s.mechanism.parameter_specifications
@@ -253,9 +253,7 @@ def _with(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesis
             start[k] = max(start[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
     z = h.z.copy()
     z[list(c.parameters)] = Transform.of(specs).unconstrain(start)
-    return dataclasses.replace(
-        h, places=(*h.places, score.place), free=(*h.free, *c.parameters), z=z
-    )
+    return dataclasses.replace(h, places=(*h.places, score.place), free=(*h.free, *c.parameters), z=z)
 
 
 def _physical(judge: Judge, h: Hypothesis, place: Place) -> bool:
@@ -263,10 +261,7 @@ def _physical(judge: Judge, h: Hypothesis, place: Place) -> bool:
     s = judge.bench.supermodel
     values = h.values(judge.bench).mean(axis=0)
     specs = s.mechanism.parameter_specifications
-    return all(
-        specs[i].physical[0] <= values[i] <= specs[i].physical[1]
-        for i in s.parameter_indices(place)
-    )
+    return all(specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(place))
 
 
 def _without(judge: Judge, h: Hypothesis, place: Place) -> Hypothesis:
@@ -296,12 +291,8 @@ def _eliminated(
     s = judge.bench.supermodel
     while on_trial := [p for p in h.places if p not in added[-1:]]:
         rivals = refit(judge, [_without(judge, h, p) for p in on_trial], turns=1)
-        worth = {
-            p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)
-        }
-        each = {
-            p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth
-        }
+        worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)}
+        each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
         surplus = {p: worth[p] - TRAIN_NATS - 0.5 * each[p] * np.log(samples) for p in worth}
         weakest = min(surplus, key=lambda p: surplus[p])
         if surplus[weakest] >= 0:
@@ -334,9 +325,7 @@ def _still_rivals(
         swapped.append(_with(judge, _without(judge, final, p), start, 0.4))
     best = held_out(away, final)
     trials = [held_out(away, h) for h in refit(judge, swapped)]
-    same = {
-        pr for pr, t in zip(pairs, trials, strict=True) if not told_apart(best, t, judge.bench.data)
-    }
+    same = {pr for pr, t in zip(pairs, trials, strict=True) if not told_apart(best, t, judge.bench.data)}
     return {p: [r for r in open_[p] if (p, r) in same] for p in found}
 
 
@@ -350,9 +339,7 @@ def _carried_over(away: Away, final: Trial, order: list[Place]) -> tuple[list[Pl
         with_it, without = (
             away.windows(
                 [
-                    away.runner(_trained(final, away), places, r).simulate_windows(
-                        recording, away.seconds
-                    )
+                    away.runner(_trained(final, away), places, r).simulate_windows(recording, away.seconds)
                     for r, recording in enumerate(away.recordings)
                 ]
             )
@@ -386,9 +373,7 @@ def _ladder(
     below = []
     for k in range(len(order)):
         wanted = {*order[:k], *own}
-        known = [
-            h for h in passed if wanted - set(CALIBRATIONS) == set(h.places) - set(CALIBRATIONS)
-        ]
+        known = [h for h in passed if wanted - set(CALIBRATIONS) == set(h.places) - set(CALIBRATIONS)]
         h = known[0] if known and wanted <= set(known[0].places) else final
         for place in set(h.places) - wanted:
             h = _without(judge, h, place)

@@ -69,9 +69,7 @@ def in_view(channel: str, energies: Mapping[str, np.ndarray | None], view: View)
     )
     usual = np.bincount(view.bins, minlength=len(profile)) / N
     profile /= profile.sum()
-    where = Where(
-        statement, share, p_value, view.kind, channel, view.edges, profile, usual, view.unit
-    )
+    where = Where(statement, share, p_value, view.kind, channel, view.edges, profile, usual, view.unit)
     return Finding(where, float(expected[look]))
 
 
@@ -108,8 +106,7 @@ def in_time(channel: str, error: np.ndarray, recording: Recording) -> Finding:
     profile = np.bincount(bins, energy, SEGMENTS) / energy.sum()
     usual = np.bincount(bins, minlength=SEGMENTS) / N
     statement = (
-        f"{percent(share)} of the {channel} error lies {when}, "
-        f"which is {percent(expected)} of the recording."
+        f"{percent(share)} of the {channel} error lies {when}, which is {percent(expected)} of the recording."
     )
     where = Where(statement, share, p_value, "time", channel, edges, profile, usual, "s")
     return Finding(where, expected)

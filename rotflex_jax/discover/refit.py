@@ -64,9 +64,7 @@ class Judge:
         values = h.values(self.bench).mean(axis=0)
         mechanism = s.clean(values, ())
         size = Layout.of(s.mechanism.structure).size
-        by_period = {
-            Ts: kalman_gains(mechanism, intensities, self.noise, Ts) for Ts in set(data.Ts.tolist())
-        }
+        by_period = {Ts: kalman_gains(mechanism, intensities, self.noise, Ts) for Ts in set(data.Ts.tolist())}
         K = np.stack([by_period[Ts] for Ts in data.Ts.tolist()], axis=1)
         return list(np.pad(K, ((0, 0), (0, 0), (0, size - K.shape[2]), (0, 0))))
 
@@ -106,9 +104,7 @@ def _moved(h: Hypothesis, step: np.ndarray) -> Hypothesis:
     return dataclasses.replace(h, z=z, own=own, x0=h.x0 + rest[:, local:])
 
 
-def levenberg_marquardt(
-    judge: Judge, hypotheses: list[Hypothesis], steps: int = 8
-) -> list[Hypothesis]:
+def levenberg_marquardt(judge: Judge, hypotheses: list[Hypothesis], steps: int = 8) -> list[Hypothesis]:
     """Fit all hypotheses, whiteners and process noise held; returns them with new whiteners."""
     bench, seen = judge.bench, judge.bench.data.seen
     count = max(judge.directions(), max(h.moved for h in hypotheses))
@@ -121,7 +117,7 @@ def levenberg_marquardt(
             break
         lanes = [now[i].lane(bench) for i in active]
         e, J = bench.slopes(lanes, [now[i].directions(bench, count) for i in active])
-        waiting = {}
+        waiting: dict[int, tuple[np.ndarray, np.ndarray, float]] = {}
         for k, i in enumerate(active):
             innovations[i] = e[k]
             h = now[i]
@@ -129,7 +125,7 @@ def levenberg_marquardt(
             waiting[i] = (*normal_equations(h, w, W), 0.5 * float(np.sum(w**2)))
         still = []
         for _ in range(5):  # shorter and shorter steps until the cost falls
-            trials = {i: _moved(now[i], _step(*waiting[i][:2], damping[i])) for i in waiting}
+            trials = {i: _moved(now[i], _step(H, g, damping[i])) for i, (H, g, _) in waiting.items()}
             if not trials:
                 break
             order = list(trials)
@@ -159,20 +155,14 @@ def _step(H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
         return -scale * np.linalg.lstsq(A, scale * g, rcond=1e-10)[0]
 
 
-def _grid(center: dict[str, float], factors: Sequence[float]) -> list[dict[str, float]]:
+def _grid(center: dict[str, float], factors: Sequence[float] | np.ndarray) -> list[dict[str, float]]:
     """All combinations of factors on two axes; on more, one axis at a time."""
     ports = list(center)
     if len(ports) <= 2:
-        mesh = np.stack(np.meshgrid(*[factors] * len(ports), indexing="ij"), -1).reshape(
-            -1, len(ports)
-        )
+        mesh = np.stack(np.meshgrid(*[factors] * len(ports), indexing="ij"), -1).reshape(-1, len(ports))
     else:
         mesh = np.array(
-            [
-                [f if i == j else 1.0 for j in range(len(ports))]
-                for i in range(len(ports))
-                for f in factors
-            ]
+            [[f if i == j else 1.0 for j in range(len(ports))] for i in range(len(ports)) for f in factors]
         )
     return [{p: center[p] * f for p, f in zip(ports, row, strict=True)} for row in mesh]
 
@@ -199,16 +189,12 @@ def _likeliest(judge: Judge, h: Hypothesis, trials: list[dict[str, float]]) -> H
     gains = judge.gains(h, trials)
     lane = h.lane(judge.bench)
     es = judge.bench.innovations([lane._replace(K=K) for K in gains])
-    scores = [
-        log_likelihood(e, seen, judge.noise, 0) if np.all(np.isfinite(e)) else -np.inf for e in es
-    ]
+    scores = [log_likelihood(e, seen, judge.noise, 0) if np.all(np.isfinite(e)) else -np.inf for e in es]
     best = int(np.argmax(scores))
     return judge.judged(dataclasses.replace(h, K=gains[best], process_noise=trials[best]), es[best])
 
 
-def refit(
-    judge: Judge, hypotheses: list[Hypothesis], wide: bool = False, turns: int = 3
-) -> list[Hypothesis]:
+def refit(judge: Judge, hypotheses: list[Hypothesis], wide: bool = False, turns: int = 3) -> list[Hypothesis]:
     """Alternate parameters and process noise until the likelihood settles."""
     now = levenberg_marquardt(judge, hypotheses)
     settled = [False] * len(now)

@@ -25,8 +25,8 @@ def motion(
     width = max(2 * round(smooth / Ts / 2) + 1, 5)
     width = min(width, len(y) - 1 + len(y) % 2)
     C = rows[is_position, : layout.n]
-    position = savgol_filter(y[:, is_position], width, 3, axis=0)
-    speed = savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0)
+    position = np.asarray(savgol_filter(y[:, is_position], width, 3, axis=0))
+    speed = np.asarray(savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0))
     back, out = np.linalg.pinv(C), {}
     for port, vector in mechanism.port_vectors.items():
         p = np.array(vector) @ back
@@ -54,8 +54,6 @@ def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict
         out[port] = Scale(voltage, max(speed, 1e-6), max(position, 1e-6), torque)
     whole = Scale(voltage, 1.0, 1.0, torque)
     for channel in mechanism.channels:
-        y = np.concatenate(
-            [model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings]
-        )
+        y = np.concatenate([model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings])
         out[channel] = Scale(voltage, 1.0, max(float(np.std(y)), 1e-9), torque)
     return out | {"input": whole}

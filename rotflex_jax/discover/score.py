@@ -59,11 +59,6 @@ def _lane_for(bench: Bench, h: Hypothesis, candidates: list[Candidate], shape: i
     return Lane(values, h.x0, gates, h.K)
 
 
-def _shapes(group: tuple[tuple[float, ...], ...], c: Candidate) -> tuple[float, ...]:
-    """Parameters of an alternative that are not amplitudes."""
-    return tuple(v for v, amplitude in zip(group[0], c.amplitudes, strict=True) if not amplitude)
-
-
 def scores(judge: Judge, h: Hypothesis) -> list[Score]:
     """Scores of all candidates that are not yet in the hypothesis, best first."""
     bench, seen = judge.bench, judge.bench.data.seen
@@ -73,10 +68,7 @@ def scores(judge: Judge, h: Hypothesis) -> list[Score]:
     count = max(judge.directions(), h.moved)
     nuisance = h.directions(bench, count)
     probes = [
-        _Probe(c, s, m)
-        for c in candidates
-        for s, group in enumerate(c.probes)
-        for m in range(len(group))
+        _Probe(c, s, m) for c in candidates for s, group in enumerate(c.probes) for m in range(len(group))
     ]
     # Alternatives that differ in amplitudes only share a lane; shapes need lanes of their own.
     batches: list[tuple[int, list[_Probe]]] = []
@@ -96,8 +88,9 @@ def scores(judge: Judge, h: Hypothesis) -> list[Score]:
         W = h.whitener(slopes[: len(part)], seen).reshape(len(part), -1)
         for p, column in zip(part, W, strict=True):
             columns.setdefault((p.candidate.place, p.shape), []).append(column)
-    samples = float(np.sum(seen)) * e.shape[-1]
-    found = [_score(c, columns, Q, r, samples) for c in candidates]
+    headroom = float(np.exp(h.whitener.log_det / (2 * e.shape[-1])) / np.exp(np.mean(np.log(judge.noise))))
+    ground = _Ground(Q, r, columns, float(np.sum(seen)) * e.shape[-1], max(headroom, 1.0))
+    found = [_score(c, ground) for c in candidates]
     return sorted(found, key=lambda s: -s.nats)
 
 
@@ -129,45 +122,55 @@ def _expanded(h: Hypothesis, W: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
-def _score(
-    c: Candidate,
-    columns: dict[tuple[Place, int], list[np.ndarray]],
-    Q: np.ndarray,
-    r: np.ndarray,
-    samples: float,
-) -> Score:
-    best: Score | None = None
-    for shape, group in enumerate(c.probes):
-        J = np.array(columns[(c.place, shape)]).T
-        full = np.linalg.norm(J, axis=0)
-        J = J - Q @ (Q.T @ J)
-        left = np.linalg.norm(J, axis=0)
-        a = _nonnegative(J, r, c)
-        if not np.all(np.isfinite(J)):
-            continue
-        used = a != 0
-        gain = float(-np.sum((J @ a) * r) - 0.5 * np.sum((J @ a) ** 2)) if used.any() else 0.0
-        df = max(int(used.sum()), 1) + (1 if len(c.probes) > 1 else 0)
-        nats = gain - 0.5 * df * np.log(samples)
-        start = np.array(group[0], float)
-        if any(c.amplitudes):
-            mix = np.array(group, float)
-            for k, amplitude in enumerate(c.amplitudes):
-                start[k] = a @ mix[:, k] if amplitude else start[k]
-        strongest = float(left.max())
-        share = float((left / np.maximum(full, 1e-300)).max())
-        score = Score(
-            c.place,
-            nats,
-            start,
-            excited=strongest**2 > VISIBLE,
-            unconfounded=share,
-            smallest=float(np.sqrt(VISIBLE) / max(strongest, 1e-300)),
-        )
-        best = score if best is None or nats > best.nats else best
-    if best is None:
-        return Score(c.place, -np.inf, np.array(c.probes[0][0]), False, 0.0, np.inf)
-    return best
+@dataclasses.dataclass(frozen=True)
+class _Ground:
+    """What all candidates are measured against.
+
+    Attributes:
+        Q: Orthonormal basis of what the hypothesis can still move (M, D').
+        r: Whitened innovations less their projection on Q (M,).
+        columns: (place, alternative) -> whitened slopes, one per probe (M,).
+        samples: Numbers measured.
+        headroom: Innovations over sensor noise: how much smaller they would be if the model were right.
+    """
+
+    Q: np.ndarray
+    r: np.ndarray
+    columns: dict[tuple[Place, int], list[np.ndarray]]
+    samples: float
+    headroom: float
+
+
+def _score(c: Candidate, ground: _Ground) -> Score:
+    """The best alternative of a candidate."""
+    alternatives = [_alternative(c, shape, ground) for shape in range(len(c.probes))]
+    return max(alternatives, key=lambda s: s.nats)
+
+
+def _alternative(c: Candidate, shape: int, ground: _Ground) -> Score:
+    group = np.array(c.probes[shape], float)
+    J = np.array(ground.columns[(c.place, shape)]).T
+    start = group[0].copy()
+    if not np.all(np.isfinite(J)):
+        return Score(c.place, -np.inf, start, False, 0.0, np.inf)
+    full = np.linalg.norm(J, axis=0)
+    J = J - ground.Q @ (ground.Q.T @ J)
+    left = np.linalg.norm(J, axis=0)
+    a = _nonnegative(J, ground.r, c)
+    moved = J @ a
+    gain = float(-moved @ ground.r - 0.5 * moved @ moved)
+    df = max(int(np.count_nonzero(a)), 1) + (1 if len(c.probes) > 1 else 0)
+    if any(c.amplitudes):
+        start = np.where(c.amplitudes, a @ group, start)
+    strongest = max(float(left.max()) * ground.headroom, 1e-300)
+    return Score(
+        c.place,
+        gain - 0.5 * df * float(np.log(ground.samples)),
+        start,
+        excited=strongest**2 > VISIBLE,
+        unconfounded=float((left / np.maximum(full, 1e-300)).max()),
+        smallest=float(np.sqrt(VISIBLE) / strongest),
+    )
 
 
 def _nonnegative(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:

@@ -12,6 +12,7 @@ from rotflex_jax.discover.result import Stage
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.discover.whiten import log_likelihood
 from rotflex_jax.fit.covariance import sandwich
+from rotflex_jax.mechanism import Solver
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Estimate
 
@@ -23,10 +24,12 @@ class Scribe:
     Attributes:
         judge: With the training recordings.
         away: The held-out recordings.
+        solver: Of the models that a user gets.
     """
 
     judge: Judge
     away: Away
+    solver: Solver
 
     def stage(self, trial: Trial, places: Sequence[Place]) -> Stage:
         """A stage of the loop.
@@ -39,26 +42,18 @@ class Scribe:
         h, away = trial.hypothesis, self.away
         bench = self.judge.bench
         values = h.values(bench).mean(axis=0)
-        trained = dataclasses.replace(
-            h, x0=away.first, own=np.tile(h.own.mean(axis=0), (len(away.first), 1))
-        )
+        trained = dataclasses.replace(h, x0=away.first, own=np.tile(h.own.mean(axis=0), (len(away.first), 1)))
         runners = [away.runner(trained, places, r) for r in range(len(away.recordings))]
         pairs = list(zip(runners, away.recordings, strict=True))
         simulated = tuple(runner.simulate(r) for runner, r in pairs)
         windowed = tuple(runner.simulate_windows(r, away.seconds) for runner, r in pairs)
         channels = bench.supermodel.baseline.channels
-        errors = [
-            y_hat - runner.measured(r) for y_hat, (runner, r) in zip(simulated, pairs, strict=True)
-        ]
-        whole = np.concatenate(
-            [e[r.n_init :] for e, r in zip(errors, away.recordings, strict=True)]
-        )
+        errors = [y_hat - runner.measured(r) for y_hat, (runner, r) in zip(simulated, pairs, strict=True)]
+        whole = np.concatenate([e[r.n_init :] for e, r in zip(errors, away.recordings, strict=True)])
         return Stage(
-            model=Model(bench.supermodel.clean(values, places), bench.solver),
+            model=Model(bench.supermodel.clean(values, places), self.solver),
             estimates=self.estimates(h),
-            held_out_rmse=dict(
-                zip(channels, np.sqrt(np.mean(whole**2, axis=0)).tolist(), strict=True)
-            ),
+            held_out_rmse=dict(zip(channels, np.sqrt(np.mean(whole**2, axis=0)).tolist(), strict=True)),
             held_out_rmse_windows=dict(zip(channels, away.windows(windowed).tolist(), strict=True)),
             simulated=simulated,
             windowed=windowed,
@@ -80,9 +75,7 @@ class Scribe:
     def estimates(self, h: Hypothesis) -> tuple[Estimate, ...]:
         """Parameters of the baseline and of what was added, intervals robust to correlated residuals."""
         bench, s = self.judge.bench, self.judge.bench.supermodel
-        e, J = bench.slopes(
-            [h.lane(bench)], [h.directions(bench, max(self.judge.directions(), h.moved))]
-        )
+        e, J = bench.slopes([h.lane(bench)], [h.directions(bench, max(self.judge.directions(), h.moved))])
         seen = bench.data.seen
         w = h.whitener(e[0], seen)
         W = h.whitener(J[0, : h.moved], seen)
@@ -121,9 +114,7 @@ class Scribe:
             if i in h.local and R > 1:
                 note = "mean of " + ", ".join(f"{v:.3g}" for v in values[:, i])
             out.append(
-                Estimate(
-                    name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note
-                )
+                Estimate(name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note)
             )
         return tuple(out)
 

@@ -83,9 +83,7 @@ class SuperModel:
         on = set(switched_on)
         base = len(self.baseline.effects)
         effects = self.mechanism.effects
-        return np.array(
-            [1.0 if i < base or (e.name, e.at) in on else 0.0 for i, e in enumerate(effects)]
-        )
+        return np.array([1.0 if i < base or (e.name, e.at) in on else 0.0 for i, e in enumerate(effects)])
 
     def clean(self, values: np.ndarray, places: Iterable[Place]) -> Mechanism:
         """The user's mechanism with fitted numbers and the named effects, nothing else."""
@@ -120,8 +118,7 @@ def build(
             continue
         names = tuple(cls.declared())
         probes = tuple(
-            tuple(tuple(float(p[n]) for n in names) for p in group)
-            for group in cls.probes(scales[port])
+            tuple(tuple(float(p[n]) for n in names) for p in group) for group in cls.probes(scales[port])
         )
         if not probes:
             continue
@@ -133,11 +130,7 @@ def build(
             tuple(range(last - len(names), last)),
             probes,
             tuple(n in cls.amplitudes for n in names),
-            all(
-                max(s.lower, s.physical[0]) >= 0
-                for n, s in cls.declared().items()
-                if n in cls.amplitudes
-            ),
+            all(max(s.lower, s.physical[0]) >= 0 for n, s in cls.declared().items() if n in cls.amplitudes),
         )
     return SuperModel(baseline, mechanism, tuple(calibrations), candidates)
 

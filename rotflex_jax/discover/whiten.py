@@ -30,9 +30,7 @@ class Whitener:
 
     def __call__(self, e: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Whitened signals (..., R, N, C); zero where not seen and in the first p samples."""
-        filtered = np.stack(
-            [lfilter(a, 1.0, e[..., c], axis=-1) for c, a in enumerate(self.a)], axis=-1
-        )
+        filtered = np.stack([lfilter(a, 1.0, e[..., c], axis=-1) for c, a in enumerate(self.a)], axis=-1)
         mask = seen.copy()
         mask[:, : self.a.shape[1] - 1] = 0
         return (filtered @ self.L.T) * mask[..., None]
@@ -46,9 +44,7 @@ class Whitener:
         return -0.5 * (np.sum(w**2, axis=-1) + (C * np.log(2 * np.pi) + self.log_det) * mask)
 
 
-def fit_whitener(
-    e: np.ndarray, seen: np.ndarray, floor: np.ndarray, order: int = ORDER
-) -> Whitener:
+def fit_whitener(e: np.ndarray, seen: np.ndarray, floor: np.ndarray, order: int = ORDER) -> Whitener:
     """Whitener fitted to innovations (R, N, C).
 
     Args:

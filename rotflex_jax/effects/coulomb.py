@@ -47,8 +47,7 @@ class Coulomb(DryFriction):
     def sentence(self) -> str:
         """In words."""
         return (
-            f"the {self.at} meets a constant friction torque of {self.level:.3g} N m "
-            "whichever way it turns"
+            f"the {self.at} meets a constant friction torque of {self.level:.3g} N m whichever way it turns"
         )
 
 
@@ -74,17 +73,14 @@ class CoulombAsymmetric(DryFriction):
     name: ClassVar[str] = "coulomb_asymmetric"
     title: ClassVar[str] = "constant friction, unequal in the two directions"
     equation: ClassVar[str] = (
-        "tau = -forward if speed > 0, +backward if speed < 0, "
-        "holds while -forward <= tau <= backward"
+        "tau = -forward if speed > 0, +backward if speed < 0, holds while -forward <= tau <= backward"
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("forward", "backward")
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
     steady: ClassVar[bool] = True
 
-    forward: float = parameter(
-        0.02, unit="N m", lower=0.0, meaning="friction torque against positive motion"
-    )
+    forward: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque against positive motion")
     backward: float = parameter(
         0.02, unit="N m", lower=0.0, meaning="friction torque against negative motion"
     )

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from rotflex_jax.effects.catalogue import register
-from rotflex_jax.effects.kinds import Actuation, Probe, Scale
+from rotflex_jax.effects.kinds import Actuation, Probe, Scalar, Scale
 from rotflex_jax.parameters import parameter
 
 
@@ -31,9 +31,7 @@ class DeadZone(Actuation):
 
     name: ClassVar[str] = "dead_zone"
     title: ClassVar[str] = "dead zone of the input"
-    equation: ClassVar[str] = (
-        "v -> v - positive if v > positive, v + negative if v < -negative, 0 between"
-    )
+    equation: ClassVar[str] = "v -> v - positive if v > positive, v + negative if v < -negative, 0 between"
     amplitudes: ClassVar[tuple[str, ...]] = ("positive", "negative")
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 2
@@ -41,7 +39,7 @@ class DeadZone(Actuation):
     positive: float = parameter(0.1, unit="V", lower=0.0, meaning="width above zero")
     negative: float = parameter(0.1, unit="V", lower=0.0, meaning="width below zero")
 
-    def drive(self, voltage: jax.Array, Ts: float) -> jax.Array:
+    def drive(self, voltage: jax.Array, Ts: Scalar) -> jax.Array:
         """Voltage [V] that is left."""
         below = jnp.where(voltage < -self.negative, voltage + self.negative, 0.0)
         return jnp.where(voltage > self.positive, voltage - self.positive, below)

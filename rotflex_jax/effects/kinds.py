@@ -211,7 +211,7 @@ class Actuation(Effect):
 
     at: str = "input"
 
-    def drive(self, voltage: jax.Array, Ts: float) -> jax.Array:
+    def drive(self, voltage: jax.Array, Ts: Scalar) -> jax.Array:
         """The whole sequence (N,) [V] that reaches the motor."""
         raise NotImplementedError
 

@@ -41,9 +41,7 @@ class Motor(Linear):
     amplitudes: ClassVar[tuple[str, ...]] = ("torque_constant",)
 
     at: str = "hub"
-    torque_constant: float = parameter(
-        0.00767, unit="N m/A", lower=0.0, meaning="torque per current"
-    )
+    torque_constant: float = parameter(0.00767, unit="N m/A", lower=0.0, meaning="torque per current")
     back_emf: float = parameter(0.00767, unit="V s/rad", lower=0.0, meaning="voltage per speed")
     resistance: float = parameter(2.6, unit="ohm", lower=1e-6, meaning="armature resistance")
     gear_ratio: float = parameter(70.0, unit="", lower=0.0, meaning="motor turns per load turn")

@@ -32,9 +32,7 @@ class QuadraticDrag(Force):
     amplitudes: ClassVar[tuple[str, ...]] = ("coefficient",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
 
-    coefficient: float = parameter(
-        1e-3, unit="N m s^2/rad^2", lower=0.0, meaning="torque per speed squared"
-    )
+    coefficient: float = parameter(1e-3, unit="N m s^2/rad^2", lower=0.0, meaning="torque per speed squared")
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
         """Torque [N m] on the port."""
@@ -47,7 +45,4 @@ class QuadraticDrag(Force):
 
     def sentence(self) -> str:
         """In words."""
-        return (
-            f"drag slows the {self.at} with the square of its speed, "
-            f"{self.coefficient:.3g} N m at 1 rad/s"
-        )
+        return f"drag slows the {self.at} with the square of its speed, {self.coefficient:.3g} N m at 1 rad/s"

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from rotflex_jax.effects.catalogue import register
-from rotflex_jax.effects.kinds import Actuation, Probe, Scale
+from rotflex_jax.effects.kinds import Actuation, Probe, Scalar, Scale
 from rotflex_jax.parameters import parameter
 
 
@@ -36,7 +36,7 @@ class Saturation(Actuation):
 
     limit: float = parameter(5.0, unit="V", lower=0.0, meaning="largest voltage")
 
-    def drive(self, voltage: jax.Array, Ts: float) -> jax.Array:
+    def drive(self, voltage: jax.Array, Ts: Scalar) -> jax.Array:
         """Voltage [V] that is left."""
         # Not `clip`, which splits the derivative between the two branches on the limit itself.
         above = jnp.where(voltage > self.limit, self.limit, voltage)

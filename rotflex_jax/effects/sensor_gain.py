@@ -32,9 +32,7 @@ class SensorGain(Sensing):
     amplitudes: ClassVar[tuple[str, ...]] = ("error",)
 
     # The bound keeps the gain positive: a sensor that reads nothing is not out of calibration.
-    error: float = parameter(
-        0.0, unit="", typical=0.05, lower=-0.9, meaning="relative error of the gain"
-    )
+    error: float = parameter(0.0, unit="", typical=0.05, lower=-0.9, meaning="relative error of the gain")
 
     def measure(self, value: Scalar) -> Scalar:
         """Reading [unit of the channel]."""

@@ -32,21 +32,16 @@ class Stribeck(DryFriction):
     name: ClassVar[str] = "stribeck"
     title: ClassVar[str] = "friction that is larger near standstill (Stribeck)"
     equation: ClassVar[str] = (
-        "tau = -(level + excess * exp(-(v / speed)^2)) * sign(v), "
-        "holds while |tau| <= level + excess"
+        "tau = -(level + excess * exp(-(v / speed)^2)) * sign(v), holds while |tau| <= level + excess"
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("level", "excess")
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque at speed")
-    excess: float = parameter(
-        0.01, unit="N m", lower=0.0, meaning="additional friction torque at standstill"
-    )
+    excess: float = parameter(0.01, unit="N m", lower=0.0, meaning="additional friction torque at standstill")
     # A shape has no value at which the effect is absent; the bound keeps the quotient finite.
-    speed: float = parameter(
-        0.2, unit="rad/s", lower=1e-4, meaning="speed over which the excess is lost"
-    )
+    speed: float = parameter(0.2, unit="rad/s", lower=1e-4, meaning="speed over which the excess is lost")
 
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
         """Level [N m] that opposes motion at |speed| [rad/s]."""

@@ -53,6 +53,4 @@ class Viscous(Linear):
                 f"the {self.at} is damped less than the rest of the model says, by "
                 f"{-self.coefficient:.3g} N m s/rad"
             )
-        return (
-            f"the {self.at} is damped in proportion to its speed, {self.coefficient:.3g} N m s/rad"
-        )
+        return f"the {self.at} is damped in proportion to its speed, {self.coefficient:.3g} N m s/rad"

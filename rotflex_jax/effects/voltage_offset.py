@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax
 
 from rotflex_jax.effects.catalogue import register
-from rotflex_jax.effects.kinds import Actuation, Probe, Scale
+from rotflex_jax.effects.kinds import Actuation, Probe, Scalar, Scale
 from rotflex_jax.parameters import parameter
 
 
@@ -36,7 +36,7 @@ class VoltageOffset(Actuation):
 
     offset: float = parameter(0.0, unit="V", typical=0.05, meaning="voltage added")
 
-    def drive(self, voltage: jax.Array, Ts: float) -> jax.Array:
+    def drive(self, voltage: jax.Array, Ts: Scalar) -> jax.Array:
         """Voltage [V] with the offset."""
         return voltage + self.offset
 

@@ -33,11 +33,13 @@ def sandwich(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
         segments: Number of the recording each sample belongs to (N,); products do not cross recordings.
 
     Returns:
-        Covariance (D, D).
+        Covariance (D, D); nan where the residuals are not finite.
 
     Source: Newey and West 1987, Econometrica 55.
     """
     D = J.shape[2]
+    if not (np.isfinite(J).all() and np.isfinite(e).all()):
+        return np.full((D, D), np.nan)
     H = np.einsum("nci,ncj->ij", J, J)
     scores = np.einsum("nci,nc->ni", J, e)
     S = np.zeros((D, D))

@@ -134,12 +134,8 @@ def fit(
         for number, stage in enumerate(stages):
             last = number == len(stages) - 1
             for _ in range(3 if last else 1):
-                now = m.with_values(
-                    np.asarray(coordinates.split(jnp.asarray(flat))[0]).mean(axis=0)
-                )
-                K = np.stack(
-                    [kalman_gains(now, [stage or {}], noise, float(Ts))[0] for Ts in data.Ts]
-                )
+                now = m.with_values(np.asarray(coordinates.split(jnp.asarray(flat))[0]).mean(axis=0))
+                K = np.stack([kalman_gains(now, [stage or {}], noise, float(Ts))[0] for Ts in data.Ts])
                 gates = jnp.ones(len(m.effects), jnp.float64)
                 args = jax.tree.map(jnp.asarray, (flat, index, gates, data, K, scale))
                 flat, cost, used, status = _levenberg_marquardt(problem, flat, args, max_steps, say)
@@ -245,9 +241,7 @@ def _report(
     covariance = sandwich(slopes, residual, segments)
     estimates, free, places = [], [], []
     dp = _stretch(coordinates, flat)
-    for i, (name, spec) in enumerate(
-        zip(m.parameter_names, m.parameter_specifications, strict=True)
-    ):
+    for i, (name, spec) in enumerate(zip(m.parameter_names, m.parameter_specifications, strict=True)):
         value = float(values[:, i].mean())
         if name in m.trusted:
             nan = float("nan")
@@ -260,9 +254,7 @@ def _report(
         low, high = spec.physical
         note = "" if low <= value <= high else "outside its physical range"
         estimates.append(
-            Estimate(
-                name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note
-            )
+            Estimate(name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note)
         )
         free.append(name)
         places.append((rows[0], dp[i]))
@@ -293,6 +285,8 @@ def _stretch(coordinates: Coordinates, flat: np.ndarray) -> np.ndarray:
 
 def _weakest(slopes: np.ndarray, names: list[str]) -> dict[str, float]:
     """The combination of parameters that the data determine least, its largest entry 1."""
+    if not np.isfinite(slopes).all():
+        return {}
     H = np.einsum("nci,ncj->ij", slopes, slopes)
     direction = np.linalg.eigh(H)[1][:, 0]
     direction = direction / direction[np.argmax(np.abs(direction))]

@@ -7,7 +7,7 @@ alone, then the first states of all recordings. A fit moves some of them; the re
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +25,10 @@ from rotflex_jax.recording import Recording
 class Data(NamedTuple):
     """Recordings side by side, shorter ones filled up with samples that are not `seen`."""
 
-    u: np.ndarray  # (R, N)
-    y: np.ndarray  # (R, N, C)
-    seen: np.ndarray  # (R, N)
-    Ts: np.ndarray  # (R,)
+    u: Any  # (R, N)
+    y: Any  # (R, N, C)
+    seen: Any  # (R, N)
+    Ts: Any  # (R,)
 
 
 def stack(recordings: Sequence[Recording], model: Model, length: int | None = None) -> Data:
@@ -136,9 +136,7 @@ def first_states(model: Model, recordings: Sequence[Recording]) -> np.ndarray:
     """First positions and speeds (R, 2 n): straight lines through the first samples, where a fit starts."""
     heads = [model.measured(r)[: r.n_init].astype(float) for r in recordings]
     structure = model.mechanism.structure
-    return np.array(
-        [rough_state(structure, y, r.Ts) for y, r in zip(heads, recordings, strict=True)]
-    )
+    return np.array([rough_state(structure, y, r.Ts) for y, r in zip(heads, recordings, strict=True)])
 
 
 def sensor_noise(recordings: Sequence[Recording], model: Model) -> np.ndarray:

@@ -220,9 +220,7 @@ def hub_inertia(tachometer: bool = True) -> float:
     return gears + _GEAR_RATIO**2 * 0.90 * motor + body
 
 
-def _srv02(
-    arm: int, stiffness: float, *, hub_damping: float, inductance: float | None
-) -> Mechanism:
+def _srv02(arm: int, stiffness: float, *, hub_damping: float, inductance: float | None) -> Mechanism:
     return flexible_joint(
         hub_inertia=hub_inertia(),
         arm_inertia=arm_inertia(arm),

@@ -5,11 +5,12 @@ Everything here is formed once per set of parameters, outside the scan, and is d
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import DTypeLike
 
 from rotflex_jax.effects.kinds import (
     Actuation,
@@ -23,6 +24,8 @@ from rotflex_jax.effects.kinds import (
     Stamp,
 )
 from rotflex_jax.mechanism.mechanism import Mechanism
+
+Kind = TypeVar("Kind", bound=Effect)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +72,7 @@ class Layout:
         )
 
 
-def effects_of(mechanism: Mechanism, kind: type[Effect]) -> list[tuple[int, Effect]]:
+def effects_of(mechanism: Mechanism, kind: type[Kind]) -> list[tuple[int, Kind]]:
     """Effects of one kind with their places in `mechanism.effects`."""
     return [(i, e) for i, e in enumerate(mechanism.effects) if isinstance(e, kind)]
 
@@ -213,7 +216,7 @@ def constants(mechanism: Mechanism, values: jax.Array, gates: jax.Array, h: jax.
     )
 
 
-def driven_voltage(mechanism: Mechanism, gates: jax.Array, u: jax.Array, Ts: float) -> jax.Array:
+def driven_voltage(mechanism: Mechanism, gates: jax.Array, u: jax.Array, Ts: Scalar) -> jax.Array:
     """Voltage (N,) that reaches the motor after all actuation effects, nearest to the command first."""
     v = u
     for i, effect in sorted(effects_of(mechanism, Actuation), key=lambda pair: pair[1].stage):
@@ -234,7 +237,7 @@ def read_outputs(mechanism: Mechanism, gates: jax.Array, x: jax.Array) -> jax.Ar
     return y
 
 
-def rest_state(structure: Mechanism, dtype: np.dtype) -> np.ndarray:
+def rest_state(structure: Mechanism, dtype: DTypeLike) -> np.ndarray:
     """State at rest: zero motion, memories at their initial value."""
     layout = Layout.of(structure)
     memory = [e.initial() for _, e in effects_of(structure, Memory)]

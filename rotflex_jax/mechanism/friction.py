@@ -19,19 +19,23 @@ class Contact(NamedTuple):
     Attributes:
         torque: Torque on the port [N m].
         t: Fraction of the step until the port first stops.
-        rests: Whether it is at rest at the end.
+        holds: One where the port is at rest at the end, falling to zero as the drive beyond the level
+            reaches the level once more; without the fade a port that just lets go would jump.
         crossed: Whether it passed through rest.
     """
 
     torque: jax.Array
     t: jax.Array
-    rests: jax.Array
+    holds: jax.Array
     crossed: jax.Array
 
 
-def contact(
-    v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array
-) -> Contact:
+def at_rest(v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array) -> jax.Array:
+    """Whether a speed is zero to rounding; arguments as in `contact`."""
+    return jnp.abs(v0) <= 64 * jnp.finfo(v0.dtype).eps * (jnp.abs(free) + stop * (up + down))
+
+
+def contact(v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array) -> Contact:
     """Independent contacts.
 
     Args:
@@ -41,6 +45,7 @@ def contact(
         up: Level against positive motion [N m].
         down: Level against negative motion [N m].
     """
+    v0 = jnp.where(at_rest(v0, free, stop, up, down), 0.0, v0)
     sign = jnp.sign(v0)
     level = jnp.where(v0 > 0, up, down)
     sliding = free - stop * sign * level
@@ -52,7 +57,19 @@ def contact(
     rests = ~keeps & (jnp.abs(drive) <= turned)
     reverses = -(t * sign * level + (1 - t) * jnp.sign(drive) * turned)
     f = jnp.where(keeps, -sign * level, jnp.where(rests, -free / stop, reverses))
-    return Contact(f, t, rests, ~keeps)
+    # Measured by the sum of the levels, which a constant torque leaves as it is.
+    band = (up + down) / 2
+    beyond = jnp.maximum(0.0, (jnp.abs(drive) - turned) / jnp.where(band == 0, 1.0, band))
+    holds = jnp.where((band == 0) | keeps, 0.0, jnp.maximum(0.0, 1.0 - beyond))
+    return Contact(f, t, holds, ~keeps)
+
+
+def within(f: jax.Array, up: jax.Array, down: jax.Array) -> jax.Array:
+    """Torques limited to their levels.
+
+    Not `clip`: where torque and level are both zero it halves the derivative with respect to the level.
+    """
+    return jnp.where(f > down, down, jnp.where(f < -up, -up, f))
 
 
 def solve_masked(matrix: jax.Array, mask: jax.Array, rhs: jax.Array, other: jax.Array) -> jax.Array:
@@ -77,11 +94,18 @@ def solve_masked(matrix: jax.Array, mask: jax.Array, rhs: jax.Array, other: jax.
 
 
 def contacts(
-    v0: jax.Array, free: jax.Array, stop: jax.Array, up: jax.Array, down: jax.Array
+    v0: jax.Array,
+    free: jax.Array,
+    stop: jax.Array,
+    up: jax.Array,
+    down: jax.Array,
+    passes: int | None = None,
 ) -> Contact:
     """Contacts that are coupled through the mechanism.
 
-    Sweeps decide which contacts rest; those are then solved for together, and the others answer.
+    First guess: what was at rest holds. The holding contacts are eliminated, the others answer with the
+    mobility that this leaves them, and whoever cannot hold lets go. One pass more than there are contacts
+    settles any case; two settle all but those in which several contacts stop or let go in one step.
 
     Args:
         v0: Port speeds at the start (k, ...) [rad/s].
@@ -89,18 +113,41 @@ def contacts(
         stop: Speed that a unit torque at one contact gives another in one step (k, k).
         up: Levels against positive motion (k, ...) [N m].
         down: Levels against negative motion (k, ...) [N m].
+        passes: One more than contacts if None.
     """
     k = v0.shape[0]
     wide = lambda m: m.reshape(m.shape + (1,) * (v0.ndim - 1))  # noqa: E731
     own = wide(jnp.stack([stop[i, i] for i in range(k)]))
     if k == 1:
         return contact(v0, free, own, up, down)
-    cross = wide(stop * (1 - jnp.eye(k, dtype=stop.dtype)))
-
-    def answer(f: jax.Array) -> Contact:
-        return contact(v0, free + jnp.sum(cross * f[None], axis=1), own, up, down)
-
-    swept = answer(answer(contact(v0, free, own, up, down).torque).torque)
-    together = solve_masked(stop, swept.rests, -free, swept.torque)
-    torque = jnp.clip(together, -up, down)
-    return answer(torque)._replace(torque=torque)
+    eye = wide(jnp.eye(k, dtype=stop.dtype))
+    full = jnp.concatenate([jnp.broadcast_to(wide(stop), (k, *v0.shape)), free[:, None]], axis=1)
+    slack = 1 + 1e3 * jnp.finfo(v0.dtype).eps
+    held = at_rest(v0, free, own, up, down)
+    f = jnp.zeros_like(v0)
+    for last in (*[False] * (k if passes is None else passes - 1), True):
+        rows, needed = [full[i] for i in range(k)], []
+        for i in range(k):  # Gauss-Jordan
+            # Three contacts on two coordinates: one that the others hold already carries nothing.
+            needed.append(held[i] & (rows[i][i] > 1e-5 * own[i]))
+            pivot = rows[i] / jnp.where(needed[i], rows[i][i], 1.0)[None]
+            rows = [
+                jnp.where(needed[i][None], pivot if j == i else row - row[i][None] * pivot, row)
+                for j, row in enumerate(rows)
+            ]
+        A, b = jnp.stack([row[:k] for row in rows]), jnp.stack([row[k] for row in rows])
+        mobile = jnp.where(held, own, jnp.maximum(jnp.sum(A * eye, axis=1), 1e-6 * own))
+        found = contact(v0, b + jnp.sum(A * (1 - eye) * f[None], axis=1), mobile, up, down)
+        f = jnp.where(held, 0.0, found.torque)
+        torque = jnp.where(jnp.stack(needed), -(b + jnp.sum(A * f[None], axis=1)), f)
+        if last:
+            break
+        fits = (torque <= down * slack) & (torque >= -up * slack)
+        f = jnp.where(held & ~fits, within(torque, up, down), f)
+        held = held & fits
+    return Contact(
+        torque=within(torque, up, down),
+        t=jnp.where(held, 0.0, found.t),
+        holds=jnp.where(held, 1.0, found.holds),
+        crossed=held | found.crossed,
+    )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from rotflex_jax.mechanism.assembly import Equations, Layout, equations
+from rotflex_jax.mechanism.assembly import Layout, equations
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.precision import double_precision
 
@@ -35,11 +35,12 @@ _equations = jax.jit(
 )
 
 
-def _linear_part(mechanism: Mechanism) -> Equations:
+def _linear_part(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`A`, `B` and the inverse mass matrix."""
     with double_precision():
         gates = jnp.ones(len(mechanism.effects))
         eq = _equations(mechanism.structure, jnp.asarray(mechanism.values), gates)
-        return Equations(*map(np.asarray, eq))
+        return np.asarray(eq.A), np.asarray(eq.B), np.asarray(eq.inverse_mass)
 
 
 def linearise(mechanism: Mechanism) -> StateSpace:
@@ -48,10 +49,10 @@ def linearise(mechanism: Mechanism) -> StateSpace:
     A friction or a dead zone has no slope at rest, so the linear model of a joint is the one without.
     """
     layout = Layout.of(mechanism.structure)
-    eq = _linear_part(mechanism)
+    A, B, _ = _linear_part(mechanism)
     C = np.zeros((len(mechanism.channels), layout.linear))
     C[:, : 2 * layout.n] = layout.output_rows
-    return StateSpace(eq.A, eq.B, C)
+    return StateSpace(A, B, C)
 
 
 def kalman_gains(
@@ -78,16 +79,11 @@ def kalman_gains(
     """
     layout, ss = Layout.of(mechanism.structure), linearise(mechanism)
     n, size = layout.n, layout.linear
-    Minv = np.asarray(_linear_part(mechanism).inverse_mass)
-    covariance = {
-        port: _built_up(ss.A, Minv @ np.array(vector), n, Ts) for port, vector in mechanism.ports
-    }
+    Minv = _linear_part(mechanism)[2]
+    covariance = {port: _built_up(ss.A, Minv @ np.array(vector), n, Ts) for port, vector in mechanism.ports}
     Ad, _ = ss.discretise(Ts)
     Q = np.array(
-        [
-            sum((q * covariance[p] for p, q in i.items()), np.zeros((size, size)))
-            for i in intensities
-        ]
+        [sum((q * covariance[p] for p, q in i.items()), np.zeros((size, size))) for i in intensities]
     )
     R = np.diag(np.square(noise))
     A = np.broadcast_to(Ad.T, Q.shape)
@@ -109,9 +105,7 @@ def kalman_gains(
     return gains
 
 
-def _built_up(
-    A: np.ndarray, push: np.ndarray, n: int, Ts: float, doublings: int = 14
-) -> np.ndarray:
+def _built_up(A: np.ndarray, push: np.ndarray, n: int, Ts: float, doublings: int = 14) -> np.ndarray:
     """Covariance that a white torque of unit intensity builds up over one sample.
 
     `Q(2 h) = Q(h) + E Q(h) E'` from a Simpson rule over the smallest step: unlike the usual block

@@ -1,7 +1,7 @@
 """A mechanism: coordinates, named ports, effects at the ports, and what the sensors see."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import jax
@@ -49,7 +49,7 @@ class Mechanism:
     ports: Any
     effects: tuple[Effect, ...] = ()
     outputs: Any = ()
-    trusted: Iterable[str] = frozenset()
+    trusted: Any = frozenset()
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - frozen class
@@ -57,9 +57,7 @@ class Mechanism:
         put("coordinates", tuple(self.coordinates))
         put("ports", tuple((k, tuple(float(c) for c in v)) for k, v in ports.items()))
         put("effects", tuple(self.effects))
-        outputs = {
-            k: v if isinstance(v, tuple) else (v, "position") for k, v in dict(self.outputs).items()
-        }
+        outputs = {k: v if isinstance(v, tuple) else (v, "position") for k, v in dict(self.outputs).items()}
         put("outputs", tuple(outputs.items()))
         put("trusted", frozenset(self.trusted))
         self._check()
@@ -144,9 +142,7 @@ class Mechanism:
         for e in self.effects:
             if (e.name, e.at) == (name, at):
                 return e
-        raise InputError(
-            f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first."
-        )
+        raise InputError(f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first.")
 
     # -- parameters --------------------------------------------------------------------------------
 
@@ -170,21 +166,18 @@ class Mechanism:
         """Parameters that a fit moves: all but the trusted ones."""
         return tuple(n for n in self.parameter_names if n not in self.trusted)
 
-    def with_values(
-        self, values: Mapping[str, float] | Sequence[Any] | np.ndarray | jax.Array
-    ) -> Self:
+    def with_values(self, values: Mapping[str, float] | Sequence[Any] | np.ndarray | jax.Array) -> Self:
         """The same mechanism with other numbers, given by full name or as the whole vector."""
         if isinstance(values, Mapping):
             for name in values:
                 self._must_exist(name)
             old = dict(zip(self.parameter_names, self.values, strict=True))
             values = list((old | dict(values)).values())
-        if isinstance(values, np.ndarray):
-            values = values.tolist()
+        listed: Any = values.tolist() if isinstance(values, np.ndarray) else values
         effects, start = [], 0
         for e in self.effects:
             names = tuple(e.values)
-            part = {n: values[start + i] for i, n in enumerate(names)}
+            part = {n: listed[start + i] for i, n in enumerate(names)}
             effects.append(e.replace(**part))
             start += len(names)
         return dataclasses.replace(self, effects=tuple(effects))

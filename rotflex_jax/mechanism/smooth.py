@@ -46,9 +46,7 @@ class SmoothRK4:
         eq = equations(structure.with_values(values), gates)
         return SmoothConstants(values, gates, Ts / self.substeps, eq)
 
-    def advance(
-        self, structure: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants
-    ) -> jax.Array:
+    def advance(self, structure: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants) -> jax.Array:
         """State one sample later under the held voltage `v` [V]."""
         mechanism = structure.with_values(c.values)
 
@@ -61,9 +59,7 @@ class SmoothRK4:
 
         return jax.lax.fori_loop(0, self.substeps, step, x)
 
-    def _flow(
-        self, mechanism: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants
-    ) -> jax.Array:
+    def _flow(self, mechanism: Mechanism, x: jax.Array, v: jax.Array, c: SmoothConstants) -> jax.Array:
         layout, eq = Layout.of(mechanism.structure), c.equations
         L, z = x[: layout.linear], x[layout.linear :]
         dL = apply(eq.A, L) + along(eq.B, v)
@@ -84,6 +80,6 @@ class SmoothRK4:
         for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
             k = layout.torque_ports.index(e.at)
             total[k] = total[k] + c.gates[i] * e.force(z[m], position[k], speed[k], v)
-            flows.append(e.flow(z[m], position[k], speed[k], v))
+            flows.append(jnp.asarray(e.flow(z[m], position[k], speed[k], v)))
         dL = dL + apply(eq.ports, jnp.stack(total))
         return jnp.concatenate([dL, jnp.stack(flows)]) if flows else dL

@@ -14,7 +14,7 @@ import numpy as np
 
 from rotflex_jax.effects.kinds import DryFriction, Force, Memory
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of
-from rotflex_jax.mechanism.friction import Contact, contacts, solve_masked
+from rotflex_jax.mechanism.friction import contacts, solve_masked, within
 from rotflex_jax.mechanism.mechanism import Mechanism
 
 
@@ -35,14 +35,14 @@ class Exponential:
     Attributes:
         order: 2 or 4, the order of the rule for smooth torques.
         substeps: Steps per sample; compare with a larger number to see the error.
+        passes: Passes over coupled friction contacts, as in `friction.contacts`; None settles any case.
     """
 
     order: int = 2
     substeps: int = 1
+    passes: int | None = None
 
-    def prepare(
-        self, structure: Mechanism, values: jax.Array, gates: jax.Array, Ts: jax.Array
-    ) -> Constants:
+    def prepare(self, structure: Mechanism, values: jax.Array, gates: jax.Array, Ts: jax.Array) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
         return constants(structure, values, gates, Ts / self.substeps)
 
@@ -57,13 +57,13 @@ class Exponential:
         """
         mechanism = structure.with_values(c.values)
         if self.substeps == 1:
-            return _advance(mechanism, x, v, c, self.order)
-        body = lambda _, state: _advance(mechanism, state, v, c, self.order)  # noqa: E731
+            return _advance(mechanism, x, v, c, self)
+        body = lambda _, state: _advance(mechanism, state, v, c, self)  # noqa: E731
         return jax.lax.fori_loop(0, self.substeps, body, x)
 
 
 def _advance(
-    mechanism: Mechanism, x: jax.Array, v: jax.Array, c: Constants, order: int
+    mechanism: Mechanism, x: jax.Array, v: jax.Array, c: Constants, solver: Exponential
 ) -> jax.Array:
     layout = Layout.of(mechanism.structure)
     L, z = x[: layout.linear], x[layout.linear :]
@@ -72,17 +72,17 @@ def _advance(
         return start
     smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
     if not smooth:
-        return _brake(mechanism, L, start, c)
+        return _brake(mechanism, L, start, c, solver.passes)
     f0 = _torques(mechanism, L, z, v, c.gates)
     guess = start + apply(c.hold, f0)
     brake = _brake_guess(mechanism, L, guess, c)
     end = guess + apply(c.hold, brake)
     z1 = _remember(mechanism, z, (L + end) / 2, v, c.h)
-    if order == 2:
+    if solver.order == 2:
         final = guess + apply(c.ramp, _torques(mechanism, end, z1, v, c.gates) - f0)
     else:
         final = start + _fourth_order(mechanism, L, z, z1, v, f0, brake, c)
-    final = _brake(mechanism, L, final, c)
+    final = _brake(mechanism, L, final, c, solver.passes)
     return jnp.concatenate([final, z1]) if z.shape[0] else final
 
 
@@ -108,9 +108,7 @@ def port_motion(layout: Layout, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return apply(P, x[: layout.n]), apply(P, x[layout.n : 2 * layout.n])
 
 
-def _torques(
-    mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array
-) -> jax.Array:
+def _torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
     """Smooth torques at the torque ports."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
@@ -124,9 +122,7 @@ def _torques(
     return jnp.stack(total)
 
 
-def _remember(
-    mechanism: Mechanism, z: jax.Array, x: jax.Array, v: jax.Array, h: jax.Array
-) -> jax.Array:
+def _remember(mechanism: Mechanism, z: jax.Array, x: jax.Array, v: jax.Array, h: jax.Array) -> jax.Array:
     """Memories after `h`, port motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
     layout = Layout.of(mechanism.structure)
     found = effects_of(mechanism, Memory)
@@ -171,23 +167,30 @@ def _brake_guess(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constant
     own = jnp.stack([1 / c.stop[i, i] for i in range(k)])
     needed = -port_motion(layout, end)[1][:k] * own.reshape((k,) + (1,) * (x.ndim - 1))
     none = jnp.zeros((len(layout.torque_ports) - k, *x.shape[1:]), x.dtype)
-    return jnp.concatenate([jnp.clip(needed, -up, down), none])
+    return jnp.concatenate([within(needed, up, down), none])
 
 
-def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants) -> jax.Array:
+def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants, passes: int | None) -> jax.Array:
     """The state at the end of the step with dry friction, positions matched to the stop inside it."""
     layout = Layout.of(mechanism.structure)
     k, n = layout.contacts, layout.n
     if not k:
         return end
-    up, down = _levels(mechanism, x, end, c.gates)
     q0, v0 = (m[:k] for m in port_motion(layout, x))
-    found: Contact = contacts(v0, port_motion(layout, end)[1][:k], c.stop[:k, :k], up, down)
+    free, stop = port_motion(layout, end)[1][:k], c.stop[:k, :k]
+    levels = _levels(mechanism, x, end, c.gates)
+    if not all(e.steady for _, e in effects_of(mechanism, DryFriction)):
+        # The level belongs to the speed that friction leaves, not to the one without it.
+        rough = contacts(v0, free, stop, *levels, passes=1)
+        levels = _levels(mechanism, x, end + apply(c.hold[:, :k], rough.torque), c.gates)
+    found = contacts(v0, free, stop, *levels, passes=passes)
     end = end + apply(c.hold[:, :k], found.torque)
     q1, v1 = (m[:k] for m in port_motion(layout, end))
-    # A held torque takes the speed from v0 to v1 on a line; in truth it reaches zero after t h.
+    # A held torque takes the speed from v0 to v1 on a line; in truth it reaches zero after t h. A port
+    # that holds moves by nothing at all, not even by the curvature of that line.
     late = c.h / 2 * (found.t * v0 + (1 - found.t) * v1 - v0 - v1)
-    shift = jnp.where(found.rests, c.h / 2 * found.t * v0 - (q1 - q0), late)
+    curved = c.h / 2 * (v0 + v1) - (q1 - q0)
+    shift = late + (1 - found.t) * found.holds * curved
     impulse = solve_masked(c.mobility[:k, :k], found.crossed, shift, jnp.zeros_like(shift))
     moved = apply(c.push[:, :k], impulse)
     return jnp.concatenate([end[:n] + moved, end[n:]])

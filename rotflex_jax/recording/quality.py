@@ -113,9 +113,7 @@ def _still(x: np.ndarray) -> bool:
 def _short(u: np.ndarray) -> Finding | None:
     if len(u) >= SHORTEST:
         return None
-    message = (
-        f"The recording must have at least {SHORTEST} samples, but has {len(u)}; record longer."
-    )
+    message = f"The recording must have at least {SHORTEST} samples, but has {len(u)}; record longer."
     return Finding("short", "time", message, "error")
 
 
@@ -153,9 +151,7 @@ def _quantised(name: str, unit: str, step: float | None) -> Finding | None:
     return Finding("quantised", name, f"Channel {name!r} is quantised in steps of {size}.", "note")
 
 
-def _like_degrees(
-    x: np.ndarray, u: np.ndarray, Ts: float, name: str, input_unit: str
-) -> Finding | None:
+def _like_degrees(x: np.ndarray, u: np.ndarray, Ts: float, name: str, input_unit: str) -> Finding | None:
     """Angles beyond what a joint can do in radians.
 
     A deflection of half a turn is none. A geared servo makes about 2 rad/s per volt, in degrees

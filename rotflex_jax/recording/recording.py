@@ -133,9 +133,7 @@ class Recording:
     def channel(self, name: str) -> Float[np.ndarray, " N"]:
         """One output by name."""
         if name not in self.channels:
-            raise InputError(
-                f"The recording has no channel {name!r}; it has {', '.join(self.channels)}."
-            )
+            raise InputError(f"The recording has no channel {name!r}; it has {', '.join(self.channels)}.")
         return self.y[:, self.channels.index(name)]
 
     def slice(self, i: int, j: int) -> "Recording":

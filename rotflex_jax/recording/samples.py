@@ -34,9 +34,7 @@ def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0)
     if array.dtype.kind in "iuf":
         return array
     if array.dtype.kind not in "OUST" or array.ndim != 1:
-        raise InputError(
-            f"{label} must hold real numbers, but holds {array.dtype.name}; convert it first."
-        )
+        raise InputError(f"{label} must hold real numbers, but holds {array.dtype.name}; convert it first.")
     numbers = np.empty(len(array))
     for k, entry in enumerate(array):
         try:
@@ -141,9 +139,7 @@ def even_spacing(t: np.ndarray, label: str, where: str = "sample", first: int = 
     """
     finite(t, label, where, first)
     if len(t) < 2:
-        raise InputError(
-            f"{label} has {len(t)} time stamps, but a sampling period needs two; record longer."
-        )
+        raise InputError(f"{label} has {len(t)} time stamps, but a sampling period needs two; record longer.")
     steps = np.diff(t)
     period = float(np.median(steps))
 

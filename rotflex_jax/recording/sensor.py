@@ -40,9 +40,7 @@ def quantisation_step(x: np.ndarray) -> float | None:
     return None
 
 
-def cut_off(
-    x: np.ndarray, step: float | None, u: np.ndarray, Ts: float
-) -> tuple[float, int] | None:
+def cut_off(x: np.ndarray, step: float | None, u: np.ndarray, Ts: float) -> tuple[float, int] | None:
     """The end of a sensor's range, where the signal shows that it wanted to go on.
 
     A joint may rest exactly at the end of its motion, so that many equal samples prove nothing.

@@ -85,9 +85,7 @@ def _tiles(discovery: Discovery) -> list[dict[str, str]]:
         before, read = readable(discovery.baseline.held_out_rmse_windows[channel], unit)
         after, _ = readable(discovery.final.held_out_rmse_windows[channel], unit)
         times = multiples[channel]
-        text = (
-            f"{plain_number(times, 2)} × the sensor noise" if times == times else "held-out error"
-        )
+        text = f"{plain_number(times, 2)} × the sensor noise" if times == times else "held-out error"
         tiles.append(
             {
                 "channel": channel,
@@ -125,8 +123,7 @@ def _round(discovery: Discovery, number: int) -> dict[str, Any]:
 
 def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
     return [
-        {"text": together(w.statement), "p": _p_value(w.p_value), "none": len(w.edges) < 2}
-        for w in places
+        {"text": together(w.statement), "p": _p_value(w.p_value), "none": len(w.edges) < 2} for w in places
     ]
 
 

@@ -127,9 +127,7 @@ def staircase(discovery: Discovery) -> Figure | None:
             )
         # Markers in the legend speak of the kind of run; their colours, of the stage.
         ax.plot([], [], "o", color=MUTED, ms=7, label=f"run anew every {seconds:g} s")
-        ax.plot(
-            [], [], "o", mfc="white", color=MUTED, ms=6, mew=1.5, label="one run over all of it"
-        )
+        ax.plot([], [], "o", mfc="white", color=MUTED, ms=6, mew=1.5, label="one run over all of it")
         floor = scale * discovery.noise_floor.get(channel, 0.0)
         if floor > 0:
             ax.axhline(floor, color=NOISE, lw=1.1, ls=(0, (4, 2)), label="sensor noise")
@@ -156,11 +154,7 @@ def _comparable(discovery: Discovery) -> dict[str, list[Estimate | None]]:
     """Free parameters that differ clearly from zero in the final model, in every stage."""
     stages = [{e.name: e for e in s.estimates} for s in discovery.stages]
     last = stages[-1]
-    kept = (
-        e.name
-        for e in last.values()
-        if e.free and math.isfinite(e.std) and abs(e.value) > 3 * e.std
-    )
+    kept = (e.name for e in last.values() if e.free and math.isfinite(e.std) and abs(e.value) > 3 * e.std)
     return {name: [s.get(name) for s in stages] for name in kept}
 
 

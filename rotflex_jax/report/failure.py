@@ -147,9 +147,7 @@ def _profile(ax: Axes, place: Where, channels: list[str]) -> None:
         ax.set_xticks(edges, [f"{scale * e:.3g}" for e in place.edges])
     bars = 0.86 * np.diff(edges)
     middle = (edges[:-1] + edges[1:]) / 2
-    ax.bar(
-        middle, 100 * place.profile, bars, color=BASELINE, alpha=0.85, label="share of the error"
-    )
+    ax.bar(middle, 100 * place.profile, bars, color=BASELINE, alpha=0.85, label="share of the error")
     ax.stairs(100 * place.expected, edges, color=INK, lw=1.4, label="if it were spread evenly")
     ax.grid(axis="x", visible=False)
     ax.set_title(f"{place.channel} error")

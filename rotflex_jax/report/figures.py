@@ -50,11 +50,7 @@ def pictures(discovery: Discovery) -> dict[str, Picture]:
         "parameters": parameters(discovery),
     }
     captions = _captions(discovery)
-    return {
-        name: Picture(figure, *captions[name])
-        for name, figure in drawn.items()
-        if figure is not None
-    }
+    return {name: Picture(figure, *captions[name]) for name, figure in drawn.items() if figure is not None}
 
 
 def _captions(discovery: Discovery) -> dict[str, tuple[str, str]]:

@@ -107,9 +107,7 @@ def overlay(discovery: Discovery) -> Figure:
             grid[row, 0].axvspan(t[first], t[last - 1], color="#f3efe2", lw=0, zorder=0)
     for ax in grid[-1]:
         ax.set_xlabel("time [s]")
-    grid[0, 0].set_title(
-        f"held-out recording, run anew every {discovery.baseline.window_seconds:g} s"
-    )
+    grid[0, 0].set_title(f"held-out recording, run anew every {discovery.baseline.window_seconds:g} s")
     grid[0, 1].set_title("where the baseline is worst")
     figure.align_ylabels(grid[:, 0])
     figure.align_ylabels(grid[:, 1])
@@ -120,9 +118,7 @@ def overlay(discovery: Discovery) -> Figure:
 def _lines(above: Axes, below: Axes, s: Shown, c: int, part: slice, scale: float) -> None:
     t = s.recording.t[part]
     measured = scale * s.measured[part, c]
-    above.plot(
-        *thinned(t, measured), color=MEASURED, lw=2.6, label="measured", solid_capstyle="round"
-    )
+    above.plot(*thinned(t, measured), color=MEASURED, lw=2.6, label="measured", solid_capstyle="round")
     runs = [(s.baseline, BASELINE, "baseline", 1.0)]
     if s.final is not None:
         runs.append((s.final, FINAL, "final model", 1.1))

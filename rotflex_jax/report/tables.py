@@ -60,9 +60,7 @@ def error_rows(discovery: Discovery) -> tuple[ErrorRow, ...]:
     by_channel = units(discovery)
 
     def cells(errors: dict[str, float]) -> tuple[ErrorCell, ...]:
-        return tuple(
-            _cell(errors[c], unit, discovery.noise_floor.get(c)) for c, unit in by_channel.items()
-        )
+        return tuple(_cell(errors[c], unit, discovery.noise_floor.get(c)) for c, unit in by_channel.items())
 
     return tuple(
         ErrorRow(label, cells(s.held_out_rmse_windows), cells(s.held_out_rmse))
@@ -100,9 +98,7 @@ def parameter_rows(discovery: Discovery) -> tuple[ParameterRow, ...]:
         last = next(s[name] for s in reversed(stages) if name in s)
         each = tuple(value_and_interval(s[name]) if name in s else None for s in stages)
         rows.append(
-            ParameterRow(
-                name, meanings.get(name, ""), unit_text(last.unit), not last.free, each, last.note
-            )
+            ParameterRow(name, meanings.get(name, ""), unit_text(last.unit), not last.free, each, last.note)
         )
     return tuple(sorted(rows, key=lambda r: r.held))
 

@@ -133,9 +133,7 @@ def value_and_interval(estimate: Estimate) -> tuple[str, str]:
 def units(discovery: Discovery) -> dict[str, str]:
     """Channel of the model -> its unit."""
     first = discovery.test[0]
-    return {
-        c: first.units[first.channels.index(c)] for c in discovery.baseline.held_out_rmse_windows
-    }
+    return {c: first.units[first.channels.index(c)] for c in discovery.baseline.held_out_rmse_windows}
 
 
 def readable(value: float, unit: str) -> tuple[float, str]:
@@ -164,14 +162,10 @@ def next_steps(discovery: Discovery) -> list[str]:
             "Use the final model: in Python it is result.model, and its method "
             "simulate(recording) runs it on any recording of this machine."
         )
-        steps.append(
-            "Check it on a recording with another input; an effect that is real keeps its numbers."
-        )
+        steps.append("Check it on a recording with another input; an effect that is real keeps its numbers.")
     elif discovery.verdict == "nothing_missing":
         steps.append("Keep the model: on these recordings no effect makes it better.")
-        steps.append(
-            "Before trusting it elsewhere, record the speeds and voltages you will use and repeat."
-        )
+        steps.append("Before trusting it elsewhere, record the speeds and voltages you will use and repeat.")
     elif discovery.verdict == "ambiguous":
         for turn in discovery.rounds:
             if turn.equivalent:
@@ -184,8 +178,7 @@ def next_steps(discovery: Discovery) -> list[str]:
         steps.append("Until then the final model simulates well, whichever of them is the cause.")
     elif discovery.verdict == "unexplained":
         steps.append(
-            "Look at the places below where the model still fails; they say what kind of effect "
-            "to think of."
+            "Look at the places below where the model still fails; they say what kind of effect to think of."
         )
         steps.append(
             "Check the recording (sampling, scaling, sensor range) and the constants that are "

@@ -1,0 +1,97 @@
+"""A super-model of a few candidates on two short recordings, for tests of scores and refits."""
+
+import functools
+
+import numpy as np
+from arena.records import make_record
+
+import rotflex_jax.effects as fx
+from rotflex_jax.discover.lanes import Bench, Hypothesis
+from rotflex_jax.discover.refit import Judge, levenberg_marquardt
+from rotflex_jax.discover.scales import scales
+from rotflex_jax.discover.supermodel import SuperModel, build
+from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.fit.greybox import torque_scale
+from rotflex_jax.fit.residuals import stack
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism import Exponential, Mechanism
+from rotflex_jax.model import Model
+from rotflex_jax.parameters import Transform
+from rotflex_jax.recording import Recording
+
+HUB = ("coulomb", "hub")
+WANTED = ((fx.Coulomb, "hub"), (fx.Viscous, "hub"), (fx.CubicSpring, "joint"), (fx.Coulomb, "joint"))
+SOLVER = Exponential(substeps=2)
+NOISE = np.array([5.4e-4, 5.4e-4])
+
+
+@functools.cache
+def records(level: float = 0.0, seeds: tuple[int, ...] = (21, 22)) -> tuple[dict, ...]:
+    """The same machine twice, with friction of that level at the hub and offsets of +-20 mV."""
+    return tuple(
+        make_record(
+            {HUB: {"level": level}, ("voltage_offset", "input"): {"offset": 0.02 * (-1) ** k}},
+            seed=seed,
+            seconds=1.6,
+            fs=400.0,
+            perturb=0.0,
+            rms=1.5,
+        )
+        for k, seed in enumerate(seeds)
+    )
+
+
+def recordings(made: tuple[dict, ...]) -> tuple[Recording, ...]:
+    return tuple(Recording(u=r["u"], y=r["y"], Ts=r["Ts"], accept=("units",)) for r in made)
+
+
+def baseline() -> Mechanism:
+    """The true joint, whose damping at the hub is left to the back-EMF, which a fit may move."""
+    joint = paper(joint_damping=0.003, hub_damping=0.004).without("viscous", "hub")
+    return joint.release("hub.motor.back_emf")
+
+
+@functools.cache
+def supermodel() -> SuperModel:
+    """The same for all tests, so that it is compiled once."""
+    found = recordings(records())
+    return build(baseline(), WANTED, scales(Model(baseline()), found, torque(found)))
+
+
+def torque(found: tuple[Recording, ...]) -> float:
+    return torque_scale(baseline(), stack(found, Model(baseline())))
+
+
+def judge(found: tuple[Recording, ...]) -> Judge:
+    data = stack(found, Model(baseline()))
+    return Judge(Bench(supermodel(), SOLVER, data), NOISE, torque(found), ("hub", "joint"))
+
+
+def start(at: Judge, wrong: float = 0.0, places=None) -> Hypothesis:
+    """The baseline in a free run from rest, its free numbers wrong by a share."""
+    s = supermodel()
+    places = s.calibrations if places is None else places
+    R = len(at.bench.data.u)
+    z = Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values)
+    z[s.local] = 0.0
+    # Friction that nobody left out: what the back-EMF has to make up for.
+    z[s.mechanism.parameter_names.index("hub.motor.back_emf")] = np.log(0.00767 * 1.04)
+    z[s.baseline_free] += np.log1p(wrong)
+    h = Hypothesis(
+        places=places,
+        free=tuple(s.baseline_free),
+        local=tuple(s.local),
+        z=z,
+        own=np.zeros((R, len(s.local))),
+        x0=np.zeros((R, 4)),
+        K=np.zeros((0,)),
+        process_noise={},
+        whitener=Whitener(np.ones((2, 1)), np.diag(1 / NOISE)),
+    )
+    return at.with_process_noise(h, {"hub": 0.0, "joint": 0.0})
+
+
+def fitted(at: Judge) -> Hypothesis:
+    """The baseline at its optimum, whitener and all."""
+    h = levenberg_marquardt(at, [start(at)])[0]
+    return levenberg_marquardt(at, [h])[0]

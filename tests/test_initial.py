@@ -1,0 +1,158 @@
+"""The first state comes from the first samples, and nothing else of the outputs reaches a model."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import rotflex_jax.effects as fx
+from arena.plant import Plant
+from arena.records import make_record
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism import Exponential, simulate, simulate_states
+from rotflex_jax.mechanism.initial import initial_states, rough_state
+from rotflex_jax.model import Model, window_starts
+from rotflex_jax.recording import Recording
+
+
+def joint(plant: Plant | dict):
+    p = plant if isinstance(plant, dict) else dataclasses.asdict(plant)
+    return paper(
+        hub_inertia=p["J_hub"],
+        arm_inertia=p["J_arm"],
+        stiffness=p["K"],
+        torque_constant=p["k_t"],
+        hub_damping=p["B_hub"],
+        joint_damping=p["B_joint"],
+    )
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """A joint in motion, by the arena's own simulator, and a model with the true numbers."""
+    r = make_record({("coulomb", "hub"): 1.0}, seed=11, seconds=4.0, fs=200.0, rms=2.0)
+    return r, joint(r["truth"]["plant"]) + fx.Coulomb("hub", level=0.03)
+
+
+def stretches(r, key: str, starts, m: int):
+    pick = np.asarray(starts)[:, None] + np.arange(m)
+    return r["u"][pick], r[key][pick]
+
+
+STARTS = [60, 200, 333, 500, 704]
+
+
+def test_recovers_the_true_state_from_noise_free_samples(truth):
+    r, mechanism = truth
+    u, y = stretches(r, "clean", STARTS, 40)
+    gates = np.ones(len(mechanism.effects))
+    # Steps short enough that the simulators differ by little.
+    found = initial_states(mechanism, Exponential(substeps=4), gates, u, y, r["Ts"])
+    true = r["state"][STARTS]
+    assert np.ptp(true[:, 2]) > 1 and np.ptp(true[:, 3]) > 1  # in motion
+    np.testing.assert_allclose(found[:, :2], true[:, :2], atol=2e-5)
+    np.testing.assert_allclose(found[:, 2:], true[:, 2:], atol=2e-3)
+    # The fit through the simulator is what does it: the straight line is far off.
+    rough = np.array([rough_state(mechanism.structure, s, r["Ts"]) for s in y])
+    assert np.abs(rough - true).max() > 0.3
+
+
+def test_recovers_its_own_state_exactly(truth):
+    r, mechanism = truth
+    true = simulate_states(mechanism, r["u"], r["Ts"])
+    u, y = stretches({"u": r["u"], "own": true[:, :2]}, "own", STARTS, 40)
+    gates = np.ones(len(mechanism.effects))
+    found = initial_states(mechanism, Exponential(), gates, u, y, r["Ts"])
+    np.testing.assert_allclose(found, true[STARTS], rtol=1e-9, atol=1e-10)
+
+
+def test_encoder_noise_is_averaged(truth):
+    """Over many stretches the speeds scatter less than a difference of two samples would."""
+    r, mechanism = truth
+    starts = np.arange(50, 750, 20)
+    u, y = stretches(r, "y", starts, 40)
+    gates = np.ones(len(mechanism.effects))
+    found = initial_states(mechanism, Exponential(), gates, u, y, r["Ts"])
+    error = found - r["state"][starts]
+    noise = np.std(r["y"] - r["clean"])
+    assert np.sqrt(np.mean(error[:, :2] ** 2)) < noise
+    assert np.sqrt(np.mean(error[:, 2:] ** 2)) < 0.3 * noise / r["Ts"]
+
+
+def test_what_is_not_measured_is_told_by_the_motion(truth):
+    """From the hub angle alone, the deflection too."""
+    r, mechanism = truth
+    alone = dataclasses.replace(mechanism, outputs={"theta": "hub"})
+    u, y = stretches(r, "clean", [200, 500], 60)
+    gates = np.ones(len(alone.effects))
+    found = initial_states(alone, Exponential(), gates, u, y[..., :1], r["Ts"])
+    true = r["state"][[200, 500]]
+    np.testing.assert_allclose(found[:, :2], true[:, :2], atol=2e-4)
+    np.testing.assert_allclose(found[:, 2:], true[:, 2:], atol=2e-2)
+
+
+def test_a_measured_speed_is_read_as_a_speed():
+    mechanism = dataclasses.replace(paper(), outputs={"omega": ("hub", "speed"), "alpha": "joint"})
+    t = np.arange(20) * 0.01
+    y = np.column_stack([1.5 + 4 * t, 0.02 - 0.3 * t])
+    state = rough_state(mechanism.structure, y, 0.01)
+    assert state[2] == pytest.approx(1.5) and state[1] == pytest.approx(0.02)
+
+
+def scrambled(y: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Nonsense of the same size wherever a model may not look."""
+    rng = np.random.default_rng(9)
+    out = y + rng.normal(size=y.shape) * y.std(axis=0)
+    out[kept] = y[kept]
+    return out
+
+
+def recorded(r, y=None) -> Recording:
+    return Recording(u=r["u"], y=r["y"] if y is None else y, Ts=r["Ts"], accept=("units",))
+
+
+def test_simulate_looks_at_the_first_samples_only(truth):
+    r, mechanism = truth
+    model, record = Model(mechanism), recorded(r)
+    kept = np.arange(record.N) < record.n_init
+    run = model.simulate(record)
+    other = recorded(r, scrambled(r["y"], kept))
+    assert other.n_init == record.n_init
+    np.testing.assert_array_equal(model.simulate(other), run)
+    # At the last sample it may look at, it does look.
+    y = r["y"].copy()
+    y[record.n_init - 1] += 0.05
+    assert np.abs(model.simulate(recorded(r, y)) - run).max() > 1e-3
+    assert np.sqrt(np.mean((run - r["clean"]) ** 2)) < 5e-3
+
+
+def test_each_window_looks_at_its_own_first_samples_only(truth):
+    r, mechanism = truth
+    model, record = Model(mechanism), recorded(r)
+    starts, length = window_starts(record, 1.0)
+    assert starts.tolist() == [0, 200, 400, 600] and length == 200
+    kept = np.arange(record.N) % 200 < record.n_init
+    run = model.simulate_windows(record, 1.0)
+    other = recorded(r, scrambled(r["y"], kept))
+    np.testing.assert_array_equal(model.simulate_windows(other, 1.0), run)
+    # A window is a free run of that part of the recording: on perfect data, of this model exactly.
+    own = recorded(r, simulate(mechanism, r["u"], r["Ts"]))
+    np.testing.assert_allclose(model.simulate_windows(own, 1.0), own.y, atol=1e-9)
+
+
+def test_a_short_rest_joins_the_last_window(truth):
+    record = recorded(truth[0]).slice(0, 650)
+    starts, length = window_starts(record, 1.0)  # n_init is 40: a rest of 50 is too short
+    assert starts.tolist() == [0, 200, 400] and length == 250
+
+
+def test_prediction_uses_the_past_only(truth):
+    """A sample changes predictions after it, never its own or an earlier one."""
+    r, mechanism = truth
+    model, noise = Model(mechanism), np.array([5e-4, 5e-4])
+    run = model.predict(recorded(r), {"hub": 1e-4}, noise)
+    y = r["y"].copy()
+    y[500:] += 0.3
+    other = model.predict(recorded(r, y), {"hub": 1e-4}, noise)
+    np.testing.assert_array_equal(other[:501], run[:501])
+    assert np.abs(other[501:] - run[501:]).min(axis=0).max() > 1e-4
