@@ -20,7 +20,6 @@ import importlib.metadata
 import json
 import os
 import platform
-import statistics
 import subprocess
 import sys
 import time
@@ -36,10 +35,10 @@ for folder in (HERE, HERE.parent):
         sys.path.insert(0, str(folder))
 
 from rich.console import Console
-from rich.table import Table
 
 from arena.hidden import DEFAULTS
 from arena.records import INPUTS
+from arena.table import answer, label, show
 
 TUNING, REPORT = tuple(range(100, 120)), tuple(range(1000, 1020))
 Job = dict[str, Any]
@@ -55,16 +54,9 @@ def jobs(seeds: list[int], inputs: list[str], nulls: int, seconds: float, only: 
         for kind in inputs
         for seed in seeds
     ]
-    nothing = [
-        {"effects": [], "kind": kinds[k % len(kinds)], "seed": base + k} for k in range(nulls)
-    ]
+    nothing = [{"effects": [], "kind": kinds[k % len(kinds)], "seed": base + k} for k in range(nulls)]
     chosen = [j for j in hidden + nothing if not only or only in label(j)]
     return [{**j, "seconds": seconds} for j in chosen]
-
-
-def label(job: Job) -> str:
-    """What is hidden, in short."""
-    return " + ".join(f"{e}@{p}" for e, p in job["effects"]) or "nothing"
 
 
 def key(job: Job) -> str:
@@ -127,88 +119,6 @@ def save(path: Path, results: dict[str, Any]) -> None:
     part = path.with_suffix(".part")
     part.write_text(json.dumps(results, indent=1) + "\n")
     part.replace(path)
-
-
-def mark(ok: bool | None) -> str:
-    """A tick or a cross."""
-    return "-" if ok is None else "[green]yes[/]" if ok else "[red]no[/]"
-
-
-def answer(row: dict[str, Any]) -> str:
-    """What was found, look-alikes of each in brackets."""
-    parts = []
-    for r in row["rounds"]:
-        others = ", ".join("@".join(p) for p in r["equivalent"])
-        parts.append(f"{r['effect']}@{r['port']}" + (f" [= {others}]" if others else ""))
-    return " + ".join(parts) or "nothing"
-
-
-def worst(row: dict[str, Any]) -> str:
-    """Largest parameter error [%]."""
-    errors = [abs(p["error_percent"]) for p in row["parameters"].values()]
-    return f"{max(errors):.1f}" if errors else "-"
-
-
-def show(console: Console, records: list[dict[str, Any]]) -> None:
-    """Table of all records, then sums, then the misses."""
-    table = Table(title="B0: one hidden effect", header_style="bold")
-    columns = (
-        "hidden,input,seed,answer,first,exact,in set,verdict,right,error %,vs oracle,wall s,cpu s"
-    )
-    for name in columns.split(","):
-        table.add_column(name, overflow="fold")
-    for row in records:
-        head = (label(row), row["kind"], str(row["seed"]))
-        if "error" in row:
-            table.add_row(*head, f"[red]{row['error'][:60]}[/]")
-            continue
-        ratio = " ".join(f"{v:.2f}" for v in row.get("over_oracle", {}).values())
-        marks = (mark(row["first"]), mark(row["exact"]), mark(row["inside"]), row["verdict"])
-        times = (f"{row['wall_s']:.1f}", f"{row['cpu_s']:.1f}")
-        said = answer(row).replace("[", "(").replace("]", ")")
-        table.add_row(*head, said, *marks, mark(row["verdict_right"]), worst(row), ratio, *times)
-    console.print(table)
-    console.print(summary(records))
-    for row in records:
-        if "error" in row or not (row["first"] and row["exact"] and row["verdict_right"]):
-            got = row.get("error") or f"{answer(row)}, {row['verdict']}"
-            text = f"  miss: {label(row)} ({row['kind']}, {row['seed']}) -> {got}"
-            console.print(text, markup=False)
-
-
-def summary(records: list[dict[str, Any]]) -> str:
-    """The numbers that a release is judged by."""
-    good = [r for r in records if "error" not in r]
-    seen, null = [r for r in good if r["wanted"]], [r for r in good if not r["wanted"]]
-    part = lambda rows, name: f"{sum(bool(r[name]) for r in rows)}/{len(rows)}"  # noqa: E731
-    lines = [
-        f"effects: first {part(seen, 'first')} (by name {part(seen, 'strict')}), exact set "
-        f"{part(seen, 'exact')}, truth in the reported set {part(seen, 'inside')}, verdict "
-        f"{part(seen, 'verdict_right')}, with false extras {part(seen, 'extra')}",
-        f"nothing to find: false alarms {part(null, 'extra')}, verdict "
-        f"{part(null, 'verdict_right')}",
-    ]
-    numbers = [p for r in seen for p in r["parameters"].values()]
-    if numbers:
-        errors = [abs(p["error_percent"]) for p in numbers]
-        lines.append(
-            f"parameters: median error {statistics.median(errors):.2f} %, 95 % interval holds the "
-            f"truth in {sum(p['covered'] for p in numbers)}/{len(numbers)}"
-        )
-    ratios = [v for r in seen for v in r.get("over_oracle", {}).values()]
-    if ratios:
-        lines.append(
-            f"held-out error over the oracle's: median {statistics.median(ratios):.3f}, "
-            f"within 5 % in {sum(v < 1.05 for v in ratios)}/{len(ratios)}"
-        )
-    if good:
-        wall, cpu = ([r[n] for r in good] for n in ("wall_s", "cpu_s"))
-        lines.append(
-            f"time per record: median {statistics.median(wall):.1f} s wall, "
-            f"{statistics.median(cpu):.1f} s CPU; longest {max(wall):.1f} s"
-        )
-    lines.append(f"records: {len(records)}, failed {len(records) - len(good)}")
-    return "\n".join(lines)
 
 
 def arguments() -> argparse.Namespace:

@@ -24,12 +24,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import rotflex_jax as rf
-from rotflex_jax.data.datasets import demo_recording
 from rotflex_jax.discover.looks import missing_acceleration
 from rotflex_jax.report import figures
 
 # Two settings of JAX that make this notebook several times quicker. Models run in double precision
-# by themselves, and nothing here draws random numbers that are not fixed: it repeats.
+# by themselves, and nothing depends on chance: every run gives the same numbers.
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
 
@@ -45,7 +44,7 @@ GREY, RED, AMBER, BLUE = "#9aa5b1", "#c8452f", "#d98e04", "#0f6f86"
 # first 70 % and are judged on the rest, which no fit sees.
 
 # %%
-recording = demo_recording()
+recording = rf.data.demo_recording()
 train, test = recording.split(0.7)
 print(recording)
 for finding in recording.findings:
@@ -141,11 +140,11 @@ def show_missing(fit, colour):
     y_hat = fit.model.simulate_windows(train, seconds=2.0)
     restarts = range(0, train.N, round(2.0 / train.Ts))
     against = {
-        "deflection alpha [deg]": ("alpha", np.rad2deg(train.channel("alpha"))),
-        "speed of the hub, simulated [deg/s]": ("theta", np.rad2deg(np.gradient(y_hat[:, 0], train.Ts))),
+        "deflection alpha [deg]": ("alpha", 7.5, np.rad2deg(train.channel("alpha"))),
+        "speed of the hub, simulated [deg/s]": ("theta", 2.2, np.rad2deg(np.gradient(y_hat[:, 0], train.Ts))),
     }
     axes = plt.subplots(1, 2, figsize=(10, 3.2))[1]
-    for ax, (label, (channel, x)) in zip(axes, against.items(), strict=True):
+    for ax, (label, (channel, reach, x)) in zip(axes, against.items(), strict=True):
         error = train.channel(channel) - y_hat[:, train.channels.index(channel)]
         lacks, seen = missing_acceleration(error, train, restarts)
         edges = np.linspace(-1, 1, 16) * np.quantile(np.abs(x), 0.98)
@@ -153,7 +152,7 @@ def show_missing(fit, colour):
         mean = np.histogram(x[seen], edges, weights=lacks[seen])[0] / count
         ax.axhline(0, color="#1f2933", lw=0.8)
         ax.plot((edges[1:] + edges[:-1]) / 2, mean, "o-", color=colour)
-        ax.set(xlabel=label, ylabel=f"missing in {channel} [rad/s²]")
+        ax.set(xlabel=label, ylabel=f"missing in {channel} [rad/s²]", ylim=(-reach, reach))
     plt.show()
 
 
@@ -198,7 +197,7 @@ show_errors(fits)
 
 # %% [markdown]
 # - The **cubic spring** takes two thirds of the error of alpha away, and little of theta.
-# - **Coulomb friction** halves the error of theta, and does little for alpha. Two effects may be
+# - **Coulomb friction** nearly halves the error of theta, and does little for alpha. Two effects may be
 #   missing, then.
 # - The **dead zone** is a warning: it nearly halves the *training* error of theta, and more than
 #   doubles the held-out one. It imitates friction on the data it was fitted to, and only there.
@@ -248,7 +247,7 @@ plt.show()
 
 # %% [markdown]
 # Nearly: the last error is a little above the rounding of the encoder, and the third look finds no
-# pattern in it. What is left is what the encoder adds besides rounding; no physics of the joint is.
+# pattern in it. What is left is noise: besides rounding, this encoder jitters a little.
 #
 # ## The same in one call
 #
@@ -273,9 +272,9 @@ figures.ranking(result)
 # ## Is it true?
 #
 # Here it can be checked, since the recording was simulated. The second lesson of missing physics is
-# in the middle column: the textbook fit does not only follow badly, its **parameters are wrong, and
-# their intervals do not know it**. The missing friction was booked as damping, the hardening as
-# stiffness.
+# in the middle column: the textbook fit does not only follow badly, two of its **parameters are far
+# off, and their intervals do not know it**. The missing friction was booked as damping of the hub,
+# the hardening as stiffness.
 
 # %%
 truth = json.loads((files("rotflex_jax.data") / "demo_truth.json").read_text())

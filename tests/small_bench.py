@@ -3,9 +3,9 @@
 import functools
 
 import numpy as np
-from arena.records import make_record
 
 import rotflex_jax.effects as fx
+from arena.records import make_record
 from rotflex_jax.discover.lanes import Bench, Hypothesis
 from rotflex_jax.discover.refit import Judge, levenberg_marquardt
 from rotflex_jax.discover.scales import scales

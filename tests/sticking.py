@@ -64,10 +64,7 @@ class Joint:
         free = self.torque(q, w, v)
         ports = np.array([c.port for c in self.contacts]).reshape(-1, 2)
         f = np.array(
-            [
-                -m * c.against(m, abs(p @ w))
-                for m, c, p in zip(modes, self.contacts, ports, strict=True)
-            ]
+            [-m * c.against(m, abs(p @ w)) for m, c, p in zip(modes, self.contacts, ports, strict=True)]
         )
         rest = [i for i, m in enumerate(modes) if m == 0]
         if rest:
@@ -87,11 +84,7 @@ class Joint:
         """
         speeds = [np.dot(c.port, x[2:]) for c in self.contacts]
         choices = [
-            (letting_go[i],)
-            if i in letting_go
-            else (int(np.sign(s)),)
-            if abs(s) > REST
-            else (0, 1, -1)
+            (letting_go[i],) if i in letting_go else (int(np.sign(s)),) if abs(s) > REST else (0, 1, -1)
             for i, s in enumerate(speeds)
         ]
         for modes in sorted(itertools.product(*choices), key=lambda m: sum(map(abs, m))):

@@ -354,9 +354,7 @@ def test_arrays_that_are_no_recording(kind: str) -> None:
     refused(lambda: Recording(**{"u": U, "y": Y, "Ts": 0.002, **given}), phrase)
 
 
-def test_missing_package_is_named_with_its_extra(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with h5py.File(tmp_path / "run.mat", "w") as file:
         file["t"] = GOOD["t"]
     monkeypatch.setitem(sys.modules, "h5py", None)

@@ -42,9 +42,7 @@ def coverage(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
 def test_white_residuals_give_the_ordinary_formula():
     errors, robust, plain = experiments(lambda rng: rng.normal(size=N))
     # Products of slow regressors and noise make one estimate scatter; their mean does not.
-    np.testing.assert_allclose(
-        np.diagonal(robust.mean(axis=0)), np.diagonal(plain.mean(axis=0)), rtol=0.05
-    )
+    np.testing.assert_allclose(np.diagonal(robust.mean(axis=0)), np.diagonal(plain.mean(axis=0)), rtol=0.05)
     np.testing.assert_allclose(np.diagonal(robust.mean(axis=0)), errors.var(axis=0), rtol=0.2)
     np.testing.assert_allclose(coverage(errors, robust), 0.95, atol=0.03)
 
@@ -104,9 +102,7 @@ def test_scale_of_residuals_and_slopes():
     one, zeros = sandwich(J, e, np.zeros(500, int)), np.zeros(500, int)
     np.testing.assert_allclose(sandwich(J, 3 * e, zeros), 9 * one, rtol=1e-10)
     units = np.array([1.0, 0.05, 20.0])
-    np.testing.assert_allclose(
-        sandwich(J * units, e, zeros), one / np.outer(units, units), rtol=1e-8
-    )
+    np.testing.assert_allclose(sandwich(J * units, e, zeros), one / np.outer(units, units), rtol=1e-8)
 
 
 @pytest.mark.parametrize("a", [0.5, 0.9])

@@ -81,9 +81,7 @@ def serve(monkeypatch: pytest.MonkeyPatch, content: Callable[[str], bytes]) -> l
     return asked
 
 
-def test_download_with_another_hash_is_refused(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_download_with_another_hash_is_refused(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     serve(monkeypatch, lambda url: b"moved")
     with pytest.raises(InputError, match="no longer the public file"):
         fetch("emps")

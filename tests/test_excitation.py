@@ -126,8 +126,6 @@ def test_pulse_is_where_it_was_asked_for() -> None:
         ("pulse", (100, Ts), {"width": 2.0}, "within the 1 s"),
     ],
 )
-def test_what_makes_no_signal_is_refused(
-    kind: str, arguments: tuple, options: dict, phrase: str
-) -> None:
+def test_what_makes_no_signal_is_refused(kind: str, arguments: tuple, options: dict, phrase: str) -> None:
     with pytest.raises(InputError, match=phrase):
         excitation.INPUTS[kind](*arguments, **options)

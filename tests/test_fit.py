@@ -138,9 +138,7 @@ def test_no_bound_is_left_where_there_is_no_friction():
     found = fit(off(truth, 5), rec)
     level = found["hub.coulomb.level"].value
     assert 0 <= level < 1e-3
-    assert found["joint.spring.stiffness"].value == pytest.approx(
-        truth["joint.spring.stiffness"], rel=0.01
-    )
+    assert found["joint.spring.stiffness"].value == pytest.approx(truth["joint.spring.stiffness"], rel=0.01)
 
 
 def test_more_freedom_is_never_worse_and_prediction_hides_less():

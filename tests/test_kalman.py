@@ -39,9 +39,8 @@ def pushed(joint, port: str) -> np.ndarray:
     return g
 
 
-def expected(joint, intensity, noise, Ts) -> np.ndarray:
+def expected(joint, Q: np.ndarray, noise: np.ndarray, Ts: float) -> np.ndarray:
     space = linearise(joint)
-    Q = sum(q * quadrature(space.A, pushed(joint, port), Ts) for port, q in intensity.items() if q)
     R = np.diag(noise**2)
     Ad = expm(space.A * Ts)
     # In units of the noise, so that SciPy solves a well-scaled problem.
@@ -68,15 +67,16 @@ def test_built_up_covariance(Ts, inductance):
 def test_gains_solve_the_riccati_equation(Ts, inductance):
     joint = paper(inductance=inductance, hub_damping=0.004, joint_damping=0.003)
     grid = [
-        {"hub": hub, "joint": deflection}
-        for hub in (1e-9, 1e-6, 1e-3)
-        for deflection in (0.0, 1e-8, 1e-4)
+        {"hub": hub, "joint": deflection} for hub in (1e-9, 1e-6, 1e-3) for deflection in (0.0, 1e-8, 1e-4)
     ]
     gains = kalman_gains(joint, grid, NOISE, Ts)
     assert gains.shape == (len(grid), 4 + (inductance is not None), 2)
-    Ad, C = expm(linearise(joint).A * Ts), linearise(joint).C
+    A, C = linearise(joint).A, linearise(joint).C
+    Ad = expm(A * Ts)
+    unit = {port: quadrature(A, pushed(joint, port), Ts) for port in ("hub", "joint")}
     for K, intensity in zip(gains, grid, strict=True):
-        right = expected(joint, intensity, NOISE, Ts)
+        Q = sum(q * unit[port] for port, q in intensity.items())
+        right = expected(joint, Q, NOISE, Ts)
         scale = np.abs(right).max(axis=1, keepdims=True)
         np.testing.assert_allclose(K / scale, right / scale, atol=2e-5, err_msg=str(intensity))
         assert np.abs(np.linalg.eigvals(Ad @ (np.eye(len(Ad)) - K @ C))).max() < 1

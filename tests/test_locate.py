@@ -136,9 +136,7 @@ def test_a_band_and_an_offset_are_named(moving) -> None:
     e = white(moving)
     e[:, 0] += 3e-3 * np.sin(2 * np.pi * 7.0 * moving.t)
     e[:, 1] += np.deg2rad(0.25)
-    told = {
-        w.channel: w for w in locate(moving, e, moving.channels, NOISE) if w.kind == "frequency"
-    }
+    told = {w.channel: w for w in locate(moving, e, moving.channels, NOISE) if w.kind == "frequency"}
     assert "lies between 5 and 10 Hz" in told["theta"].statement
     assert "is a constant offset of 0.25 deg" in told["alpha"].statement
     assert told["theta"].expected.sum() == pytest.approx(1.0)
@@ -212,9 +210,7 @@ def test_names_and_ports_of_another_machine() -> None:
     assert "of the motor error" in told
     assert "while load is beyond ±" in told
     rec = recording()
-    by_mechanism = [
-        v.phrases for v in views(rec, ("theta", "alpha"), noise, paper()) if v.kind == "speed"
-    ]
+    by_mechanism = [v.phrases for v in views(rec, ("theta", "alpha"), noise, paper()) if v.kind == "speed"]
     assert "while the hub turns forwards" in by_mechanism[0]
 
 

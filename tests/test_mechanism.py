@@ -140,9 +140,7 @@ def test_jit_and_gradient_pass_through_a_mechanism():
     found = dict(zip(joint.parameter_names, jax.tree.leaves(gradient), strict=True))
     for name, old in zip(joint.parameter_names, joint.values, strict=True):
         h = 1e-5 * abs(old) or 1e-7
-        up, down = (
-            simulate(joint.with_values({name: old + s * h}), noise(60), 0.01)[-1, 1] for s in (1, -1)
-        )
+        up, down = (simulate(joint.with_values({name: old + s * h}), noise(60), 0.01)[-1, 1] for s in (1, -1))
         expected = (up - down) / (2 * h)
         assert float(found[name]) == pytest.approx(expected, rel=1e-5, abs=1e-9), name
 

@@ -52,9 +52,7 @@ def test_recording_brings_its_channels_and_its_initial_samples(name: str) -> Non
     values = metric(recording, y_hat)
     assert list(values) == ["theta", "alpha"]
     assert all(type(value) is float for value in values.values())
-    np.testing.assert_array_equal(
-        list(values.values()), metric(recording.y, y_hat, recording.n_init)
-    )
+    np.testing.assert_array_equal(list(values.values()), metric(recording.y, y_hat, recording.n_init))
 
 
 def test_single_precision_stays_single() -> None:

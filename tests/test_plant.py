@@ -136,9 +136,7 @@ def test_a_stuck_port_does_not_creep(pulse):
     assert np.ptp(pulse[500:1000, 1]) == 0
     at_rest = p.simulate(
         BARE,
-        laws(
-            {(name, port): parameters((name, port)) for name, port in DEFAULTS if name == "coulomb"}
-        ),
+        laws({(name, port): parameters((name, port)) for name, port in DEFAULTS if name == "coulomb"}),
         np.full(2000, 0.1),
         2e-3,
         start=(0.0, 0.002, 0.0, 0.0),
@@ -183,9 +181,7 @@ def test_friction_and_dead_zone_are_odd():
 
 def test_halving_the_step_changes_nothing_that_an_encoder_sees():
     everything = {place: parameters(place) for place in DEFAULTS}
-    coarse, fine = (
-        p.simulate(p.Plant(), laws(everything), noise(4000), 2e-3, step=s) for s in (2e-5, 1e-5)
-    )
+    coarse, fine = (p.simulate(p.Plant(), laws(everything), noise(4000), 2e-3, step=s) for s in (2e-5, 1e-5))
     np.testing.assert_allclose(coarse[:, :2], fine[:, :2], atol=2e-5)
 
 
@@ -203,15 +199,11 @@ def test_springs_and_gravity_conserve_energy():
     spring = plant.K * alpha**2 / 2 + alpha**3 + 10 * alpha**4
     gravity = -0.03 * np.cos(theta + 0.6) - 0.05 * np.cos(theta + alpha - 0.4)
     assert np.ptp(spring) > 0.005 and np.ptp(gravity) > 0.005
-    np.testing.assert_allclose(
-        kinetic + spring + gravity, (kinetic + spring + gravity)[0], atol=1e-8
-    )
+    np.testing.assert_allclose(kinetic + spring + gravity, (kinetic + spring + gravity)[0], atol=1e-8)
 
 
 @pytest.mark.parametrize("port", ["hub", "arm"])
-@pytest.mark.parametrize(
-    "effect", ["coulomb", "coulomb_asymmetric", "stribeck", "viscous", "quadratic_drag"]
-)
+@pytest.mark.parametrize("effect", ["coulomb", "coulomb_asymmetric", "stribeck", "viscous", "quadratic_drag"])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_steady_turning_balances_the_torques(effect, port, sign):
     plant, given = p.Plant(), parameters((effect, port))
@@ -219,9 +211,7 @@ def test_steady_turning_balances_the_torques(effect, port, sign):
     speed = abs(x[2])
     resisting = {
         "coulomb": lambda level: level,
-        "coulomb_asymmetric": lambda level_plus, level_minus: (
-            level_plus if sign > 0 else level_minus
-        ),
+        "coulomb_asymmetric": lambda level_plus, level_minus: level_plus if sign > 0 else level_minus,
         "stribeck": lambda level, excess, speed: level + excess * np.exp(-((x[2] / speed) ** 2)),
         "viscous": lambda coefficient: coefficient * speed,
         "quadratic_drag": lambda coefficient: coefficient * speed**2,
@@ -289,19 +279,13 @@ def test_what_cannot_be_seen_cannot_be_seen():
     for effect, port in ABSORBED:
         value = parameters((effect, port))["coefficient"]
         damped = p.Plant(**{f"B_{port}": getattr(p.Plant(), f"B_{port}") + value})
-        hidden = p.simulate(
-            p.Plant(), laws({(effect, port): {"coefficient": value}}), noise(500), 2e-3
-        )
-        np.testing.assert_allclose(
-            p.simulate(damped, laws({}), noise(500), 2e-3), hidden, atol=1e-12
-        )
+        hidden = p.simulate(p.Plant(), laws({(effect, port): {"coefficient": value}}), noise(500), 2e-3)
+        np.testing.assert_allclose(p.simulate(damped, laws({}), noise(500), 2e-3), hidden, atol=1e-12)
     for (place, kinds), gain in zip(UNSEEN.items(), (0.8, 1.0), strict=True):
         for kind in kinds:
             u = make_record(kind=kind, seconds=2.0)["u"]
             hidden = p.simulate(BARE, laws({place: parameters(place)}), u, 2e-3)
-            np.testing.assert_allclose(
-                p.simulate(BARE, laws({}), gain * u, 2e-3), hidden, atol=1e-12
-            )
+            np.testing.assert_allclose(p.simulate(BARE, laws({}), gain * u, 2e-3), hidden, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", INPUTS)

@@ -35,9 +35,7 @@ def imports_of(file: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rotflex_jax."):
             found.add(str(node.module).partition(".")[2])
         elif isinstance(node, ast.Import):
-            found |= {
-                a.name.partition(".")[2] for a in node.names if a.name.startswith("rotflex_jax.")
-            }
+            found |= {a.name.partition(".")[2] for a in node.names if a.name.startswith("rotflex_jax.")}
     return found
 
 

@@ -134,11 +134,7 @@ def test_the_step_of_a_joint(which):
     with double_precision():
         step, *point = joint(CHUNK + 90)[which]
         way = tangent(tuple(point), 7)
-        found = jax.jit(lambda p, d: jax.jvp(functools.partial(states, step), p, d))(
-            tuple(point), way
-        )
-        expected = jax.jit(lambda p, d: jax.jvp(functools.partial(plain, step), p, d))(
-            tuple(point), way
-        )
+        found = jax.jit(lambda p, d: jax.jvp(functools.partial(states, step), p, d))(tuple(point), way)
+        expected = jax.jit(lambda p, d: jax.jvp(functools.partial(plain, step), p, d))(tuple(point), way)
     assert np.abs(expected[1]).max() > 0
     close(found, expected, rtol=1e-8)

@@ -55,9 +55,7 @@ def test_defaults_are_those_of_the_joint() -> None:
 @pytest.mark.parametrize(
     ("N", "period", "n_init"), [(4000, 0.002, 100), (200, 0.1, 10), (60, 0.002, 15), (52, 1.0, 10)]
 )
-def test_initial_samples_are_a_fifth_of_a_second_within_limits(
-    N: int, period: float, n_init: int
-) -> None:
+def test_initial_samples_are_a_fifth_of_a_second_within_limits(N: int, period: float, n_init: int) -> None:
     u, y = swinging(N)
     assert Recording(u=u, y=y, Ts=period).n_init == n_init
 
@@ -246,10 +244,7 @@ def test_held_voltage_is_no_clipped_one(u: np.ndarray) -> None:
 
 def test_units_are_doubted_by_size() -> None:
     u, y = swinging()
-    assert (
-        "looks like degrees"
-        in kinds(Recording(u=u, y=np.rad2deg(y), Ts=Ts))["units", "theta"].message
-    )
+    assert "looks like degrees" in kinds(Recording(u=u, y=np.rad2deg(y), Ts=Ts))["units", "theta"].message
     assert "millivolts" in kinds(Recording(u=1000 * u, y=y, Ts=Ts))["units", "voltage"].message
     assert kinds(Recording(u=u, y=1000 * y, Ts=Ts, units=("mm", "mm"))) == {}
 

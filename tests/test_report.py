@@ -145,9 +145,7 @@ def two_rounds() -> Discovery:
 def nothing() -> Discovery:
     full = two_rounds()
     base = full.final
-    even = locate(
-        full.test[0], full.test[0].y - base.windowed[0], ("theta", "alpha"), full.noise_floor
-    )
+    even = locate(full.test[0], full.test[0].y - base.windowed[0], ("theta", "alpha"), full.noise_floor)
     return dataclasses.replace(
         full,
         verdict="nothing_missing",
@@ -166,9 +164,7 @@ def one_channel() -> Discovery:
     error = 0.01 * np.sin(test.t)[:, None] + NOISE
     base = stage(single_inertia(), test, error, {"hub.inertia.inertia": 1e-5})
     where = locate(test, error, ("theta",), [0.0])
-    return Discovery(
-        "unexplained", "Something remains", (test,), (test,), base, (), (), where, {}, 1.0
-    )
+    return Discovery("unexplained", "Something remains", (test,), (test,), base, (), (), where, {}, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -327,9 +323,7 @@ def test_figures_leave_the_settings_of_matplotlib_alone(discovery) -> None:
     before = dict(matplotlib.rcParams)
     pictures(discovery)
     assert dict(matplotlib.rcParams) == before
-    assert (
-        "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
-    )
+    assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
 
 
 def test_degrees_are_drawn_where_angles_are_read(discovery) -> None:
@@ -385,14 +379,10 @@ def test_long_recordings_keep_the_page_small(discovery) -> None:
     test = moved(60_000, 0.002)
     rng = np.random.default_rng(2)
     stages = [
-        dataclasses.replace(
-            s, simulated=(), windowed=(test.y - 0.01 * rng.standard_normal(test.y.shape),)
-        )
+        dataclasses.replace(s, simulated=(), windowed=(test.y - 0.01 * rng.standard_normal(test.y.shape),))
         for s in discovery.stages
     ]
-    rounds = tuple(
-        dataclasses.replace(r, stage=s) for r, s in zip(discovery.rounds, stages[1:], strict=True)
-    )
+    rounds = tuple(dataclasses.replace(r, stage=s) for r, s in zip(discovery.rounds, stages[1:], strict=True))
     long = dataclasses.replace(discovery, test=(test,), baseline=stages[0], rounds=rounds)
     page = render(long)
     assert len(page) < 3e6
@@ -418,9 +408,7 @@ def test_a_browser_shows_the_page_without_complaint(discovery, tmp_path) -> None
         "--window-size=1000,2400",
         f"--screenshot={shot}",
     ]
-    done = subprocess.run(
-        [str(CHROMIUM), *flags, path.as_uri()], capture_output=True, text=True, timeout=120
-    )
+    done = subprocess.run([str(CHROMIUM), *flags, path.as_uri()], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "CONSOLE" not in done.stderr
     picture = image.imread(shot)

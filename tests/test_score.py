@@ -91,7 +91,7 @@ def test_what_is_in_the_hypothesis_is_scored_no_more(weak):
 
 def test_switched_off_it_is_the_baseline(weak):
     """Innovations of a free run are those of the baseline alone, to the last digits."""
-    judge, h, _ = weak
+    judge, _, _ = weak
     bench, s = judge.bench, judge.bench.supermodel
     off = sb.start(judge, places=())
     e = bench.innovations([off.lane(bench)])[0]
@@ -103,25 +103,29 @@ def test_switched_off_it_is_the_baseline(weak):
         np.testing.assert_allclose(e[r], data.y[r] - y_hat, atol=1e-11)
 
 
-def test_switched_on_it_is_the_clean_model(weak):
+@pytest.mark.parametrize(("friction", "exact"), [(False, 1e-9), (True, 1e-5)])
+def test_switched_on_it_is_the_clean_model(weak, friction, exact):
+    """To the last digits but where two contacts stop in one step, one of them switched off."""
     judge, h, _ = weak
     bench, s = judge.bench, judge.bench.supermodel
     numbers = {"hub.coulomb.level": 0.02, "joint.cubic_spring.stiffness": 30.0}
     z = Transform.of(s.mechanism.parameter_specifications).unconstrain(
         s.mechanism.with_values(numbers).values
     )
-    places = (sb.HUB, ("cubic_spring", "joint"))
+    places, by_hand = [("cubic_spring", "joint")], sb.baseline() + fx.CubicSpring("joint", 30.0)
+    if friction:
+        places, by_hand = [*places, sb.HUB], by_hand + fx.Coulomb("hub", 0.02)
     still = np.zeros((2, len(h.local)))
-    h = dataclasses.replace(sb.start(judge, places=places), z=z, own=still)
+    h = dataclasses.replace(sb.start(judge, places=tuple(places)), z=z, own=still)
     e = bench.innovations([h.lane(bench)])[0]
-    by_hand = sb.baseline() + fx.Coulomb("hub", 0.02) + fx.CubicSpring("joint", 30.0)
     clean = s.clean(h.values(bench)[0], places)
     assert clean.structure == by_hand.structure
     np.testing.assert_allclose(clean.values, by_hand.values, rtol=1e-9)
     data = bench.data
     y_hat = simulate(by_hand, data.u[1], float(data.Ts[1]), solver=sb.SOLVER)
-    assert np.abs(y_hat - simulate(sb.baseline(), data.u[1], float(data.Ts[1]))).max() > 0.01
-    np.testing.assert_allclose(e[1], data.y[1] - y_hat, atol=1e-9)
+    plain = simulate(sb.baseline(), data.u[1], float(data.Ts[1]), solver=sb.SOLVER)
+    assert np.abs(y_hat - plain).max() > 100 * exact
+    np.testing.assert_allclose(e[1], data.y[1] - y_hat, atol=exact)
 
 
 def test_a_super_model_holds_what_is_new_and_possible():
@@ -130,8 +134,10 @@ def test_a_super_model_holds_what_is_new_and_possible():
     s = build(paper(), [*wanted, (fx.DeadZone, "input")], whole)
     assert set(s.candidates) == {("gravity", "arm"), ("dead_zone", "input")}
     assert s.calibrations == CALIBRATIONS
-    assert [s.mechanism.parameter_names[i] for i in s.local] == [f"{at}.{n}.{p}" for n, at, p in (
-        ("voltage_offset", "input", "offset"), ("sensor_bias", "alpha", "bias"))]
+    assert [s.mechanism.parameter_names[i] for i in s.local] == [
+        f"{at}.{n}.{p}"
+        for n, at, p in (("voltage_offset", "input", "offset"), ("sensor_bias", "alpha", "bias"))
+    ]
     gates = s.gates([("gravity", "arm")])
     on = [e.name for e, g in zip(s.mechanism.effects, gates, strict=True) if g]
     assert on == [*(e.name for e in paper().effects), "gravity"]
@@ -153,7 +159,5 @@ def test_amplitudes_that_cannot_be_negative_are_not(one_sided):
         r = rng.normal(size=50) - J @ rng.normal(size=2)
         free = np.linalg.lstsq(J, -r, rcond=None)[0]
         signs.add(bool((free < 0).any()))
-        np.testing.assert_allclose(
-            _nonnegative(J, r, c), nnls(J, -r)[0] if one_sided else free, atol=1e-9
-        )
+        np.testing.assert_allclose(_nonnegative(J, r, c), nnls(J, -r)[0] if one_sided else free, atol=1e-9)
     assert signs == {True, False}

@@ -205,9 +205,7 @@ def test_locked_ringing(Ts, close):
         np.testing.assert_allclose(-np.diff(turns[turns > 2e-3]), 2 * 0.003 / K, atol=2e-5)
 
 
-@pytest.mark.parametrize(
-    "also", [[], [fx.Coulomb("joint", 0.003)], [fx.QuadraticDrag("hub", 0.01)]]
-)
+@pytest.mark.parametrize("also", [[], [fx.Coulomb("joint", 0.003)], [fx.QuadraticDrag("hub", 0.01)]])
 def test_breakaway_voltage(also):
     """Dead zone and friction add up: 0.1 + 0.03 / 0.2065 = 0.245278 V."""
     zone = fx.DeadZone(positive=0.1, negative=0.1)
@@ -360,8 +358,7 @@ def test_smooth_torques_converge_at_their_order(order, close):
     expected = Joint(extra=smooth_torques).run(u, Ts, start)[:, :2]
     joint = with_all(paper(), *SMOOTH)
     errors = [
-        np.abs(simulate(joint, u, Ts, start, Exponential(order, n)) - expected).max()
-        for n in (1, 2, 4)
+        np.abs(simulate(joint, u, Ts, start, Exponential(order, n)) - expected).max() for n in (1, 2, 4)
     ]
     assert errors[0] < close * 4
     for coarse, fine in itertools.pairwise(errors):
@@ -372,8 +369,7 @@ def test_runge_kutta_has_order_four_on_the_linear_joint():
     u, Ts = noise(100), 0.01
     exact = simulate(paper(), u, Ts)
     errors = [
-        np.abs(simulate(paper(), u, Ts, solver=SmoothRK4(substeps=n)) - exact).max()
-        for n in (1, 2, 4, 100)
+        np.abs(simulate(paper(), u, Ts, solver=SmoothRK4(substeps=n)) - exact).max() for n in (1, 2, 4, 100)
     ]
     assert errors[0] / errors[1] > 14 and errors[1] / errors[2] > 14
     assert errors[3] < 1e-11
@@ -399,9 +395,7 @@ def test_dahl_converges(presliding):
 
     for v in u:
         expected.append(x[:2])
-        run = solve_ivp(
-            flow, (0, Ts), x, "DOP853", rtol=1e-9, atol=1e-11, max_step=Ts / 3, args=(v,)
-        )
+        run = solve_ivp(flow, (0, Ts), x, "DOP853", rtol=1e-9, atol=1e-11, max_step=Ts / 3, args=(v,))
         x = run.y[:, -1]
     mine = paper() + fx.Dahl("hub", level, presliding)
     solvers = (Exponential(), Exponential(substeps=16), SmoothRK4(substeps=60))
@@ -518,15 +512,11 @@ def test_derivatives_of_a_trajectory_equal_central_differences(case):
         for i, name in enumerate(m.joint.parameter_names):
             # A step small enough that no stick or reversal moves to another sample.
             h = 1e-6 * abs(float(values[i]))
-            plus, minus = (
-                np.asarray(m.run(values.at[i].add(s * h), gates, u, x0)) for s in (1, -1)
-            )
+            plus, minus = (np.asarray(m.run(values.at[i].add(s * h), gates, u, x0)) for s in (1, -1))
             expected = (plus - minus) / (2 * h)
             size = np.abs(expected).max()
             assert size > 0, name
-            np.testing.assert_allclose(
-                forward[..., i], expected, rtol=0, atol=2e-5 * size, err_msg=name
-            )
+            np.testing.assert_allclose(forward[..., i], expected, rtol=0, atol=2e-5 * size, err_msg=name)
     if backward is not None:  # slow to compile; `memory` has dry friction too
         expected = np.einsum("nc,ncp->p", weights, forward)
         np.testing.assert_allclose(backward, expected, rtol=1e-8, atol=1e-10)

@@ -25,9 +25,7 @@ def noise(N: int, fs: float, rng: np.random.Generator, cutoff: float = 5.0) -> S
     return u
 
 
-def multisine(
-    N: int, fs: float, rng: np.random.Generator, band: tuple[float, float] = (0.1, 12.0)
-) -> Signal:
+def multisine(N: int, fs: float, rng: np.random.Generator, band: tuple[float, float] = (0.1, 12.0)) -> Signal:
     """Every harmonic of the record in `band` [Hz], equal amplitudes, random phases."""
     harmonics = np.arange(np.ceil(band[0] * N / fs), np.floor(band[1] * N / fs) + 1)
     spectrum = np.zeros(N // 2 + 1, dtype=complex)
@@ -48,9 +46,7 @@ def prbs(N: int, fs: float, rng: np.random.Generator, hold: float = 0.05) -> Sig
     return np.repeat(2.0 * np.array(bits) - 1.0, samples)[:N]
 
 
-def steps(
-    N: int, fs: float, rng: np.random.Generator, dwell: tuple[float, float] = (0.15, 0.8)
-) -> Signal:
+def steps(N: int, fs: float, rng: np.random.Generator, dwell: tuple[float, float] = (0.15, 0.8)) -> Signal:
     """Random levels, uniform with unit variance, each held for a random time [s]."""
     u = np.empty(N)
     k = 0

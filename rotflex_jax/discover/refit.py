@@ -37,9 +37,9 @@ class Judge:
     ports: tuple[str, ...]
 
     def directions(self) -> int:
-        """Directions per slope pass: enough for three effects on top of the baseline."""
+        """Directions per slope pass: enough for a few effects on top of the baseline."""
         s = self.bench.supermodel
-        most = len(s.baseline_free) + len(s.local) + 2 * len(s.baseline.coordinates) + 7
+        most = len(s.baseline_free) + len(s.local) + 2 * len(s.baseline.coordinates) + 4
         return -(-most // 4) * 4
 
     @property

@@ -12,6 +12,7 @@ import numpy as np
 from rotflex_jax.discover.lanes import Bench, Directions, Hypothesis, Lane
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.supermodel import Candidate, Place
+from rotflex_jax.effects import CATALOG
 
 # A plausible effect must be able to gain this much (chi-square) for a recording to show it.
 VISIBLE = 12.0
@@ -23,7 +24,8 @@ class Score:
 
     Attributes:
         place: Effect and port.
-        nats: Log-likelihood gained to first order, less half a log N per number it needs.
+        gain: Log-likelihood gained to first order [nat].
+        nats: The same, less half a log N per number it needs.
         start: Parameter values where a refit should start.
         excited: Whether an effect of plausible size would have been visible.
         unconfounded: Norm of the projected slope over the norm of the slope.
@@ -31,6 +33,7 @@ class Score:
     """
 
     place: Place
+    gain: float
     nats: float
     start: np.ndarray
     excited: bool
@@ -152,7 +155,7 @@ def _alternative(c: Candidate, shape: int, ground: _Ground) -> Score:
     J = np.array(ground.columns[(c.place, shape)]).T
     start = group[0].copy()
     if not np.all(np.isfinite(J)):
-        return Score(c.place, -np.inf, start, False, 0.0, np.inf)
+        return Score(c.place, -np.inf, -np.inf, start, False, 0.0, np.inf)
     full = np.linalg.norm(J, axis=0)
     J = J - ground.Q @ (ground.Q.T @ J)
     left = np.linalg.norm(J, axis=0)
@@ -165,6 +168,7 @@ def _alternative(c: Candidate, shape: int, ground: _Ground) -> Score:
     strongest = max(float(left.max()) * ground.headroom, 1e-300)
     return Score(
         c.place,
+        gain,
         gain - 0.5 * df * float(np.log(ground.samples)),
         start,
         excited=strongest**2 > VISIBLE,
@@ -185,3 +189,19 @@ def _nonnegative(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:
         drop = np.flatnonzero(keep)[np.argmin(part)]
         keep[drop] = False
     return a
+
+
+def promising(listed: list[Score], most: int) -> list[Score]:
+    """Scores worth a refit, best first.
+
+    A richer effect that gains nothing to first order over the simpler one it contains (a friction that
+    is the same both ways, say) would only be refitted to the same model.
+    """
+    gains = {s.place: s.gain for s in listed}
+    worth = []
+    for s in (s for s in listed if s.nats > 0):
+        name, port = s.place
+        simpler = [gains[c, port] for c in CATALOG[name].contains if (c, port) in gains]
+        if all(s.gain > g + 1.0 for g in simpler):
+            worth.append(s)
+    return worth[:most]

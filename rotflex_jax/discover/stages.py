@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.decide import Away, Trial
+from rotflex_jax.discover.heldout import Away, Trial
 from rotflex_jax.discover.lanes import Hypothesis, constrain
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Stage

@@ -27,7 +27,7 @@ def rough_state(structure: Mechanism, y: np.ndarray, Ts: float) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _refine(structure, solver, values, gates, guess, u, y, scale, Ts):  # noqa: ANN001, ANN202
+def _refine(structure, solver, values, gates, guess, u, y, Ts):  # noqa: ANN001, ANN202
     """Damped Gauss-Newton on all stretches at once.
 
     Slopes are secants: stretches are short, and the derivative of the simulation would take longer to
@@ -35,7 +35,7 @@ def _refine(structure, solver, values, gates, guess, u, y, scale, Ts):  # noqa: 
     """
     W, m = guess.shape
     rest = jnp.asarray(rest_state(structure, np.float64))[m:]
-    reach = 1e-6 * jnp.maximum(jnp.max(jnp.abs(guess)), 1.0)
+    reach = 1e-6
     nudges = jnp.concatenate([jnp.zeros((1, m)), reach * jnp.eye(m)])
     run = functools.partial(free_run, structure, solver)
     runs = jax.vmap(run, in_axes=(None, None, 0, 0, None))
@@ -45,8 +45,7 @@ def _refine(structure, solver, values, gates, guess, u, y, scale, Ts):  # noqa: 
         flat = states.reshape(W * V, m)
         start = jnp.concatenate([flat, jnp.broadcast_to(rest, (W * V, len(rest)))], axis=1)
         y_hat = runs(values, gates, start, jnp.repeat(u, V, axis=0), Ts)[1]
-        e = (y_hat.reshape(W, V, *y.shape[1:]) - y[:, None]) / scale[None, None, None]
-        return e.reshape(W, V, -1)
+        return (y_hat.reshape(W, V, *y.shape[1:]) - y[:, None]).reshape(W, V, -1)
 
     def iterate(_, state):  # noqa: ANN001, ANN202
         s, damping, previous, kept = state
@@ -58,7 +57,7 @@ def _refine(structure, solver, values, gates, guess, u, y, scale, Ts):  # noqa: 
         kept = jnp.where(better[:, None], s, kept)
         H = jnp.einsum("wik,wjk->wij", J, J)
         # A trace of damping also decides what a stretch cannot tell: such directions stay put.
-        D = jnp.diagonal(H, axis1=1, axis2=2) * damping[:, None] + 1e-9 * jnp.max(H)
+        D = jnp.diagonal(H, axis1=1, axis2=2) * damping[:, None] + 1e-9 * jnp.max(H, axis=(1, 2))[:, None]
         step = jnp.linalg.solve(
             H + D[:, :, None] * jnp.eye(m)[None], -jnp.einsum("wik,wk->wi", J, r)[..., None]
         )
@@ -77,9 +76,9 @@ def initial_states(
     y: np.ndarray,
     Ts: float,
 ) -> np.ndarray:
-    """First positions and speeds (W, 2 n) of W stretches of a recording.
+    """First positions and speeds (W, 2 n) of W stretches of a recording, each by itself.
 
-    Memories and motor current start at rest.
+    Errors of the channels count in their own units. Memories and motor current start at rest.
 
     Args:
         mechanism: Model.
@@ -91,8 +90,6 @@ def initial_states(
     """
     structure = mechanism.structure
     guess = np.array([rough_state(structure, stretch, Ts) for stretch in y])
-    spread = np.std(y.reshape(-1, y.shape[-1]), axis=0)
-    scale = np.where(spread > 0, spread, 1.0)
     with double_precision():
-        arrays = map(jnp.asarray, (mechanism.values, gates, guess, u, y, scale, np.float64(Ts)))
+        arrays = map(jnp.asarray, (mechanism.values, gates, guess, u, y, np.float64(Ts)))
         return np.asarray(_refine(structure, solver, *arrays))

@@ -1,0 +1,224 @@
+"""The toolkit's own batched least squares against SciPy's, and what a refit must never do."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import small_bench as sb
+from scipy.optimize import least_squares
+
+from rotflex_jax.discover.refit import (
+    LONGEST,
+    _grid,
+    _moved,
+    choose_process_noise,
+    levenberg_marquardt,
+    normal_equations,
+    refit,
+)
+from rotflex_jax.discover.score import _expanded
+from rotflex_jax.parameters import Transform
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """Recordings of the baseline itself, and the baseline at its optimum."""
+    judge = sb.judge(sb.recordings(sb.records(0.0)))
+    return judge, sb.fitted(judge)
+
+
+@pytest.fixture(scope="module")
+def rough():
+    """Recordings with friction."""
+    return sb.judge(sb.recordings(sb.records(0.02)))
+
+
+def with_friction(judge, level: float):
+    """The true structure, friction free."""
+    s, h = judge.bench.supermodel, sb.start(judge, wrong=0.05)
+    i = s.parameter_indices(sb.HUB)[0]
+    z = h.z.copy()
+    spec = s.mechanism.parameter_specifications[i]
+    z[i] = Transform.of([spec]).unconstrain(np.array([level]))[0]
+    return dataclasses.replace(h, places=(*h.places, sb.HUB), free=(*h.free, i), z=z)
+
+
+def at(h, numbers: np.ndarray):
+    """The hypothesis at other numbers: common, then for each recording its own and its first state."""
+    shared, R = len(h.free), len(h.x0)
+    z = h.z.copy()
+    z[list(h.free)] = numbers[:shared]
+    rest = numbers[shared:].reshape(R, -1)
+    return dataclasses.replace(h, z=z, own=rest[:, : len(h.local)], x0=rest[:, len(h.local) :])
+
+
+def numbers_of(h) -> np.ndarray:
+    return np.concatenate([h.z[list(h.free)], np.hstack([h.own, h.x0]).ravel()])
+
+
+def cost(judge, h, whitener) -> float:
+    e = judge.bench.innovations([h.lane(judge.bench)])[0]
+    return 0.5 * float(np.sum(whitener(e, judge.bench.data.seen) ** 2))
+
+
+def test_slopes_are_those_of_the_innovations(rough):
+    """Every direction that a fit moves, against differences."""
+    bench, h = rough.bench, with_friction(rough, 0.02)
+    h = rough.with_process_noise(h, {"hub": 1e-4 * rough.torque**2 * 0.0025, "joint": 1e-9})
+    own = np.array([[0.01, 0.002], [-0.02, 0.001]])
+    h = dataclasses.replace(h, own=own, x0=np.full((2, 4), 0.01))
+    count = rough.directions()
+    _, J = bench.slopes([h.lane(bench)], [h.directions(bench, count)])
+    assert (J[0, h.moved :] == 0).all()
+    point, shared, each, step = numbers_of(h), len(h.free), h.moved - len(h.free), 1e-6
+    for k in range(h.moved):
+        nudge = np.zeros_like(point)
+        # Local numbers and first states move in both recordings together.
+        nudge[[k] if k < shared else [k, k + each]] = step
+        up, down = (at(h, point + way * nudge).lane(bench) for way in (1, -1))
+        e = bench.innovations([up, down])
+        expected = (e[0] - e[1]) / (2 * step)
+        # Friction switches at a sample here and there; differences see that as a jump.
+        close = np.abs(J[0, k] - expected) < 1e-4 * np.abs(expected).max()
+        assert close.mean() > 0.98, k
+
+
+def test_normal_equations_are_those_of_the_whole_matrix(plain):
+    _, h = plain
+    rng = np.random.default_rng(0)
+    w, W = rng.normal(size=(2, 30, 2)), rng.normal(size=(h.moved, 2, 30, 2))
+    H, g = normal_equations(h, w, W)
+    rows = _expanded(h, W)
+    shared, each = len(h.free), h.moved - len(h.free)
+    # `_expanded` has recordings innermost, the normal equations outermost.
+    order = [*range(shared), *(shared + 2 * k + r for r in range(2) for k in range(each))]
+    rows = rows[order]
+    np.testing.assert_allclose(H, rows @ rows.T, atol=1e-10)
+    np.testing.assert_allclose(g, rows @ w.ravel(), atol=1e-10)
+
+
+@pytest.mark.parametrize("intensity", [0.0, 1e-4], ids=["free run", "predictor"])
+def test_the_optimum_is_that_of_scipy(rough, intensity):
+    h = with_friction(rough, 0.01)
+    h = rough.with_process_noise(h, dict.fromkeys(rough.ports, intensity * rough.horizon[1]))
+    found = levenberg_marquardt(rough, [h], steps=30)[0]
+    bench, seen = rough.bench, rough.bench.data.seen
+
+    def residuals(numbers):
+        e = bench.innovations([at(h, numbers).lane(bench)])[0]
+        return h.whitener(e, seen).ravel()
+
+    def slopes(numbers):
+        """By differences, several at a time."""
+        step = 1e-6
+        lanes = [at(h, numbers + step * row).lane(bench) for row in np.eye(len(numbers))]
+        e = bench.innovations([at(h, numbers).lane(bench), *lanes])
+        w = h.whitener(e, seen).reshape(len(e), -1)
+        return (w[1:] - w[0]).T / step
+
+    # From the other side, so that the two do not share a path.
+    start = numbers_of(found) + 0.02
+    best = least_squares(residuals, start, jac=slopes, x_scale="jac", xtol=1e-10, ftol=1e-10)
+    assert cost(rough, found, h.whitener) < best.cost + 0.5
+    assert cost(rough, found, h.whitener) > best.cost - 0.5
+    assert cost(rough, found, h.whitener) < cost(rough, h, h.whitener) - 100
+    mine, theirs = found.values(bench)[0], at(h, best.x).values(bench)[0]
+    free = list(h.free)
+    np.testing.assert_allclose(mine[free], theirs[free], rtol=0.02)
+
+
+def test_side_by_side_is_the_same_as_alone(rough):
+    starts = [with_friction(rough, 0.005), sb.start(rough, wrong=0.1), with_friction(rough, 0.05)]
+    together = levenberg_marquardt(rough, starts)
+    for h, one in zip(together, starts, strict=True):
+        alone = levenberg_marquardt(rough, [one])[0]
+        np.testing.assert_allclose(h.log_likelihood, alone.log_likelihood, rtol=1e-9)
+        np.testing.assert_allclose(h.z, alone.z, rtol=1e-6, atol=1e-9)
+
+
+def test_the_truth_is_recovered(rough):
+    found = refit(rough, [with_friction(rough, 0.008)])[0]
+    values = found.values(rough.bench)
+    s = rough.bench.supermodel
+    level, bias = s.parameter_indices(sb.HUB)[0], s.parameter_indices(("voltage_offset", "input"))[0]
+    assert values[0, level] == pytest.approx(0.02, rel=0.05)
+    # Each recording has an offset of its own; the numbers of the machine are common.
+    np.testing.assert_allclose(values[:, bias], [0.02, -0.02], atol=0.006)
+    assert np.ptp(values[:, list(found.free)], axis=0).max() == 0
+
+
+def test_the_likelihood_never_falls(rough):
+    starts = [with_friction(rough, 0.05), sb.start(rough, wrong=0.1)]
+    e = rough.bench.innovations([h.lane(rough.bench) for h in starts])
+    before = [rough.judged(h, x).log_likelihood for h, x in zip(starts, e, strict=True)]
+    one = levenberg_marquardt(rough, starts)
+    for h, ll in zip(one, before, strict=True):
+        assert h.log_likelihood >= ll
+    for h, ll in zip(refit(rough, one, turns=2), [h.log_likelihood for h in one], strict=True):
+        assert h.log_likelihood >= ll
+    # At the optimum there is nothing to gain.
+    again = levenberg_marquardt(rough, levenberg_marquardt(rough, one))
+    last = levenberg_marquardt(rough, again)
+    for a, b in zip(again, last, strict=True):
+        assert 0 <= b.log_likelihood - a.log_likelihood < 1.0
+
+
+def test_each_step_lowers_the_cost(rough):
+    """Also from so far off that a whole step leads astray."""
+    starts = [sb.start(rough, wrong=-0.7), sb.start(rough, wrong=5.0)]
+    costs = [[cost(rough, h, h.whitener) for h in starts]]
+    for steps in range(1, 5):
+        now = levenberg_marquardt(rough, starts, steps=steps)
+        costs.append([cost(rough, h, s.whitener) for h, s in zip(now, starts, strict=True)])
+    assert (np.diff(costs, axis=0) < 0).all()
+
+
+def test_more_freedom_is_never_less_likely(rough):
+    small = levenberg_marquardt(rough, [sb.start(rough)])[0]
+    i = rough.bench.supermodel.parameter_indices(sb.HUB)[0]
+    z = small.z.copy()
+    z[i] = np.log(1e-3)
+    large = dataclasses.replace(small, places=(*small.places, sb.HUB), free=(*small.free, i), z=z)
+    assert refit(rough, [large])[0].log_likelihood > small.log_likelihood + 50
+
+
+def test_process_noise_is_nil_where_the_model_is_right_and_not_where_it_is_wrong(plain, rough):
+    judge, right = plain
+    least, most = judge.horizon
+    settled = choose_process_noise(judge, right, wide=True)
+    assert settled.process_noise["hub"] < 1e-4 * most
+    assert settled.log_likelihood < right.log_likelihood + 5
+    wrong = levenberg_marquardt(rough, [sb.start(rough)])[0]
+    moved = choose_process_noise(rough, wrong, wide=True)
+    assert moved.process_noise["hub"] > 1e-3 * most
+    assert moved.log_likelihood > wrong.log_likelihood + 100
+    for h in (settled, moved):
+        assert all(least <= q <= most for q in h.process_noise.values())
+    # The gain is that of the intensity it names.
+    np.testing.assert_allclose(rough.gains(moved, [moved.process_noise])[0], moved.K, rtol=1e-9)
+
+
+def test_one_step_is_no_longer_than_allowed(plain):
+    _, h = plain
+    far = _moved(h, np.full(len(numbers_of(h)), 50.0))
+    free = list(h.free)
+    np.testing.assert_allclose(far.z[free] - h.z[free], LONGEST)
+    np.testing.assert_allclose(far.own - h.own, LONGEST)
+    held = [i for i in range(len(h.z)) if i not in h.free]
+    np.testing.assert_array_equal(far.z[held], h.z[held])
+
+
+def test_grid_of_intensities():
+    two = _grid({"hub": 1.0, "joint": 10.0}, (0.1, 1.0))
+    assert sorted((q["hub"], q["joint"]) for q in two) == [(0.1, 1), (0.1, 10), (1, 1), (1, 10)]
+    three = _grid({"a": 1.0, "b": 1.0, "c": 1.0}, (0.5, 2.0))
+    assert len(three) == 6 and all(sorted(q.values())[1] == 1.0 for q in three)
+
+
+def test_a_start_from_which_nothing_is_finite_is_left_alone(rough):
+    """Numbers that overflow stay the unlikeliest, and do not stop the others."""
+    good, bad = with_friction(rough, 0.01), sb.start(rough)
+    bad = dataclasses.replace(bad, x0=np.full((2, 4), np.nan))
+    one, other = levenberg_marquardt(rough, [good, bad])
+    assert np.isfinite(one.log_likelihood)
+    assert other.log_likelihood == -np.inf
