@@ -131,6 +131,21 @@ class Estimate:
     free: bool = True
     note: str = ""
 
+    @classmethod
+    def of(cls, name: str, value: float, std: float, spec: Specification, note: str = "") -> "Estimate":
+        """A fitted parameter with its 95 % interval and what its numbers say of themselves."""
+        low, high = spec.physical
+        remarks = [note] if note else []
+        if not low <= value <= high:
+            remarks.append("outside its physical range")
+        if math.isnan(std):
+            remarks.append("not determined by these data")
+        elif math.isfinite(spec.lower) and value - spec.lower < 1e-6 * spec.typical:
+            remarks.append("at its lower bound")
+        return cls(
+            name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note="; ".join(remarks)
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""
         return {

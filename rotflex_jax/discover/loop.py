@@ -144,7 +144,7 @@ def discover(
             stage=stage,
             score=dict(taken)[place] if place in dict(taken) else worth[place],
             held_out_gain_nats=stage.log_likelihood - before.log_likelihood,
-            sentence=stage.model.mechanism.effect(*place).sentence(),
+            sentence=stages[-1].model.mechanism.effect(*place).sentence(),
             equation=CATALOG[place[0]].equation,
         )
         for place, before, stage in zip(order, stages, stages[1:], strict=False)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.decide import TRAIN_NATS, told_apart
-from rotflex_jax.discover.heldout import Away, held_out
+from rotflex_jax.discover.decide import TRAIN_NATS, TRAIN_Z, lead, told_apart
+from rotflex_jax.discover.heldout import Away, held_out, in_blocks
 from rotflex_jax.discover.lanes import Hypothesis
 from rotflex_jax.discover.refit import Judge, refit
 from rotflex_jax.discover.score import Score
@@ -128,6 +128,10 @@ def eliminate(
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)}
         each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
         surplus = {p: worth[p] - TRAIN_NATS - 0.5 * each[p] * np.log(samples) for p in worth}
+        for p, r in zip(on_trial, rivals, strict=True):
+            # What a few moments of the recording want, the recording does not.
+            if lead(*(in_blocks(x.densities, judge.bench.data) for x in (h, r)))[1] < TRAIN_Z:
+                surplus[p] = min(surplus[p], -1.0)
         weakest = min(surplus, key=lambda p: surplus[p])
         if surplus[weakest] >= 0:
             return h, worth

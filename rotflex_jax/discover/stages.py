@@ -109,13 +109,9 @@ class Scribe:
                 out.append(Estimate(name, value, nan, (nan, nan), spec.unit, free=False))
                 continue
             std = float(np.sqrt(max(weight @ covariance[np.ix_(rows, rows)] @ weight, 0.0)))
-            low, high = spec.physical
-            note = "" if low <= value <= high else "outside its physical range"
-            if i in h.local and R > 1:
-                note = "mean of " + ", ".join(f"{v:.3g}" for v in values[:, i])
-            out.append(
-                Estimate(name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note)
-            )
+            each_own = i in h.local and R > 1
+            note = "mean of " + ", ".join(f"{v:.3g}" for v in values[:, i]) if each_own else ""
+            out.append(Estimate.of(name, value, std, spec, note))
         return tuple(out)
 
     def own_estimates(self, stage: Stage, place: Place) -> dict[str, Estimate]:

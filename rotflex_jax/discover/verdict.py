@@ -35,7 +35,7 @@ def judge_end(
     seconds = final.window_seconds
     left = ", ".join(f"{c} {r:.2f}" for c, r in ratios.items())
     reached = f"the held-out error over {seconds:g} s is {left} times the sensor noise"
-    names = " and ".join(f"{r.effect} at {r.port}" for r in rounds)
+    names = " and ".join(f"{r.effect.replace('_', ' ')} at the {r.port}" for r in rounds)
     visible = [s for s in ranking if s.excited]
     unseen = len(ranking) - len(visible)
     if not explained:

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+# Relative curvature below which a combination of parameters counts as not determined.
+UNSEEN = 1e-11
+
 
 def correlation_length(e: np.ndarray) -> int:
     """Samples after which the autocorrelation of residuals (N, C) stays small; at most N / 10."""
@@ -33,7 +36,8 @@ def sandwich(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
         segments: Number of the recording each sample belongs to (N,); products do not cross recordings.
 
     Returns:
-        Covariance (D, D); nan where the residuals are not finite.
+        Covariance (D, D); nan where the residuals are not finite, and for parameters that the data do not
+        determine.
 
     Source: Newey and West 1987, Econometrica 55.
     """
@@ -51,6 +55,14 @@ def sandwich(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
         total = np.cumsum(padded, axis=0)
         sums = total[width:] - total[:-width]
         S += sums.T @ sums / width
+    # In units in which each parameter alone is as well determined as any other, an eigenvalue at the
+    # level of rounding is a direction that the data do not see: no interval, rather than a narrow one.
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(H / np.outer(size, size))
+    blind = eigenvalues < UNSEEN
+    inverse = (vectors / np.where(blind, np.inf, eigenvalues)) @ vectors.T / np.outer(size, size)
     n, k = len(scores), D
-    inverse = np.linalg.pinv(H, rcond=1e-14, hermitian=True)
-    return inverse @ S @ inverse * (n / max(n - k, 1))
+    covariance = inverse @ S @ inverse * (n / max(n - k, 1))
+    lost = (np.abs(vectors[:, blind]) > 1e-3).any(axis=1) | (np.diag(H) <= 0)
+    covariance[lost, :] = covariance[:, lost] = np.nan
+    return covariance

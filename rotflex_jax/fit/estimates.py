@@ -47,11 +47,7 @@ def report(
         rows = [int(np.flatnonzero(index == k)[0]) for k in own]
         weights = np.array([dp[i] for _ in own]) / len(own)
         std = float(np.sqrt(weights @ covariance[np.ix_(rows, rows)] @ weights))
-        low, high = spec.physical
-        note = "" if low <= value <= high else "outside its physical range"
-        estimates.append(
-            Estimate(name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note=note)
-        )
+        estimates.append(Estimate.of(name, value, std, spec))
         free.append(name)
         places.append((rows[0], dp[i]))
     rows = [r for r, _ in places]

@@ -187,7 +187,7 @@ def _levenberg_marquardt(
         return flat, cost, 0, "diverged: the model error at the start is not finite"
     used, status = 0, f"stopped after {max_steps} steps"
     while used < max_steps:
-        new, new_cost, steps, result = _some_steps(problem, moved, args, 6)
+        new, new_cost, steps, result = _some_steps(problem, moved, args, min(6, max_steps - used))
         used += int(steps)
         gain = cost - float(new_cost)
         if gain > 0:
