@@ -46,6 +46,7 @@ def build(script: Path, timeout: float) -> None:
         notebook,
         timeout=timeout,
         kernel_name="python3",
+        coalesce_streams=True,
         resources={"metadata": {"path": str(FOLDER)}},
     ).execute()
     for number, cell in enumerate(notebook.cells):

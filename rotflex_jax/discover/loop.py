@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.decide import choose, describe, samples_of
+from rotflex_jax.discover.decide import WINDOWS_BETTER, choose, describe, samples_of
 from rotflex_jax.discover.heldout import Away, Trial, held_out
 from rotflex_jax.discover.lanes import Bench, Hypothesis
 from rotflex_jax.discover.locate import locate
@@ -178,7 +178,7 @@ def discover(
 def _carried_over(away: Away, final: Trial, order: list[Place]) -> tuple[list[Place], list[Place]]:
     """Effects of the machine, and calibrations that belong to the training recordings alone.
 
-    A calibration is one of the machine if its trained value makes the held-out free runs better.
+    A calibration is one of the machine if its trained value makes the held-out free runs clearly better.
     """
     kept, own = list(order), []
     for place in [p for p in order if p in CALIBRATIONS]:
@@ -191,7 +191,7 @@ def _carried_over(away: Away, final: Trial, order: list[Place]) -> tuple[list[Pl
             )
             for places in (kept, [p for p in kept if p != place])
         )
-        if float(np.mean(np.log(with_it / without))) >= 0:
+        if float(np.mean(np.log(with_it / without))) > -WINDOWS_BETTER:
             kept.remove(place)
             own.append(place)
     return kept, own

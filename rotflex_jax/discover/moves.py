@@ -129,6 +129,8 @@ def eliminate(
         each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
         surplus = {p: worth[p] - TRAIN_NATS - 0.5 * each[p] * np.log(samples) for p in worth}
         for p, r in zip(on_trial, rivals, strict=True):
+            if p in CALIBRATIONS:
+                continue
             # What a few moments of the recording want, the recording does not.
             if lead(*(in_blocks(x.densities, judge.bench.data) for x in (h, r)))[1] < TRAIN_Z:
                 surplus[p] = min(surplus[p], -1.0)

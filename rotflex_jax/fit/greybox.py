@@ -187,13 +187,14 @@ def _levenberg_marquardt(
         return flat, cost, 0, "diverged: the model error at the start is not finite"
     used, status = 0, f"stopped after {max_steps} steps"
     while used < max_steps:
-        new, new_cost, steps, result = _some_steps(problem, moved, args, min(6, max_steps - used))
+        count = min(6, max_steps - used)
+        new, new_cost, steps, result = _some_steps(problem, moved, args, count)
         used += int(steps)
         gain = cost - float(new_cost)
         if gain > 0:
             moved, cost = new, float(new_cost)
         say(f"fit: {used} steps, cost {cost:.1f}")
-        if not gain > NATS:
+        if not gain > NATS and count == 6:
             bad = result not in (optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
             status = str(result) if bad else "converged"
             break
