@@ -53,7 +53,7 @@ def _refine(structure, solver, values, gates, guess, u, y, Ts):  # noqa: ANN001,
         r, J = e[:, 0], (e[:, 1:] - e[:, :1]) / reach
         cost = jnp.sum(r**2, axis=1)
         better = cost <= previous
-        damping = jnp.where(better, damping / 10, damping * 100)
+        damping = jnp.where(better, damping / 10, damping * 10)
         kept = jnp.where(better[:, None], s, kept)
         H = jnp.einsum("wik,wjk->wij", J, J)
         # A trace of damping also decides what a stretch cannot tell: such directions stay put.
@@ -65,7 +65,7 @@ def _refine(structure, solver, values, gates, guess, u, y, Ts):  # noqa: ANN001,
         return moved, damping, jnp.minimum(cost, previous), kept
 
     start = (guess, jnp.full(W, 1e-2), jnp.full(W, jnp.inf), guess)
-    return jax.lax.fori_loop(0, 8, iterate, start)[3]
+    return jax.lax.fori_loop(0, 25, iterate, start)[3]
 
 
 def initial_states(
