@@ -191,8 +191,6 @@ def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants, pas
     late = c.h / 2 * (found.t * v0 + (1 - found.t) * v1 - v0 - v1)
     curved = c.h / 2 * (v0 + v1) - (q1 - q0)
     shift = late + (1 - found.t) * found.holds * curved
-    up, down = levels
-    stopped = found.crossed & (up + down > 0)
-    impulse = solve_masked(c.mobility[:k, :k], stopped, shift, jnp.zeros_like(shift))
+    impulse = solve_masked(c.mobility[:k, :k], found.crossed, shift, jnp.zeros_like(shift))
     moved = apply(c.push[:, :k], impulse)
     return jnp.concatenate([end[:n] + moved, end[n:]])
