@@ -36,7 +36,7 @@ def report(
     fitted = m.with_values(values.mean(axis=0))
     covariance = sandwich(slopes, residual, segments)
     estimates, free, places = [], [], []
-    dp = _stretch(coordinates, flat)
+    dp = coordinates.transform.physical(flat[: coordinates.parameters])[1]
     for i, (name, spec) in enumerate(zip(m.parameter_names, m.parameter_specifications, strict=True)):
         value = float(values[:, i].mean())
         if name in m.trusted:
@@ -67,12 +67,6 @@ def report(
         history=tuple(history),
         weakest=_weakest(slopes[:, :, rows], free),
     )
-
-
-def _stretch(coordinates: Coordinates, flat: np.ndarray) -> np.ndarray:
-    """dp/dz of each parameter at the fitted values."""
-    z = jnp.asarray(flat[: coordinates.parameters])
-    return np.asarray(jax.jvp(coordinates.transform.constrain, (z,), (jnp.ones_like(z),))[1])
 
 
 def _weakest(slopes: np.ndarray, names: list[str]) -> dict[str, float]:

@@ -31,6 +31,7 @@ from rotflex_jax.report.wording import (
     plain_number,
     readable,
     sentence,
+    standing,
     together,
     units,
     value_and_interval,
@@ -161,15 +162,7 @@ def _ranked(discovery: Discovery, r: Ranked) -> dict[str, str]:
     pair = (r.effect, r.port)
     found = [(t.effect, t.port) for t in discovery.rounds]
     alike = [p for t in discovery.rounds for p in t.equivalent]
-    state = (
-        "found"
-        if pair in found
-        else "cannot be told from what was found"
-        if pair in alike
-        else "not added"
-        if r.excited
-        else "not excited"
-    )
+    state = standing(r, found, alike)
     return {
         "label": effect_label(*pair),
         "title": effect_title(r.effect),

@@ -22,7 +22,7 @@ from rotflex_jax.report.style import (
     styled,
 )
 from rotflex_jax.report.tables import stage_labels
-from rotflex_jax.report.wording import effect_label, plain_number, readable, units
+from rotflex_jax.report.wording import effect_label, plain_number, readable, standing, units
 
 MOST_BARS = 14
 
@@ -44,16 +44,7 @@ def ranking(discovery: Discovery) -> Figure | None:
         "not excited by this recording": ("#dfe4e8", 1.0),
     }
     for k, r in enumerate(listed):
-        pair = (r.effect, r.port)
-        group = (
-            "found"
-            if pair in found
-            else "cannot be told from what was found"
-            if pair in alike
-            else "not added"
-            if r.excited
-            else "not excited by this recording"
-        )
+        group = standing(r, found, alike).replace("not excited", "not excited by this recording")
         colour, strength = groups[group]
         ax.barh(k, r.score, 0.72, color=colour, alpha=strength, label=group)
         ax.annotate(

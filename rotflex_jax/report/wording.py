@@ -2,9 +2,10 @@
 
 import math
 import re
+from collections.abc import Collection
 
 from rotflex_jax.discover.looks import as_read
-from rotflex_jax.discover.result import Discovery
+from rotflex_jax.discover.result import Discovery, Ranked
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.parameters import Estimate
 
@@ -195,3 +196,13 @@ def next_steps(discovery: Discovery) -> list[str]:
             "a recording with more motion would decide on them, too."
         )
     return steps
+
+
+def standing(r: Ranked, found: Collection[tuple[str, str]], alike: Collection[tuple[str, str]]) -> str:
+    """How a candidate stands at the end of the search, given the pairs found and those like them."""
+    pair = (r.effect, r.port)
+    if pair in found:
+        return "found"
+    if pair in alike:
+        return "cannot be told from what was found"
+    return "not added" if r.excited else "not excited"
