@@ -66,14 +66,29 @@ class Model:
     def _switches(self) -> np.ndarray:
         return np.ones(len(self.mechanism.effects)) if self.gates is None else np.array(self.gates)
 
-    def _starts(self, u: np.ndarray, y: np.ndarray, Ts: float) -> np.ndarray:
-        return initial_states(self.mechanism, self.solver, self._switches(), u, y, Ts)
+    def _starts(
+        self, u: np.ndarray, y: np.ndarray, Ts: float, hidden: np.ndarray | None = None
+    ) -> np.ndarray:
+        return initial_states(self.mechanism, self.solver, self._switches(), u, y, Ts, hidden)
 
-    def _full(self, start: np.ndarray) -> np.ndarray:
-        rest = rest_state(self.mechanism.structure, np.float64)
-        full = np.tile(rest, (len(start), 1))
-        full[:, : start.shape[1]] = start
-        return full
+    def _start(self, recording: Recording) -> np.ndarray:
+        """State at the beginning of a recording, from its first `n_init` samples."""
+        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        m = recording.n_init
+        return self._starts(u[None, :m], y[None, :m], recording.Ts)[0]
+
+    def _run(self, recording: Recording, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (N, n) and outputs (N, C) of a free run."""
+        with double_precision():
+            run = _free(
+                self.mechanism.structure,
+                self.solver,
+                *self._arguments(),
+                jnp.asarray(start),
+                jnp.asarray(recording.u.astype(float)),
+                jnp.asarray(float(recording.Ts)),
+            )
+            return np.asarray(run[0]), np.asarray(run[1])
 
     def simulate(self, recording: Recording, x0: np.ndarray | None = None) -> np.ndarray:
         """Free run over a recording: outputs (N, C) from its voltage alone.
@@ -85,26 +100,19 @@ class Model:
             recording: Its voltage drives the model.
             x0: First positions and speeds, where they are known.
         """
-        u, y = recording.u.astype(float), self.measured(recording).astype(float)
         if x0 is None:
-            m = recording.n_init
-            x0 = self._starts(u[None, :m], y[None, :m], recording.Ts)[0]
-        with double_precision():
-            run = _free(
-                self.mechanism.structure,
-                self.solver,
-                *self._arguments(),
-                jnp.asarray(self._full(np.asarray(x0, float)[None])[0]),
-                jnp.asarray(u),
-                jnp.asarray(float(recording.Ts)),
-            )
-            return np.asarray(run[1])
+            return self._run(recording, self._start(recording))[1]
+        start = rest_state(self.mechanism.structure, np.float64)
+        start[: len(x0)] = x0
+        return self._run(recording, start)[1]
 
     def simulate_windows(self, recording: Recording, seconds: float = 2.0) -> np.ndarray:
         """Free runs that start anew every few seconds: outputs (N, C).
 
-        Each starts from the state that the first `n_init` samples of its window tell. The servo angle
-        integrates every small torque error, so one long run hides where the error is made.
+        Each starts from the positions and speeds that the first `n_init` samples of its window tell.
+        What no sensor shows (memories, motor current) is as a free run from the beginning has it by
+        then. The servo angle integrates every small torque error, so one long run hides where the
+        error is made.
 
         Args:
             recording: Its voltage drives the model.
@@ -115,14 +123,18 @@ class Model:
         pick = starts[:, None] + np.arange(length)[None, :]
         inside = np.minimum(pick, len(u) - 1)
         m = recording.n_init
-        head = inside[:, :m]
-        x0 = self._starts(u[head], y[head], recording.Ts)
+        head, moving = inside[:, :m], 2 * len(self.mechanism.coordinates)
+        hidden = None
+        if len(rest_state(self.mechanism.structure, np.float64)) > moving:
+            states = self._run(recording, self._start(recording))[0]
+            hidden = states[starts, moving:]
+        x0 = self._starts(u[head], y[head], recording.Ts, hidden)
         with double_precision():
             run = _free_many(
                 self.mechanism.structure,
                 self.solver,
                 *self._arguments(),
-                jnp.asarray(self._full(x0)),
+                jnp.asarray(x0),
                 jnp.asarray(u[inside]),
                 jnp.asarray(float(recording.Ts)),
             )
@@ -144,14 +156,13 @@ class Model:
         """
         u, y = recording.u.astype(float), self.measured(recording).astype(float)
         K = kalman_gains(self.mechanism, [process_noise], noise, recording.Ts)[0]
-        m = recording.n_init
-        x0 = self._starts(u[None, :m], y[None, :m], recording.Ts)
+        x0 = self._start(recording)
         with double_precision():
             run = _predict(
                 self.mechanism.structure,
                 self.solver,
                 *self._arguments(),
-                jnp.asarray(self._full(x0)[0]),
+                jnp.asarray(x0),
                 *map(jnp.asarray, (u, y, np.ones(len(u)), K)),
                 jnp.asarray(float(recording.Ts)),
             )

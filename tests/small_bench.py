@@ -6,7 +6,8 @@ import numpy as np
 
 import rotflex_jax.effects as fx
 from arena.records import make_record
-from rotflex_jax.discover.lanes import Bench, Hypothesis
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.refit import Judge, levenberg_marquardt
 from rotflex_jax.discover.scales import scales
 from rotflex_jax.discover.supermodel import SuperModel, build

@@ -9,7 +9,7 @@ import small_bench as sb
 from rotflex_jax.discover import decide
 from rotflex_jax.discover.decide import admissible, choose, lead, told_apart
 from rotflex_jax.discover.heldout import Away, Trial, held_out, in_blocks
-from rotflex_jax.discover.lanes import Hypothesis
+from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.refit import levenberg_marquardt
 from rotflex_jax.discover.whiten import Whitener
 from rotflex_jax.fit.residuals import Data, first_states

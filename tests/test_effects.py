@@ -11,30 +11,42 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
+import scipy.signal
 
 import rotflex_jax.effects as effects
 from rotflex_jax.effects import (
     CATALOG,
     Actuation,
+    BoucWen,
+    Cogging,
     Coulomb,
     CoulombAsymmetric,
     CubicSpring,
     Dahl,
     DeadZone,
+    Delay,
     DryFriction,
     Effect,
     Force,
     Gravity,
+    Heating,
     Inertia,
+    JointPlay,
+    Lag,
     Linear,
+    LuGre,
     Memory,
     Motor,
     QuadraticDrag,
     QuadraticSpring,
+    Rectifier,
     Saturation,
     Scale,
+    SecondMode,
     Sensing,
     SensorBias,
+    SensorCubic,
     SensorGain,
     Spring,
     Stribeck,
@@ -49,9 +61,9 @@ from rotflex_jax.precision import double_precision
 
 CLASSES = [CATALOG[name] for name in sorted(CATALOG)]
 SCALES = [
-    Scale(voltage=5.0, speed=2.0, position=0.05, torque=0.2),
-    Scale(voltage=0.1, speed=40.0, position=10.0, torque=1e-3),
-    Scale(voltage=24.0, speed=1e-3, position=1e-4, torque=50.0),
+    Scale(voltage=5.0, speed=2.0, position=0.05, torque=0.2, stiffness=1.6, inertia=0.006),
+    Scale(voltage=0.1, speed=40.0, position=10.0, torque=1e-3, stiffness=1e-3, inertia=1e-6),
+    Scale(voltage=24.0, speed=1e-3, position=1e-4, torque=50.0, stiffness=1e5, inertia=3.0),
 ]
 PASSIVE = {
     "viscous",
@@ -61,8 +73,22 @@ PASSIVE = {
     "stribeck",
     "quadratic_drag",
     "dahl",
+    "lugre",
+    "bouc_wen",
+    "second_mode",
+    "heating",
 }
-CONSERVATIVE = {"inertia", "spring", "cubic_spring", "quadratic_spring", "gravity"}
+CONSERVATIVE = {
+    "inertia",
+    "spring",
+    "cubic_spring",
+    "quadratic_spring",
+    "gravity",
+    "cogging",
+    "joint_play",
+}
+# Where the typical values sit on a kink: a delay of whole samples of 2 ms has a slope on each side.
+BESIDE_THE_KINK = {"delay": {"time": 0.0033}}
 
 every_effect = pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.name)
 
@@ -163,6 +189,8 @@ def test_absent_at_zero_amplitude(cls):
         said = law(effect, list(effect.values.values()), x, w, v, z)
         if isinstance(effect, Memory):
             said = said[:1]  # the state may move, the torque may not
+        if isinstance(effect, Linear) and effect.order:
+            said = jnp.concatenate([said[:4], said[-effect.order :]])  # the same for its states
         assert np.abs(said - nothing(effect, x, v)).max() == 0
 
 
@@ -191,7 +219,7 @@ def test_nothing_is_nan_at_rest_or_at_a_kink(cls, dtype):
 
 @every_effect
 def test_derivatives_equal_central_differences(cls):
-    effect = example(cls)
+    effect = example(cls).replace(**BESIDE_THE_KINK.get(cls.name, {}))
     numbers = np.array(list(effect.values.values()))
     point = np.array([0.31, -0.17, 3.7, 0.4])  # away from every kink of the example
 
@@ -225,7 +253,7 @@ def test_jit_vmap_and_arrays_agree_with_one_point(cls):
     "cls", [c for c in CLASSES if not issubclass(c, (Actuation, Sensing))], ids=lambda c: c.name
 )
 def test_gives_no_energy(cls):
-    """A torque either takes energy at every moment or stores it as a function of the state."""
+    """A torque takes energy at every moment but for what it stores, or is a function of the position."""
     assert (cls.name in PASSIVE) != (cls.name in CONSERVATIVE), "say which of the two it is"
     effect = example(cls)
     if cls.name == "viscous":
@@ -233,6 +261,9 @@ def test_gives_no_energy(cls):
     numbers = [jnp.asarray(n) for n in effect.values.values()]
     rng = np.random.default_rng(0)
     for x, w, v, z in rng.normal(size=(50, 4)) * [1.0, 3.0, 5.0, 1.0]:
+        if isinstance(effect, (LuGre, BoucWen, Heating, SecondMode)):
+            assert taken(effect, x, w, v, z) >= -1e-15
+            continue
         said = np.array(law(effect, numbers, *scalars(x, w, v, np.tanh(z))))
         if isinstance(effect, Linear):
             assert (said[:3] >= 0).all()
@@ -250,6 +281,33 @@ def test_gives_no_energy(cls):
             torque, rate = said
             storing = effect.level * effect.presliding * np.tanh(z) * rate
             assert torque * w + storing <= 1e-15
+
+
+def taken(effect: Effect, x: float, w: float, v: float, z: float) -> float:
+    """Power [W] that an effect with a state takes from its port and does not store."""
+    if isinstance(effect, SecondMode):  # `x` is the angle of the part from the port, `v` its own speed
+        s, W = effect.stamp(), 2 * math.pi * effect.frequency
+        turn, accelerate = (a * x + b * v + c * w for (a, b), c in zip(s.own, s.from_speed, strict=True))
+        torque = s.torque[0] * x + s.torque[1] * v - s.damping * w
+        stored = effect.inertia * (v * accelerate + W**2 * x * turn)
+        lost = 2 * effect.damping * W * effect.inertia * (v - w) ** 2
+        np.testing.assert_allclose(-torque * w - stored, lost, rtol=0, atol=1e-13 * abs(stored))
+        return lost
+    if isinstance(effect, Heating):  # `v` is the torque of the cold motor; what is lost is part of it
+        loss = float(effect.force(*scalars(abs(z), x, w, v)))
+        assert abs(loss) < abs(v)
+        assert float(effect.flow(*scalars(0.0, x, w, v))) >= 0  # never colder than cold
+        return -loss * v
+    if isinstance(effect, LuGre):  # passive as long as damping |speed| <= 4 level g
+        z = (1 + effect.rise) * np.tanh(z)
+        w = math.copysign(min(abs(w), 4 * effect.level / effect.damping), w)
+        lever = effect.level * effect.presliding * z
+    else:  # what comes back on the way to no torque at all
+        assert isinstance(effect, BoucWen)
+        z = np.tanh(z)
+        lever = effect.level * effect.width * z / (1 - (1 - 2 * effect.beta) * abs(z))
+    rate, torque = (float(f(*scalars(z, x, w, v))) for f in (effect.flow, effect.force))
+    return -torque * w - lever * rate
 
 
 @every_effect
@@ -303,9 +361,13 @@ def test_what_may_be_negative():
         "quadratic_spring.stiffness",
         "gravity.sine",
         "gravity.cosine",
+        "cogging.sine",
+        "cogging.cosine",
         "voltage_offset.offset",
         "sensor_bias.bias",
         "sensor_gain.error",
+        "sensor_cubic.cubic",
+        "rectifier.loss",
     }
 
 
@@ -357,6 +419,11 @@ def test_candidates_cover_the_first_family():
         assert {(name, p) for p in ("hub", "arm", "joint")} <= pairs
     assert {p for n, p in pairs if n == "gravity"} == {"hub", "arm"}
     assert ("cubic_spring", "joint") in pairs and ("cubic_spring", "hub") not in pairs
+    assert {("lag", "input"), ("delay", "input"), ("heating", "hub"), ("cogging", "hub")} <= pairs
+    assert {("joint_play", "joint"), ("bouc_wen", "joint"), ("second_mode", "arm")} <= pairs
+    assert {(name, p) for name in ("dahl", "lugre") for p in ("hub", "joint")} <= pairs
+    assert {("sensor_cubic", "alpha"), ("rectifier", "alpha")} <= pairs
+    assert ("heating", "arm") not in pairs and ("heating", "joint") not in pairs  # no motor there
     assert ("sensor_bias", "alpha") in pairs and ("sensor_bias", "theta") not in pairs
     assert not {"inertia", "spring", "motor"} & {n for n, _ in pairs}
 
@@ -429,11 +496,85 @@ def test_actuation_laws_and_their_order():
     limited = Saturation(limit=5.0).drive(v, 0.01)
     np.testing.assert_allclose(limited, [-5, -0.2, -0.05, 0, 0.05, 0.3, 5], atol=0)
     np.testing.assert_allclose(VoltageOffset(offset=0.3).drive(v, 0.01), v + 0.3, atol=0)
-    assert Saturation.stage < VoltageOffset.stage < DeadZone.stage
+    assert Saturation.stage < VoltageOffset.stage < DeadZone.stage < Delay.stage < Lag.stage
     assert DeadZone().at == "input"
 
 
+@pytest.mark.parametrize("samples", [0, 1, 3, 0.25, 1.5, 2.999, 40, 41.3])
+def test_delay_is_the_mean_of_the_shifted_staircase(samples):
+    """By its integral, a line between samples: what has come by one edge less what had by the one before."""
+    rng, Ts, N = np.random.default_rng(0), 0.004, 30
+    u = rng.normal(size=N)
+    late = np.asarray(Delay(time=samples * Ts).drive(jnp.asarray(u), Ts))
+    before = 50  # the command was there before the recording
+    edges = np.arange(-before, N + 1) * Ts
+    come = np.concatenate([[0.0], np.cumsum(np.concatenate([np.full(before, u[0]), u]))]) * Ts
+    expected = np.diff(np.interp(edges[before:] - samples * Ts, edges, come)) / Ts
+    np.testing.assert_allclose(late, expected, rtol=0, atol=1e-12)
+    if samples in (0, 1, 3):
+        np.testing.assert_allclose(late[samples:], u[: N - samples], rtol=0, atol=1e-12)
+    if samples >= N:
+        np.testing.assert_allclose(late, u[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("time", [3e-4, 0.006, 0.5])
+def test_lag_is_the_mean_of_a_low_pass(time):
+    """Against scipy's simulation on a grid a hundred times as fine, Simpson's rule over each sample."""
+    rng, Ts, N, fine = np.random.default_rng(0), 0.004, 30, 100
+    u = rng.normal(size=N)
+    t = np.arange(N * fine + 1) * Ts / fine
+    held = np.append(np.repeat(u, fine), u[-1])
+    v = scipy.signal.lsim(([1.0], [time, 1.0]), held - u[0], t, interp=False)[1] + u[0]
+    expected = [scipy.integrate.simpson(v[k * fine : (k + 1) * fine + 1], dx=1 / fine) for k in range(N)]
+    found = np.asarray(Lag(time=time).drive(jnp.asarray(u), Ts))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 if time < 1e-3 else 1e-9)
+    assert found[0] == u[0]
+
+
+def test_a_short_lag_is_a_short_delay():
+    """Both shift the centre of a slow signal by the same time."""
+    Ts = 0.004
+    ramp = jnp.arange(400.0) * Ts
+    late, slow = (e.drive(ramp, Ts) for e in (Delay(time=0.0101), Lag(time=0.0101)))
+    np.testing.assert_allclose(slow[100:], late[100:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(late[100:], ramp[100:] - 0.0101, rtol=0, atol=1e-12)
+
+
+def test_cogging_repeats_and_keeps_energy():
+    torque = Cogging("hub", sine=0.02, cosine=-0.013, periods=7.0)
+    x = jnp.linspace(-1.0, 1.0, 201)
+    said = np.asarray(torque.force(x, x, x))
+    np.testing.assert_allclose(torque.force(x + 2 * np.pi / 7, x, x), said, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(torque.force(x + np.pi / 7, x, x), -said, rtol=0, atol=1e-15)
+    # Its potential: what a spring of that kind stores, here and there.
+    stored = (-0.02 * np.cos(7 * x) - 0.013 * np.sin(7 * x)) / 7
+    work = scipy.integrate.simpson(said, x=x)
+    np.testing.assert_allclose(work, stored[0] - stored[-1], rtol=1e-6)
+    assert max(abs(said)) == pytest.approx(math.hypot(0.02, 0.013), rel=1e-3)
+    assert "0.0239 N m" in torque.sentence() and "7 times per turn" in torque.sentence()
+
+
+def test_the_joint_is_loose_within_its_play():
+    """Spring and play together are a spring that begins at the edge of the play."""
+    play, stiffness = 0.006, 1.61
+    x = jnp.asarray([-0.02, -0.006, -0.0059, -0.001, 0.0, 0.003, 0.006, 0.0061, 0.5])
+    spring = -stiffness * x
+    together = spring + JointPlay("joint", play, stiffness).force(x, x, x)
+    expected = -stiffness * np.sign(x) * np.maximum(np.abs(x) - play, 0)
+    np.testing.assert_allclose(together, expected, rtol=0, atol=1e-16)
+
+
+def test_a_play_of_nothing_has_the_slope_of_a_small_one():
+    force = lambda play: JointPlay("joint", play, 1.5).force(jnp.asarray([-0.3, 0.2]), 0.0, 0.0)  # noqa: E731
+    np.testing.assert_array_equal(jax.jacfwd(force)(jnp.asarray(0.0)), [-1.5, 1.5])
+
+
 def test_sensing_laws():
+    assert SensorCubic("alpha", cubic=6.0).measure(-0.2) == pytest.approx(-0.248, rel=1e-14)
+    value = jnp.array([-2.0, -0.1, 0.0, 0.3])
+    np.testing.assert_array_equal(Rectifier("alpha", loss=1.0).measure(value), [0, 0, 0, 0.3])
+    np.testing.assert_array_equal(Rectifier("alpha", loss=2.0).measure(value), np.abs(value))
+    np.testing.assert_allclose(Rectifier("alpha", loss=0.15).measure(value), [-1.7, -0.085, 0, 0.3])
     assert SensorBias("alpha", bias=0.02).measure(0.1) == pytest.approx(0.12, rel=1e-15)
     assert SensorGain("alpha", error=-0.1).measure(0.2) == pytest.approx(0.18, rel=1e-15)
 

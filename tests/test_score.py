@@ -8,7 +8,7 @@ import small_bench as sb
 from scipy.optimize import nnls
 
 import rotflex_jax.effects as fx
-from rotflex_jax.discover.lanes import Hypothesis
+from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.refit import levenberg_marquardt
 from rotflex_jax.discover.score import Score, _nonnegative, scores
 from rotflex_jax.discover.supermodel import CALIBRATIONS, build

@@ -417,6 +417,8 @@ def test_dahl_converges(presliding):
         functools.partial(fx.Stribeck, level=0.003, excess=0.003, speed=0.3),
         functools.partial(fx.QuadraticDrag, coefficient=0.01),
         functools.partial(fx.Dahl, level=0.01, presliding=0.005),
+        functools.partial(fx.LuGre, level=0.01, rise=0.5, slow=0.3, presliding=0.005, damping=0.002),
+        functools.partial(fx.BoucWen, level=0.01, width=0.005, beta=0.5),
     ],
     ids=lambda p: p.func.name,
 )
@@ -426,7 +428,7 @@ def test_without_input_no_passive_effect_adds_energy(law):
     start = np.array([0.0, 0.08, 1.5, -2.0])
     s = simulate_states(joint, np.zeros(1000), 0.001, x0=start)
     E = J_HUB / 2 * s[:, 2] ** 2 + J_ARM / 2 * (s[:, 2] + s[:, 3]) ** 2 + K / 2 * s[:, 1] ** 2
-    if law.func is fx.Dahl:  # the bristles store some
+    if law.func in (fx.Dahl, fx.LuGre, fx.BoucWen):  # the bristles store some
         E = E + 0.01 * 0.005 / 2 * np.sum(s[:, 4:] ** 2, axis=1)
     assert E[-1] < 0.9 * E[0]
     assert np.diff(E).max() < 1e-7 * E[0]
@@ -440,6 +442,52 @@ def test_springs_keep_energy(order, close):
     E = J_HUB / 2 * s[:, 2] ** 2 + J_ARM / 2 * (s[:, 2] + s[:, 3]) ** 2
     E = E + 0.25 * s[:, 0] ** 2 + K / 2 * s[:, 1] ** 2 + 5 * s[:, 1] ** 4
     assert np.abs(E / E[0] - 1).max() < close
+
+
+def test_a_damped_part_takes_energy_and_an_undamped_one_keeps_it():
+    for damping, left in ((0.0, 1.0), (0.05, 0.99)):
+        joint = paper(back_emf=0.0) + fx.SecondMode("arm", 8e-4, 14.0, damping)
+        s = simulate_states(joint, np.zeros(1000), 0.001, x0=np.array([0.2, 0.08, 1.5, -2.0, 0.01, 3.0]))
+        E = J_HUB / 2 * s[:, 2] ** 2 + J_ARM / 2 * (s[:, 2] + s[:, 3]) ** 2 + K / 2 * s[:, 1] ** 2
+        E = E + 8e-4 / 2 * (s[:, 5] ** 2 + (28 * np.pi * s[:, 4]) ** 2)
+        assert np.diff(E).max() < 1e-12 * E[0]
+        assert (E[-1] > (1 - 1e-10) * E[0]) if left == 1 else (E[-1] < left * E[0])
+
+
+@pytest.mark.parametrize(("order", "close"), [(2, 1e-4), (4, 1e-7)])
+def test_cogging_keeps_energy(order, close):
+    joint = paper(back_emf=0.0) + fx.Cogging("hub", sine=0.03, cosine=0.02, periods=8.0)
+    start = np.array([0.2, 0.03, 1.0, -1.0])
+    s = simulate_states(joint, np.zeros(1000), 0.001, x0=start, solver=Exponential(order))
+    E = J_HUB / 2 * s[:, 2] ** 2 + J_ARM / 2 * (s[:, 2] + s[:, 3]) ** 2 + K / 2 * s[:, 1] ** 2
+    E = E + (0.02 * np.sin(8 * s[:, 0]) - 0.03 * np.cos(8 * s[:, 0])) / 8
+    assert np.abs(E / E[0] - 1).max() < close
+
+
+def test_a_loose_joint_coasts_within_its_play_and_swings_beyond():
+    """Period 2 pi / w + 4 play / speed: half a swing on each edge, two flights across."""
+    play, speed = 0.006, 0.4
+    joint = paper(back_emf=0.0, torque_constant=0.0) + fx.JointPlay("joint", play, K)
+    still = simulate_states(joint, np.zeros(200), 0.004, x0=np.array([0.0, 0.9 * play, 0.0, 0.0]))
+    assert np.abs(still - still[0]).max() < 1e-13
+    # Hub and arm part so that their centre rests; the joint then feels the reduced inertia.
+    reduced = J_HUB * J_ARM / (J_HUB + J_ARM)
+    hub = -speed * J_ARM / (J_HUB + J_ARM)
+    t = np.arange(400) * 0.001
+    s = simulate_states(
+        joint, 0 * t, 0.001, x0=np.array([0.0, 0.0, hub, speed]), solver=Exponential(substeps=8)
+    )
+    w = np.sqrt(K / reduced)
+    flight, half = play / speed, np.pi / w
+    period = 2 * half + 4 * flight
+    phase = t % period
+    side = np.where(phase < period / 2, 1.0, -1.0)
+    phase = phase % (period / 2)
+    beyond = play + speed / w * np.sin(w * (phase - flight))
+    there = np.where(phase < flight, speed * phase, beyond)
+    back = play - speed * (phase - flight - half)
+    expected = side * np.where(phase > flight + half, back, there)
+    np.testing.assert_allclose(s[:, 1], expected, rtol=0, atol=2e-5)
 
 
 # -- derivatives --------------------------------------------------------------------------------
@@ -456,6 +504,15 @@ LADEN = {
         fx.SensorBias("alpha", bias=0.01),
         fx.SensorGain("alpha", error=0.05),
     ],
+    "smooth and more": [
+        fx.Cogging("hub", sine=0.02, cosine=-0.01, periods=8.0),
+        fx.JointPlay("joint", play=0.004, stiffness=1.2),
+        fx.SecondMode("arm", inertia=5e-4, frequency=15.0, damping=0.05),
+        fx.Delay(time=0.0051),
+        fx.Lag(time=0.006),
+        fx.SensorCubic("alpha", cubic=6.0),
+        fx.Rectifier("alpha", loss=0.15),
+    ],
     "dry": [
         fx.CoulombAsymmetric("hub", 0.03, 0.02),
         fx.Stribeck("joint", 0.003, 0.002, 0.3),
@@ -466,7 +523,14 @@ LADEN = {
         fx.Dahl("arm", 0.005, 0.01),
         fx.Coulomb("joint", 0.003),
     ],
+    "memory and more": [
+        fx.LuGre("hub", level=0.02, rise=0.5, slow=0.3, presliding=0.004, damping=0.01),
+        fx.BoucWen("joint", level=0.02, width=0.02, beta=0.4),
+        fx.Heating("hub", rate=50.0, time=0.3),
+    ],
 }
+# Cases whose derivatives are taken both ways: reverse mode is slow to compile, and `memory` has friction.
+BACKWARD = {"smooth", "memory"}
 
 
 class Laden:
@@ -508,7 +572,7 @@ def test_derivatives_of_a_trajectory_equal_central_differences(case):
         values, gates = jnp.asarray(m.joint.values), jnp.ones(len(m.joint.effects))
         forward = np.asarray(m.forward(values, gates, u, x0)[0])
         weights = jnp.asarray(np.random.default_rng(0).normal(size=forward.shape[:2]))
-        backward = m.backward(values, gates, u, x0, weights)[0] if case != "dry" else None
+        backward = m.backward(values, gates, u, x0, weights)[0] if case in BACKWARD else None
         for i, name in enumerate(m.joint.parameter_names):
             # A step small enough that no stick or reversal moves to another sample.
             h = 1e-6 * abs(float(values[i]))
@@ -517,7 +581,7 @@ def test_derivatives_of_a_trajectory_equal_central_differences(case):
             size = np.abs(expected).max()
             assert size > 0, name
             np.testing.assert_allclose(forward[..., i], expected, rtol=0, atol=2e-5 * size, err_msg=name)
-    if backward is not None:  # slow to compile; `memory` has dry friction too
+    if backward is not None:
         expected = np.einsum("nc,ncp->p", weights, forward)
         np.testing.assert_allclose(backward, expected, rtol=1e-8, atol=1e-10)
 
@@ -541,7 +605,7 @@ def test_no_derivative_is_nan_at_rest_or_where_effects_are_absent(case):
                 for size in (0.0, 1.0):
                     gates = jnp.ones(len(m.joint.effects)).at[m.first :].set(size)
                     found = [m.run(values, gates, u, x0), *m.forward(values, gates, u, x0)]
-                    if case != "dry":
+                    if case in BACKWARD:
                         found += m.backward(values, gates, u, x0, weights)
                     assert all(np.isfinite(a).all() for a in found)
 

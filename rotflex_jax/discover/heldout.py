@@ -5,7 +5,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.lanes import Bench, Hypothesis
+from rotflex_jax.discover.hypothesis import Hypothesis, seat
+from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.fit.residuals import Data
@@ -49,7 +50,7 @@ class Away:
     Attributes:
         judge: With the held-out recordings on its bench.
         recordings: The same, as recordings.
-        first: First states to begin with (R, m).
+        first: First positions and speeds to begin with (R, 2 n).
         seconds: Length of the windows of short free runs [s].
     """
 
@@ -61,9 +62,10 @@ class Away:
     def runner(self, h: Hypothesis, places: Iterable[Place], recording: int) -> Model:
         """A model of one held-out recording; all share the super-model's compiled code, gates apart."""
         bench = self.judge.bench
-        s = bench.supermodel
-        mechanism = s.mechanism.with_values(h.values(bench)[recording])
-        return Model(mechanism, bench.solver, tuple(s.gates(places)))
+        gates = bench.supermodel.gates(places)
+        part = bench.supermodel.part(gates)
+        mechanism = part.mechanism.with_values(h.values(bench)[recording, part.parameters])
+        return Model(mechanism, bench.solver, tuple(gates[list(part.effects)]))
 
     def windows(self, runs: Sequence[np.ndarray]) -> np.ndarray:
         """Root mean square error per channel of short free runs, their first samples not counted."""
@@ -90,7 +92,7 @@ def held_out(away: Away, h: Hypothesis) -> Trial:
     """
     bench, R = away.judge.bench, len(away.first)
     own = np.tile(h.own.mean(axis=0), (R, 1))
-    now = dataclasses.replace(h, x0=away.first.copy(), own=own)
+    now = dataclasses.replace(h, x0=seat(bench, h.places, away.first), own=own)
     now = away.judge.with_process_noise(now, h.process_noise)
     e = bench.innovations([now.lane(bench)])[0]
     for _ in range(10):

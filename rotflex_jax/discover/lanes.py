@@ -1,4 +1,4 @@
-"""Hypotheses side by side: innovations and their slopes for several parameter sets in one call."""
+"""Parameter sets side by side: innovations and their slopes for several of them in one call."""
 
 import dataclasses
 import functools
@@ -11,11 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rotflex_jax.discover.supermodel import Place, SuperModel
-from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.discover.supermodel import Part, SuperModel
 from rotflex_jax.fit.residuals import Data, predicted
 from rotflex_jax.mechanism import Mechanism, Solver
-from rotflex_jax.parameters import Transform
 from rotflex_jax.precision import double_precision
 
 # Lanes per call for values alone, where lanes come nearly free. Slopes run one lane a call: their
@@ -27,7 +25,7 @@ class Lane(NamedTuple):
     """Numbers of one hypothesis for all recordings; stacked, a leading axis is added."""
 
     values: Any  # (R, P)
-    x0: Any  # (R, m)
+    x0: Any  # (R, m), of the part of the super-model that the gates need
     gates: Any  # (E,)
     K: Any  # (R, n, C)
 
@@ -71,12 +69,20 @@ def _stacked(parts: list[Lane]) -> Lane:
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *full)
 
 
+def cut(lane: Lane, part: Part) -> Lane:
+    """The numbers of a lane that a part of the super-model needs."""
+    states = np.array(part.states)
+    return Lane(
+        lane.values[:, part.parameters], lane.x0, lane.gates[np.array(part.effects)], lane.K[:, states]
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class Bench:
     """Where hypotheses are run: one super-model, one solver, one set of recordings.
 
     Attributes:
-        supermodel: What is compiled.
+        supermodel: What is compiled, each part of it once.
         solver: Integration rule.
         data: The recordings.
         compiled: Which programs have run once, and so may run on several threads.
@@ -85,41 +91,73 @@ class Bench:
     supermodel: SuperModel
     solver: Solver
     data: Data
-    compiled: set[str] = dataclasses.field(default_factory=set)
+    compiled: set[Any] = dataclasses.field(default_factory=set)
 
     def innovations(self, lanes: list[Lane]) -> np.ndarray:
         """Innovations (L, R, N, C) of any number of lanes."""
-        structure = self.supermodel.mechanism.structure
 
-        def run(part: list[Lane]) -> np.ndarray:
+        def run(job: tuple[Part, list[int]]) -> np.ndarray:
+            part, places = job
             with double_precision():
-                e = _innovations(structure, self.solver, _stacked(part), self._on_device())
-                return np.asarray(e)[: len(part)]
+                stack = _stacked([cut(lanes[i], part) for i in places])
+                e = _innovations(part.mechanism.structure, self.solver, stack, self.on_device())
+                return np.asarray(e)[: len(places)]
 
-        parts = [lanes[i : i + LANES] for i in range(0, len(lanes), LANES)]
-        return np.concatenate(self._each(run, parts, "innovations"))
+        jobs: list[tuple[Part, list[int]]] = []
+        for part, places in self._by_part([lane.gates for lane in lanes]):
+            jobs += [(part, places[i : i + LANES]) for i in range(0, len(places), LANES)]
+        out = np.empty((len(lanes), *self.data.y.shape))
+        for (_, places), e in zip(jobs, self.each(run, jobs, _named("innovations")), strict=True):
+            out[places] = e
+        return out
 
     def slopes(self, lanes: list[Lane], directions: list[Directions]) -> tuple[np.ndarray, np.ndarray]:
         """Innovations (L, R, N, C) and their slopes (L, D, R, N, C)."""
-        structure = self.supermodel.mechanism.structure
 
-        def run(pair: tuple[Lane, Directions]) -> tuple[np.ndarray, np.ndarray]:
+        def run(job: tuple[Part, list[int]]) -> tuple[np.ndarray, np.ndarray]:
+            part, (i,) = job
+            d = directions[i]
+            along = Directions(d.values[..., part.parameters], d.x0, d.gates[:, part.effects])
             with double_precision():
-                e, J = _slopes(structure, self.solver, *pair, self._on_device())
+                structure = part.mechanism.structure
+                e, J = _slopes(structure, self.solver, cut(lanes[i], part), along, self.on_device())
                 return np.asarray(e), np.asarray(J)
 
-        pairs = self._each(run, list(zip(lanes, directions, strict=True)), "slopes")
-        return np.stack([e for e, _ in pairs]), np.stack([J for _, J in pairs])
+        gates = [np.vstack([lane.gates, d.gates]) for lane, d in zip(lanes, directions, strict=True)]
+        jobs = [(part, [i]) for part, places in self._by_part(gates) for i in places]
+        found = dict(zip([i for _, (i,) in jobs], self.each(run, jobs, _named("slopes")), strict=True))
+        return tuple(np.stack([found[i][k] for i in range(len(lanes))]) for k in (0, 1))  # type: ignore
 
-    def _each(self, run: Callable[[Any], Any], parts: list[Any], what: str) -> list[Any]:
-        if what in self.compiled:
-            return _side_by_side(run, parts)
-        first = run(parts[0])
-        self.compiled.add(what)
-        return [first, *(_side_by_side(run, parts[1:]) if parts[1:] else [])]
+    def _by_part(self, gates: list[np.ndarray]) -> list[tuple[Part, list[int]]]:
+        """Which lanes run on which part of the super-model."""
+        groups: dict[tuple[int, ...], tuple[Part, list[int]]] = {}
+        for i, g in enumerate(gates):
+            part = self.supermodel.part(g)
+            groups.setdefault(part.effects, (part, []))[1].append(i)
+        return list(groups.values())
 
-    def _on_device(self) -> Data:
+    def each(self, run: Callable[[Any], Any], jobs: list[Any], program: Callable[[Any], Any]) -> list[Any]:
+        """Results of jobs side by side; the first of each `program` (its name for a job) compiles alone."""
+        done: list[Any] = [None] * len(jobs)
+        rest = []
+        for i, job in enumerate(jobs):
+            if program(job) in self.compiled:
+                rest.append(i)
+            else:
+                done[i] = run(job)
+                self.compiled.add(program(job))
+        for i, result in zip(rest, _side_by_side(run, [jobs[i] for i in rest]), strict=True):
+            done[i] = result
+        return done
+
+    def on_device(self) -> Data:
+        """The recordings as arrays of JAX; call it inside the precision that is wanted."""
         return jax.tree.map(jnp.asarray, self.data)
+
+
+def _named(what: str) -> Callable[[tuple[Part, list[int]]], Any]:
+    """Name of the program that runs a job: what it computes, on which part of the super-model."""
+    return lambda job: (what, job[0].effects)
 
 
 def _side_by_side(run: Callable[[Any], Any], parts: list[Any]) -> list[Any]:
@@ -131,76 +169,7 @@ def _side_by_side(run: Callable[[Any], Any], parts: list[Any]) -> list[Any]:
         run: What to call; compiled before, so that no two threads compile the same.
         parts: Its arguments.
     """
+    if not parts:
+        return []
     with ThreadPoolExecutor(min(len(parts), os.cpu_count() or 1)) as pool:
         return list(pool.map(run, parts))
-
-
-@dataclasses.dataclass(frozen=True)
-class Hypothesis:
-    """One model on one set of recordings, with everything a comparison needs.
-
-    Attributes:
-        places: Candidates and calibrations that are switched on, in the order they came.
-        free: Parameters common to all recordings that are fitted.
-        local: Parameters that each recording has for itself and that are fitted.
-        z: Unconstrained values (P,).
-        own: Unconstrained values of the local parameters (R, len(local)).
-        x0: First positions and speeds (R, m).
-        K: Gains (R, n, C).
-        process_noise: Port -> intensity that gave `K`.
-        whitener: Fixed while parameters move.
-        densities: Log-likelihood of each training sample (R, N) [nat].
-    """
-
-    places: tuple[Place, ...]
-    free: tuple[int, ...]
-    local: tuple[int, ...]
-    z: np.ndarray
-    own: np.ndarray
-    x0: np.ndarray
-    K: np.ndarray
-    process_noise: dict[str, float]
-    whitener: Whitener
-    densities: np.ndarray = dataclasses.field(default_factory=lambda: np.array(-np.inf))
-
-    @property
-    def log_likelihood(self) -> float:
-        """Of the training recordings [nat]."""
-        total = float(np.sum(self.densities))
-        return total if np.isfinite(total) else -np.inf
-
-    def values(self, bench: Bench) -> np.ndarray:
-        """Physical values (R, P)."""
-        z = np.tile(self.z, (len(self.x0), 1))
-        if self.local:
-            z[:, list(self.local)] = self.own
-        return constrain(bench, z)[0]
-
-    def lane(self, bench: Bench) -> Lane:
-        """The numbers to run."""
-        return Lane(self.values(bench), self.x0, bench.supermodel.gates(self.places), self.K)
-
-    @property
-    def moved(self) -> int:
-        """Number of directions a fit moves: common, then local, then first states."""
-        return len(self.free) + len(self.local) + self.x0.shape[1]
-
-    def directions(self, bench: Bench, count: int) -> Directions:
-        """Tangents of all that a fit moves, in unconstrained coordinates, filled up with zeros."""
-        R, P = len(self.x0), len(self.z)
-        z = np.tile(self.z, (R, 1))
-        if self.local:
-            z[:, list(self.local)] = self.own
-        stretch = constrain(bench, z)[1]
-        E, m = len(bench.supermodel.mechanism.effects), self.x0.shape[1]
-        d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
-        for k, i in enumerate((*self.free, *self.local)):
-            d.values[k, :, i] = stretch[:, i]
-        start = len(self.free) + len(self.local)
-        d.x0[start : start + m] = np.eye(m)
-        return d
-
-
-def constrain(bench: Bench, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Physical values of unconstrained ones (..., P), and their derivative."""
-    return Transform.of(bench.supermodel.mechanism.parameter_specifications).physical(z)

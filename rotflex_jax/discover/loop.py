@@ -8,7 +8,8 @@ import numpy as np
 
 from rotflex_jax.discover.decide import WINDOWS_BETTER, choose, describe, samples_of
 from rotflex_jax.discover.heldout import Away, Trial, held_out
-from rotflex_jax.discover.lanes import Bench, Hypothesis
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.locate import locate
 from rotflex_jax.discover.moves import begin, eliminate, is_physical, ladder, remaining_rivals, with_each
 from rotflex_jax.discover.refit import Judge

@@ -7,11 +7,13 @@ import numpy as np
 
 from rotflex_jax.discover.decide import TRAIN_NATS, TRAIN_Z, lead, told_apart
 from rotflex_jax.discover.heldout import Away, held_out, in_blocks
-from rotflex_jax.discover.lanes import Hypothesis
-from rotflex_jax.discover.refit import Judge, refit
+from rotflex_jax.discover.hypothesis import Hypothesis, seat
+from rotflex_jax.discover.refit import Judge, levenberg_marquardt, refit
 from rotflex_jax.discover.score import Score
 from rotflex_jax.discover.supermodel import CALIBRATIONS, Place, SuperModel
 from rotflex_jax.discover.whiten import Whitener, log_likelihood
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects.kinds import Memory
 from rotflex_jax.fit.residuals import first_states
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Transform
@@ -31,7 +33,7 @@ def begin(judge: Judge, s: SuperModel, model: Model, trained: Sequence[Recording
         local=tuple(s.local),
         z=z,
         own=np.zeros((R, len(s.local))),
-        x0=first_states(model, trained),
+        x0=seat(judge.bench, s.calibrations, first_states(model, trained)),
         K=np.zeros((0,)),
         process_noise={},
         whitener=Whitener(np.eye(1, 1).repeat(C, 0), np.diag(1 / judge.noise)),
@@ -55,23 +57,68 @@ def with_each(judge: Judge, base: Hypothesis, promising: list[Score]) -> list[Hy
 
     First order overshoots where an effect is strongly nonlinear, so a refit starts at the likeliest of
     several shares of the amplitude; one that still ends below the base starts again from next to nothing.
+    A law with memory takes the place of the simpler one that it contains: two of them in parallel would
+    be a third law.
     """
-    starts = [[_with(judge, base, s, share) for share in SHARES] for s in promising]
-    lanes = [h.lane(judge.bench) for row in starts for h in row]
-    es = judge.bench.innovations(lanes).reshape(len(starts), len(SHARES), *judge.bench.data.y.shape)
-    seen = judge.bench.data.seen
-    likely = [
-        [log_likelihood(e, seen, judge.noise) if np.all(np.isfinite(e)) else -np.inf for e in row]
-        for row in es
+    shapes = [
+        (i, dataclasses.replace(s, start=x)) for i, s in enumerate(promising) for x in (s.start, *s.others)
     ]
-    chosen = [row[int(np.argmax(ll))] for row, ll in zip(starts, likely, strict=True)]
+    starts = [[_grown(judge, base, s, share) for share in SHARES] for _, s in shapes]
+    likely = likelihoods(judge, [h for row in starts for h in row]).reshape(len(starts), -1)
+    likeliest = [row[int(np.argmax(ll))] for row, ll in zip(starts, likely, strict=True)]
+    chosen, last = _best_shapes(judge, [i for i, _ in shapes], likeliest), {}
+    for (i, _), row in zip(shapes, starts, strict=True):
+        last.setdefault(i, row[-1])
     refitted = refit(judge, chosen)
     worse = [i for i, h in enumerate(refitted) if h.log_likelihood < base.log_likelihood]
     if worse:
-        again = refit(judge, [starts[i][-1] for i in worse])
+        again = refit(judge, [last[i] for i in worse])
         for i, h in zip(worse, again, strict=True):
-            refitted[i] = h if h.log_likelihood > base.log_likelihood else starts[i][-1]
+            refitted[i] = h if h.log_likelihood > base.log_likelihood else last[i]
     return refitted
+
+
+def _best_shapes(judge: Judge, of: list[int], starts: list[Hypothesis]) -> list[Hypothesis]:
+    """For each candidate (`of` says whose a start is) the start that a short fit takes farthest."""
+    several = [k for k, i in enumerate(of) if of.count(i) > 1]
+    now = list(starts)
+    if several:
+        fitted = levenberg_marquardt(judge, [now[k] for k in several], steps=4)
+        for k, h in zip(several, fitted, strict=True):
+            now[k] = h
+    best = {}
+    for i, h in zip(of, now, strict=True):
+        if i not in best or h.log_likelihood > best[i].log_likelihood:
+            best[i] = h
+    return [best[i] for i in sorted(best)]
+
+
+def likelihoods(judge: Judge, hypotheses: list[Hypothesis]) -> np.ndarray:
+    """Log-likelihoods of hypotheses as they are [nat], whitened anew; minus infinity where a run diverges."""
+    es = judge.bench.innovations([h.lane(judge.bench) for h in hypotheses])
+    seen = judge.bench.data.seen
+    return np.array([log_likelihood(e, seen, judge.noise) if np.all(np.isfinite(e)) else -np.inf for e in es])
+
+
+def _grown(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesis:
+    """The hypothesis with one more effect, or with it in the place of simpler ones that it contains."""
+    s, (name, port) = judge.bench.supermodel, score.place
+    simpler = [(c, port) for c in CATALOG[name].contains if (c, port) in h.places]
+    if not simpler or not issubclass(CATALOG[name], Memory):
+        return _with(judge, h, score, share)
+    values, known = h.values(judge.bench).mean(axis=0), {}
+    for place in simpler:
+        names = [s.mechanism.parameter_names[i].rpartition(".")[2] for i in s.parameter_indices(place)]
+        known |= dict(zip(names, values[s.parameter_indices(place)], strict=True))
+        h = _without(judge, h, place)
+    start = score.start.copy()
+    for k, i in enumerate(s.candidates[score.place].parameters):
+        parameter = s.mechanism.parameter_names[i].rpartition(".")[2]
+        if parameter in known:
+            # What the simpler law has already keeps its size; the share is for the rest.
+            amplitude = s.candidates[score.place].amplitudes[k]
+            start[k] = known[parameter] / (share if amplitude else 1.0)
+    return _with(judge, h, dataclasses.replace(score, start=start), share)
 
 
 def _with(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesis:
@@ -87,7 +134,10 @@ def _with(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesis
             start[k] = max(start[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
     z = h.z.copy()
     z[list(c.parameters)] = Transform.of(specs).unconstrain(start)
-    return dataclasses.replace(h, places=(*h.places, score.place), free=(*h.free, *c.parameters), z=z)
+    places = (*h.places, score.place)
+    return dataclasses.replace(
+        h, places=places, free=(*h.free, *c.parameters), z=z, x0=h.seated(judge.bench, places)
+    )
 
 
 def is_physical(judge: Judge, h: Hypothesis, place: Place) -> bool:
@@ -102,9 +152,11 @@ def _without(judge: Judge, h: Hypothesis, place: Place) -> Hypothesis:
     s = judge.bench.supermodel
     gone = set(s.parameter_indices(place))
     kept = [k for k, i in enumerate(h.local) if i not in gone]
+    places = tuple(p for p in h.places if p != place)
     return dataclasses.replace(
         h,
-        places=tuple(p for p in h.places if p != place),
+        places=places,
+        x0=h.seated(judge.bench, places),
         free=tuple(i for i in h.free if i not in gone),
         local=tuple(h.local[k] for k in kept),
         own=h.own[:, kept],

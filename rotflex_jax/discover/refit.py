@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.lanes import Bench, Hypothesis
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.whiten import fit_whitener, log_likelihood
 from rotflex_jax.mechanism import kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
@@ -63,10 +64,11 @@ class Judge:
         s, data = self.bench.supermodel, self.bench.data
         values = h.values(self.bench).mean(axis=0)
         mechanism = s.clean(values, ())
-        size = Layout.of(s.mechanism.structure).size
         by_period = {Ts: kalman_gains(mechanism, intensities, self.noise, Ts) for Ts in set(data.Ts.tolist())}
         K = np.stack([by_period[Ts] for Ts in data.Ts.tolist()], axis=1)
-        return list(np.pad(K, ((0, 0), (0, 0), (0, size - K.shape[2]), (0, 0))))
+        full = np.zeros((*K.shape[:2], Layout.of(s.mechanism.structure).size, K.shape[3]))
+        full[:, :, s.baseline_states] = K
+        return list(full)
 
     def judged(self, h: Hypothesis, e: np.ndarray) -> Hypothesis:
         """The hypothesis with the whitener and likelihood that its innovations (R, N, C) give."""

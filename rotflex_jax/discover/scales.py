@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.signal import savgol_filter
 
-from rotflex_jax.effects.kinds import Scale
+from rotflex_jax.effects.kinds import Linear, Scale
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.mechanism.linearise import inverse_mass
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
@@ -35,6 +36,14 @@ def motion(
     return out
 
 
+def at_port(mechanism: Mechanism, port: str) -> tuple[float, float]:
+    """Stiffness of the linear springs at a port [N m/rad], and the inertia that a torque there meets."""
+    springs = [e for e in mechanism.effects if isinstance(e, Linear) and e.at == port]
+    stiffness = sum(float(e.stamp().stiffness) for e in springs)
+    p = np.array(mechanism.port_vectors[port])
+    return stiffness, float(1 / (p @ inverse_mass(mechanism) @ p))
+
+
 def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict[str, Scale]:
     """Port, `input` or channel -> size of its signals.
 
@@ -51,7 +60,8 @@ def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict
         known = [m[port] for m in found if port in m]
         speed = max((float(np.sqrt(np.mean(s**2))) for _, s in known), default=1.0)
         position = max((float(np.max(np.abs(q - q.mean()))) for q, _ in known), default=0.1)
-        out[port] = Scale(voltage, max(speed, 1e-6), max(position, 1e-6), torque)
+        stiffness, inertia = at_port(mechanism, port)
+        out[port] = Scale(voltage, max(speed, 1e-6), max(position, 1e-6), torque, stiffness, inertia)
     whole = Scale(voltage, 1.0, 1.0, torque)
     for channel in mechanism.channels:
         y = np.concatenate([model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings])

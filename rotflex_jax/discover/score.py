@@ -9,13 +9,19 @@ import dataclasses
 
 import numpy as np
 
-from rotflex_jax.discover.lanes import Bench, Directions, Hypothesis, Lane
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.lanes import Bench, Directions, Lane
+from rotflex_jax.discover.probing import probe
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.supermodel import Candidate, Place
 from rotflex_jax.effects import CATALOG
 
 # A plausible effect must be able to gain this much (chi-square) for a recording to show it.
 VISIBLE = 12.0
+# Directions per pass.
+PROBES = 8
+# Shapes beside the best one at which a refit may start.
+SHAPES = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +36,7 @@ class Score:
         excited: Whether an effect of plausible size would have been visible.
         unconfounded: Norm of the projected slope over the norm of the slope.
         smallest: Factor of the plausible size that would just have been visible.
+        others: Starts at the next best shapes.
     """
 
     place: Place
@@ -39,6 +46,7 @@ class Score:
     excited: bool
     unconfounded: float
     smallest: float
+    others: tuple[np.ndarray, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +76,6 @@ def scores(judge: Judge, h: Hypothesis) -> list[Score]:
     candidates = [c for c in bench.supermodel.candidates.values() if c.place not in h.places]
     if not candidates:
         return []
-    count = max(judge.directions(), h.moved)
-    nuisance = h.directions(bench, count)
     probes = [
         _Probe(c, s, m) for c in candidates for s, group in enumerate(c.probes) for m in range(len(group))
     ]
@@ -77,17 +83,18 @@ def scores(judge: Judge, h: Hypothesis) -> list[Score]:
     batches: list[tuple[int, list[_Probe]]] = []
     for shape in sorted({p.shape for p in probes}):
         mine = [p for p in probes if p.shape == shape]
-        batches += [(shape, mine[i : i + count]) for i in range(0, len(mine), count)]
-    lanes = [h.lane(bench)] + [_lane_for(bench, h, candidates, shape) for shape, _ in batches]
-    along = [nuisance] + [_tangents(bench, h, part, count) for _, part in batches]
-    e, J = bench.slopes(lanes, along)
+        batches += [(shape, mine[i : i + PROBES]) for i in range(0, len(mine), PROBES)]
+    present = h.lane(bench)
+    e, J = bench.slopes([present], [h.directions(bench, max(judge.directions(), h.moved))])
     w = h.whitener(e[0], seen)
     N = _expanded(h, h.whitener(J[0, : h.moved], seen))
+    lanes = [_lane_for(bench, h, candidates, shape) for shape, _ in batches]
+    J = probe(bench, present, lanes, [_tangents(bench, h, part) for _, part in batches])
     Q = np.linalg.qr(N.T / np.maximum(np.linalg.norm(N, axis=1), 1e-300))[0]
     r = w.ravel()
     r = r - Q @ (Q.T @ r)
     columns: dict[tuple[Place, int], list[np.ndarray]] = {}
-    for (_, part), slopes in zip(batches, J[1:], strict=True):
+    for (_, part), slopes in zip(batches, J, strict=True):
         W = h.whitener(slopes[: len(part)], seen).reshape(len(part), -1)
         for p, column in zip(part, W, strict=True):
             columns.setdefault((p.candidate.place, p.shape), []).append(column)
@@ -97,11 +104,11 @@ def scores(judge: Judge, h: Hypothesis) -> list[Score]:
     return sorted(found, key=lambda s: -s.nats)
 
 
-def _tangents(bench: Bench, h: Hypothesis, part: list[_Probe], count: int) -> Directions:
+def _tangents(bench: Bench, h: Hypothesis, part: list[_Probe]) -> Directions:
     """Directions of probes: along amplitudes by their values, along effects without any by the gate."""
     R, P = len(h.x0), len(h.z)
     E, m = len(bench.supermodel.mechanism.effects), h.x0.shape[1]
-    d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
+    d = Directions(np.zeros((PROBES, R, P)), np.zeros((PROBES, m)), np.zeros((PROBES, E)))
     for row, p in enumerate(part):
         c = p.candidate
         if not any(c.amplitudes):
@@ -145,9 +152,10 @@ class _Ground:
 
 
 def _score(c: Candidate, ground: _Ground) -> Score:
-    """The best alternative of a candidate."""
+    """The best alternative of a candidate, with starts at the next best ones."""
     alternatives = [_alternative(c, shape, ground) for shape in range(len(c.probes))]
-    return max(alternatives, key=lambda s: s.nats)
+    best, *rest = sorted(alternatives, key=lambda s: -s.nats)
+    return dataclasses.replace(best, others=tuple(s.start for s in rest[:SHAPES] if s.gain > 0))
 
 
 def _alternative(c: Candidate, shape: int, ground: _Ground) -> Score:

@@ -1,17 +1,20 @@
 """The baseline with every candidate built in and switched off.
 
-One structure serves the score test, all refits and all comparisons, so it is compiled once; which
-effects take part is a matter of their gates, which are numbers.
+Which effects take part is a matter of their gates, which are numbers, so one structure serves nearly all
+refits and comparisons and is compiled once. Effects with states of their own would make every run dearer;
+they are left out of a run unless they are switched on, so each of them is one structure more.
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterable
 
 import numpy as np
 
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.kinds import Actuation, Effect, Scale, Sensing
+from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Linear, Memory, Scale, Sensing
 from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.assembly import effects_of
 
 Place = tuple[str, str]  # (effect name, port)
 
@@ -43,6 +46,23 @@ CALIBRATIONS: tuple[Place, ...] = (("voltage_offset", "input"), ("sensor_bias", 
 
 
 @dataclasses.dataclass(frozen=True)
+class Part:
+    """The super-model less some effects that are off.
+
+    Attributes:
+        mechanism: What is left.
+        effects: Places of its effects in the super-model's.
+        parameters: Places of its parameters in the super-model's values.
+        states: Places of its states in the super-model's state.
+    """
+
+    mechanism: Mechanism
+    effects: tuple[int, ...]
+    parameters: tuple[int, ...]
+    states: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class SuperModel:
     """Baseline, calibrations and candidates in one mechanism.
 
@@ -51,12 +71,49 @@ class SuperModel:
         mechanism: With calibrations and candidates.
         calibrations: Places of the calibrations that were added.
         candidates: By place.
+        parts: Parts formed so far, by the stateful candidates in them.
     """
 
     baseline: Mechanism
     mechanism: Mechanism
     calibrations: tuple[Place, ...]
     candidates: dict[Place, Candidate]
+    parts: dict[frozenset[int], Part] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def stateful(self) -> frozenset[int]:
+        """Candidates' effects that have states of their own."""
+        own = state_rows(self.mechanism)
+        dry = [i for i, _ in effects_of(self.mechanism, DryFriction)]
+        return frozenset(i for i in (*own, *dry) if i >= len(self.baseline.effects))
+
+    @functools.cached_property
+    def baseline_states(self) -> list[int]:
+        """Places of the baseline's states in the state."""
+        own, count = state_rows(self.mechanism), len(self.baseline.effects)
+        moving = range(2 * len(self.baseline.coordinates))
+        return sorted([*moving, *(row for i, rows in own.items() if i < count for row in rows)])
+
+    def part(self, gates: np.ndarray) -> Part:
+        """The super-model without the stateful candidates whose gate (..., E) is zero."""
+        on = frozenset(i for i in self.stateful if np.any(gates[..., i] != 0))
+        if on not in self.parts:
+            self.parts[on] = self._part(on)
+        return self.parts[on]
+
+    def _part(self, on: frozenset[int]) -> Part:
+        kept = [i for i in range(len(self.mechanism.effects)) if i not in self.stateful or i in on]
+        effects = tuple(self.mechanism.effects[i] for i in kept)
+        mechanism = dataclasses.replace(self.mechanism, effects=effects)
+        names = {n: k for k, n in enumerate(self.mechanism.parameter_names)}
+        rows = state_rows(self.mechanism)
+        moving = range(2 * len(self.mechanism.coordinates))
+        return Part(
+            mechanism,
+            tuple(kept),
+            tuple(names[n] for n in mechanism.parameter_names),
+            tuple(sorted([*moving, *(row for i in kept for row in rows.get(i, ()))])),
+        )
 
     def effect_index(self, place: Place) -> int:
         """Index of an effect."""
@@ -92,6 +149,19 @@ class SuperModel:
         for place in places:
             mechanism = mechanism + self.mechanism.effects[self.effect_index(place)]
         return mechanism.with_values({n: numbers[n] for n in mechanism.parameter_names})
+
+
+def state_rows(mechanism: Mechanism) -> dict[int, tuple[int, ...]]:
+    """Effects with states of their own -> places of these in the state."""
+    rows, at = {}, 2 * len(mechanism.coordinates)
+    # The state holds those of linear effects first, then memories.
+    for kind in (Linear, Memory):
+        for i, e in effects_of(mechanism, kind):
+            count = e.order if isinstance(e, Linear) else 1
+            if count:
+                rows[i] = tuple(range(at, at + count))
+                at += count
+    return rows
 
 
 def build(
@@ -138,4 +208,6 @@ def build(
 def _has(mechanism: Mechanism, cls: type[Effect], port: str) -> bool:
     if issubclass(cls, Actuation):
         return port == "input"
+    if issubclass(cls, Memory) and cls.driven_by == "motor" and not mechanism.has_motor(port):
+        return False
     return port in (mechanism.channels if issubclass(cls, Sensing) else mechanism.port_vectors)

@@ -4,15 +4,21 @@ To add one, derive a frozen dataclass from a kind (`kinds.py`), decorate it with
 import it here.
 """
 
+from rotflex_jax.effects.bouc_wen import BoucWen
 from rotflex_jax.effects.catalogue import CATALOG, candidates, register
+from rotflex_jax.effects.cogging import Cogging
 from rotflex_jax.effects.coulomb import Coulomb, CoulombAsymmetric
 from rotflex_jax.effects.cubic_spring import CubicSpring
 from rotflex_jax.effects.dahl import Dahl
 from rotflex_jax.effects.dead_zone import DeadZone
+from rotflex_jax.effects.delay import Delay
 from rotflex_jax.effects.gravity import Gravity
+from rotflex_jax.effects.heating import Heating
 from rotflex_jax.effects.inertia import Inertia
+from rotflex_jax.effects.joint_play import JointPlay
 from rotflex_jax.effects.kinds import (
     Actuation,
+    Drive,
     DryFriction,
     Effect,
     Force,
@@ -23,11 +29,16 @@ from rotflex_jax.effects.kinds import (
     Sensing,
     Stamp,
 )
+from rotflex_jax.effects.lag import Lag
+from rotflex_jax.effects.lugre import LuGre
 from rotflex_jax.effects.motor import Motor
 from rotflex_jax.effects.quadratic_drag import QuadraticDrag
 from rotflex_jax.effects.quadratic_spring import QuadraticSpring
+from rotflex_jax.effects.rectifier import Rectifier
 from rotflex_jax.effects.saturation import Saturation
+from rotflex_jax.effects.second_mode import SecondMode
 from rotflex_jax.effects.sensor_bias import SensorBias
+from rotflex_jax.effects.sensor_cubic import SensorCubic
 from rotflex_jax.effects.sensor_gain import SensorGain
 from rotflex_jax.effects.spring import Spring
 from rotflex_jax.effects.stribeck import Stribeck
@@ -45,6 +56,7 @@ __all__ = [
     "Sensing",
     "Stamp",
     "Scale",
+    "Drive",
     "Probe",
     # catalogue
     "CATALOG",
@@ -55,6 +67,7 @@ __all__ = [
     "Spring",
     "Viscous",
     "Motor",
+    "SecondMode",
     # dry friction
     "Coulomb",
     "CoulombAsymmetric",
@@ -64,13 +77,22 @@ __all__ = [
     "CubicSpring",
     "QuadraticSpring",
     "Gravity",
+    "Cogging",
+    "JointPlay",
     # with memory
     "Dahl",
+    "LuGre",
+    "BoucWen",
+    "Heating",
     # actuation
     "DeadZone",
     "Saturation",
     "VoltageOffset",
+    "Delay",
+    "Lag",
     # sensing
     "SensorBias",
     "SensorGain",
+    "SensorCubic",
+    "Rectifier",
 ]

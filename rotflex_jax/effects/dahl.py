@@ -34,6 +34,7 @@ class Dahl(Memory):
     equation: ClassVar[str] = "dz/dt = speed / presliding * (1 - z * sign(speed)), tau = -level * z"
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque when it slides")
     # Coulomb friction is the limit of none at all; the bound keeps the rate finite.
@@ -41,12 +42,12 @@ class Dahl(Memory):
         0.003, unit="rad", lower=1e-6, meaning="displacement over which it builds up"
     )
 
-    def flow(self, z: Scalar, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Time derivative of the state [1/s]."""
         # |speed| instead of speed sign(speed): its derivative at rest is zero, not undefined.
         return speed / self.presliding - jnp.abs(speed) / self.presliding * z
 
-    def force(self, z: Scalar, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Torque [N m] on the port."""
         return -self.level * z
 

@@ -8,7 +8,7 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import jax
 
@@ -17,6 +17,7 @@ from rotflex_jax.parameters import Specification, specifications
 
 Scalar = jax.Array | float
 Probe = Mapping[str, float]
+Drive = Literal["voltage", "motor"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,12 +29,16 @@ class Scale:
         speed: Root mean square speed of the port [rad/s].
         position: Largest |position| of the port about its mean [rad].
         torque: Root mean square torque the motor can be seen to give [N m].
+        stiffness: Of the linear springs at the port [N m/rad].
+        inertia: What an acceleration of the port meets, all else held [kg m^2].
     """
 
     voltage: float
     speed: float
     position: float
     torque: float
+    stiffness: float = 0.0
+    inertia: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,6 +161,9 @@ class Stamp(NamedTuple):
 class Linear(Effect):
     """Enters the linear part, which the step integrates exactly."""
 
+    # True for what turns voltage into torque at its port.
+    motor: ClassVar[bool] = False
+
     def stamp(self) -> Stamp:
         """Entries of the equations of motion."""
         raise NotImplementedError
@@ -186,17 +194,25 @@ class DryFriction(Effect):
 
 
 class Memory(Effect):
-    """A torque law with one state of its own, `dz/dt = flow`."""
+    """A torque law with one state of its own, `dz/dt = flow`.
+
+    Normalise the state so that its flow does not depend on the amplitudes where these are zero: a
+    search sees the torque's slope along them there, `z` as it is.
+    """
+
+    # What the last argument of its laws is: the motor's voltage [V], or the torque [N m] that the
+    # linear motors at its port give.
+    driven_by: ClassVar[Drive] = "voltage"
 
     def initial(self) -> float:
         """State at rest."""
         return 0.0
 
-    def flow(self, z: Scalar, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
-        """Time derivative of the state [1/s]."""
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the state [its unit per s]."""
         raise NotImplementedError
 
-    def force(self, z: Scalar, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Torque [N m] on the port."""
         raise NotImplementedError
 

@@ -39,6 +39,7 @@ class Motor(Linear):
         "inductance * di/dt = v - resistance * i - back_emf * gear_ratio * speed"
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("torque_constant",)
+    motor: ClassVar[bool] = True
 
     at: str = "hub"
     torque_constant: float = parameter(0.00767, unit="N m/A", lower=0.0, meaning="torque per current")

@@ -27,14 +27,13 @@ def rough_state(structure: Mechanism, y: np.ndarray, Ts: float) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _refine(structure, solver, values, gates, guess, u, y, Ts):  # noqa: ANN001, ANN202
+def _refine(structure, solver, values, gates, guess, hidden, u, y, Ts):  # noqa: ANN001, ANN202
     """Damped Gauss-Newton on all stretches at once.
 
     Slopes are secants: stretches are short, and the derivative of the simulation would take longer to
     compile than all the runs take.
     """
     W, m = guess.shape
-    rest = jnp.asarray(rest_state(structure, np.float64))[m:]
     reach = 1e-6
     nudges = jnp.concatenate([jnp.zeros((1, m)), reach * jnp.eye(m)])
     run = functools.partial(free_run, structure, solver)
@@ -43,7 +42,7 @@ def _refine(structure, solver, values, gates, guess, u, y, Ts):  # noqa: ANN001,
     def errors(states):  # noqa: ANN001, ANN202 - (W, V, m) -> (W, V, samples * C)
         V = states.shape[1]
         flat = states.reshape(W * V, m)
-        start = jnp.concatenate([flat, jnp.broadcast_to(rest, (W * V, len(rest)))], axis=1)
+        start = jnp.concatenate([flat, jnp.repeat(hidden, V, axis=0)], axis=1)
         y_hat = runs(values, gates, start, jnp.repeat(u, V, axis=0), Ts)[1]
         return (y_hat.reshape(W, V, *y.shape[1:]) - y[:, None]).reshape(W, V, -1)
 
@@ -75,10 +74,12 @@ def initial_states(
     u: np.ndarray,
     y: np.ndarray,
     Ts: float,
+    hidden: np.ndarray | None = None,
 ) -> np.ndarray:
-    """First positions and speeds (W, 2 n) of W stretches of a recording, each by itself.
+    """First states (W, n) of W stretches of a recording, each by itself.
 
-    Errors of the channels count in their own units. Memories and motor current start at rest.
+    Positions and speeds are fitted; errors of the channels count in their own units. States that no
+    sensor shows (memories, motor current, modes of a part) are given.
 
     Args:
         mechanism: Model.
@@ -87,9 +88,13 @@ def initial_states(
         u: Voltage (W, m) [V].
         y: Measured outputs (W, m, C).
         Ts: Sampling period [s].
+        hidden: What follows positions and speeds in the first states; at rest if None.
     """
     structure = mechanism.structure
+    if hidden is None:
+        rest = rest_state(structure, np.float64)[2 * Layout.of(structure).n :]
+        hidden = np.tile(rest, (len(u), 1))
     guess = np.array([rough_state(structure, stretch, Ts) for stretch in y])
     with double_precision():
-        arrays = map(jnp.asarray, (mechanism.values, gates, guess, u, y, np.float64(Ts)))
-        return np.asarray(_refine(structure, solver, *arrays))
+        arrays = map(jnp.asarray, (mechanism.values, gates, guess, hidden, u, y, np.float64(Ts)))
+        return np.concatenate([np.asarray(_refine(structure, solver, *arrays)), hidden], axis=1)

@@ -43,6 +43,11 @@ def _linear_part(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray, np.ndarr
         return np.asarray(eq.A), np.asarray(eq.B), np.asarray(eq.inverse_mass)
 
 
+def inverse_mass(mechanism: Mechanism) -> np.ndarray:
+    """Inverse of the mass matrix (n, n) of the coordinates."""
+    return _linear_part(mechanism)[2]
+
+
 def linearise(mechanism: Mechanism) -> StateSpace:
     """State space of the linear effects (inertias, springs, dampers, motor); the others are left out.
 
@@ -79,7 +84,7 @@ def kalman_gains(
     """
     layout, ss = Layout.of(mechanism.structure), linearise(mechanism)
     n, size = layout.n, layout.linear
-    Minv = _linear_part(mechanism)[2]
+    Minv = inverse_mass(mechanism)
     covariance = {port: _built_up(ss.A, Minv @ np.array(vector), n, Ts) for port, vector in mechanism.ports}
     Ad, _ = ss.discretise(Ts)
     Q = np.array(

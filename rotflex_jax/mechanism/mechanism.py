@@ -7,7 +7,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from rotflex_jax.effects.kinds import Actuation, Effect, Sensing
+from rotflex_jax.effects.kinds import Actuation, Effect, Linear, Memory, Sensing
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import Specification, specifications
 
@@ -91,6 +91,11 @@ class Mechanism:
                     f"add up their parameters."
                 )
             seen.add((effect.at, effect.name))
+            if isinstance(effect, Memory) and effect.driven_by == "motor" and not self.has_motor(effect.at):
+                raise InputError(
+                    f"{type(effect).__name__} was put at {effect.at!r}, but no motor drives that port; put "
+                    f"it at the port of a motor, or add a Motor there first."
+                )
         for name in sorted(self.trusted):
             self._must_exist(name)
 
@@ -143,6 +148,10 @@ class Mechanism:
             if (e.name, e.at) == (name, at):
                 return e
         raise InputError(f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first.")
+
+    def has_motor(self, port: str) -> bool:
+        """Whether a linear motor drives the port."""
+        return any(isinstance(e, Linear) and e.motor and e.at == port for e in self.effects)
 
     # -- parameters --------------------------------------------------------------------------------
 

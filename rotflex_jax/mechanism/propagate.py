@@ -61,27 +61,47 @@ def _joined(chunks: jax.Array, N: int) -> jax.Array:
     return pieces.reshape(-1, *pieces.shape[2:])[:N]
 
 
+def slopes(step: StepFunction, X: jax.Array, inputs: Any, constants: Any) -> jax.Array:
+    """`df/dx` along the states X (N, n): entry [k, j] is the column of `A[k]` for state j (N, n, n)."""
+    x, w = _chunks((X, inputs))
+    ways = jnp.eye(X.shape[1], dtype=X.dtype)
+
+    def here(pair: Any) -> jax.Array:
+        s, v = pair
+        wide = jnp.broadcast_to(ways[:, :, None], (len(ways), *s.shape))
+        return jax.vmap(lambda way: jax.jvp(lambda q: step(q, v, constants), (s,), (way,))[1])(wide)
+
+    return _joined(jax.lax.map(here, (x, w)), len(X))
+
+
+def forcing(
+    step: StepFunction, X: jax.Array, inputs: Any, dinputs: Any, constants: Any, dconstants: Any
+) -> jax.Array:
+    """`b[k] = df/dw dw[k] + df/dc dc` (N, n) along the states X (N, n)."""
+    x, w, dw = _chunks((X, inputs, dinputs))
+
+    def here(triple: Any) -> jax.Array:
+        s, v, dv = triple
+        return jax.jvp(functools.partial(step, s), (v, constants), (dv, dconstants))[1]
+
+    return _joined(jax.lax.map(here, (x, w, dw)), len(X))
+
+
+def recursion(A: jax.Array, b: jax.Array, dx0: jax.Array) -> jax.Array:
+    """`dx[k+1] = A[k] dx[k] + b[k]`: dx (N, n), row 0 is `dx0`; A as `slopes` gives it."""
+
+    def body(dx: jax.Array, ab: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        a, force = ab
+        return jnp.sum(a * dx[:, None], axis=0) + force, dx
+
+    return jax.lax.scan(body, dx0, (A, b))[1]
+
+
 @states.defjvp
 def _states_jvp(step: StepFunction, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     x0, inputs, constants = primals
     dx0, dinputs, dconstants = tangents
     X = states(step, x0, inputs, constants)
-    x, w, dw = _chunks((X, inputs, dinputs))
-
-    def slopes(here: Any) -> jax.Array:
-        s, v = here
-        ways = jnp.broadcast_to(jnp.eye(len(x0), dtype=s.dtype)[:, :, None], (len(x0), *s.shape))
-        return jax.vmap(lambda way: jax.jvp(lambda q: step(q, v, constants), (s,), (way,))[1])(ways)
-
-    def forced(here: Any) -> jax.Array:
-        s, v, dv = here
-        return jax.jvp(functools.partial(step, s), (v, constants), (dv, dconstants))[1]
-
-    A = _joined(jax.lax.map(slopes, (x, w)), len(X))
-    b = _joined(jax.lax.map(forced, (x, w, dw)), len(X))
-
-    def body(dx: jax.Array, ab: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        a, forcing = ab
-        return jnp.sum(a * dx[:, None], axis=0) + forcing, dx
-
-    return X, jax.lax.scan(body, dx0, (A, b))[1]
+    A = slopes(step, X, inputs, constants)
+    b = forcing(step, X, inputs, dinputs, constants, dconstants)
+    return X, recursion(A, b, dx0)

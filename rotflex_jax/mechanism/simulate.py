@@ -11,7 +11,8 @@ from rotflex_jax.mechanism.assembly import driven_voltage, read_outputs, rest_st
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import states
 from rotflex_jax.mechanism.smooth import SmoothRK4
-from rotflex_jax.mechanism.step import Exponential, apply
+from rotflex_jax.mechanism.step import Exponential
+from rotflex_jax.mechanism.torques import apply
 from rotflex_jax.precision import working_precision
 
 Solver = Exponential | SmoothRK4
@@ -29,13 +30,14 @@ class _FreeStep:
 
 
 @dataclasses.dataclass(frozen=True)
-class _PredictorStep:
+class PredictorStep:
     """State to state, corrected by the measured output first: `x+ = F(x + K (y - h(x)), v)`."""
 
     structure: Mechanism
     solver: Solver
 
     def __call__(self, x: jax.Array, w: tuple[jax.Array, ...], constants: Any) -> jax.Array:
+        """State one sample later; `w` is voltage, outputs, and whether they may correct the state."""
         v, y, seen = w
         c, K = constants
         mechanism = self.structure.with_values(c.values)
@@ -98,7 +100,7 @@ def predictor_run(
     mechanism = structure.with_values(values)
     c = solver.prepare(structure, values, gates, Ts)
     v = driven_voltage(mechanism, gates, u, Ts)
-    X = states(_PredictorStep(structure, solver), x0, (v, y, seen), (c, K))
+    X = states(PredictorStep(structure, solver), x0, (v, y, seen), (c, K))
     return X, read_outputs(mechanism, gates, X.T).T
 
 

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rotflex_jax.effects.kinds import DryFriction, Force, Memory
+from rotflex_jax.effects.kinds import DryFriction
 from rotflex_jax.mechanism.assembly import Equations, Layout, effects_of, equations
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.step import along, apply, port_motion
+from rotflex_jax.mechanism.step import along
+from rotflex_jax.mechanism.torques import apply, flows, port_motion, torques
 
 
 class SmoothConstants(NamedTuple):
@@ -65,21 +66,13 @@ class SmoothRK4:
         dL = apply(eq.A, L) + along(eq.B, v)
         if not layout.torque_ports:
             return dL
+        total = torques(mechanism, L, z, v, c.gates)
         position, speed = port_motion(layout, L)
-        total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
-        flows: list[jax.Array] = []
-        for i, e in effects_of(mechanism, Force):
-            k = layout.torque_ports.index(e.at)
-            total[k] = total[k] + c.gates[i] * e.force(position[k], speed[k], v)
         for i, e in effects_of(mechanism, DryFriction):
             k = layout.torque_ports.index(e.at)
             size = jnp.abs(speed[k])
             up, down = (e.limit(position[k], size, way) for way in (1.0, -1.0))
             smooth = jnp.tanh(speed[k] / self.width)
-            total[k] = total[k] - c.gates[i] * jnp.where(smooth > 0, up, down) * smooth
-        for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
-            k = layout.torque_ports.index(e.at)
-            total[k] = total[k] + c.gates[i] * e.force(z[m], position[k], speed[k], v)
-            flows.append(jnp.asarray(e.flow(z[m], position[k], speed[k], v)))
-        dL = dL + apply(eq.ports, jnp.stack(total))
-        return jnp.concatenate([dL, jnp.stack(flows)]) if flows else dL
+            total = total.at[k].add(-c.gates[i] * jnp.where(smooth > 0, up, down) * smooth)
+        dL = dL + apply(eq.ports, total)
+        return jnp.concatenate([dL, flows(mechanism, L, z, v, c.gates)]) if z.shape[0] else dL

@@ -10,17 +10,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rotflex_jax.effects.kinds import DryFriction, Force, Memory
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of
 from rotflex_jax.mechanism.friction import contacts, solve_masked, within
 from rotflex_jax.mechanism.mechanism import Mechanism
-
-
-def apply(A: jax.Array, x: jax.Array) -> jax.Array:
-    """`A @ x` for `x` of shape (n, ...) as multiply and add, which the compiler fuses into the loop."""
-    return jnp.sum(A.reshape(A.shape + (1,) * (x.ndim - 1)) * x[None], axis=1)
+from rotflex_jax.mechanism.torques import apply, port_motion, remember, torques
 
 
 def along(a: jax.Array, v: jax.Array) -> jax.Array:
@@ -73,13 +68,13 @@ def _advance(
     smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
     if not smooth:
         return _brake(mechanism, L, start, c, solver.passes)
-    f0 = _torques(mechanism, L, z, v, c.gates)
+    f0 = torques(mechanism, L, z, v, c.gates)
     guess = start + apply(c.hold, f0)
     brake = _brake_guess(mechanism, L, guess, c)
     end = guess + apply(c.hold, brake)
-    z1 = _remember(mechanism, z, (L + end) / 2, v, c.h)
+    z1 = remember(mechanism, z, (L + end) / 2, v, c.gates, c.h)
     if solver.order == 2:
-        final = guess + apply(c.ramp, _torques(mechanism, end, z1, v, c.gates) - f0)
+        final = guess + apply(c.ramp, torques(mechanism, end, z1, v, c.gates) - f0)
     else:
         final = start + _fourth_order(mechanism, L, z, z1, v, f0, brake, c)
     final = _brake(mechanism, L, final, c, solver.passes)
@@ -90,55 +85,16 @@ def _fourth_order(mechanism, L, z, z1, v, f0, brake, c):  # noqa: ANN001, ANN202
     """Contribution of the smooth torques over the step, ETDRK4."""
     half = apply(c.half_E, L) + along(c.half_input, v)
     a = half + apply(c.half_hold, f0 + brake)
-    zh = _remember(mechanism, z, (L + a) / 2, v, c.h / 2)
-    fa = _torques(mechanism, a, zh, v, c.gates)
+    zh = remember(mechanism, z, (L + a) / 2, v, c.gates, c.h / 2)
+    fa = torques(mechanism, a, zh, v, c.gates)
     b = half + apply(c.half_hold, fa + brake)
-    fb = _torques(mechanism, b, zh, v, c.gates)
+    fb = torques(mechanism, b, zh, v, c.gates)
     e = apply(c.half_E, a) + along(c.half_input, v) + apply(c.half_hold, 2 * fb - f0 + brake)
-    fe = _torques(mechanism, e, z1, v, c.gates)
+    fe = torques(mechanism, e, z1, v, c.gates)
     first = c.hold - 3 * c.ramp + 4 * c.rise
     middle = 2 * c.ramp - 4 * c.rise
     last = 4 * c.rise - c.ramp
     return apply(first, f0) + apply(middle, fa + fb) + apply(last, fe)
-
-
-def port_motion(layout: Layout, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Positions and speeds of the torque ports."""
-    P = jnp.asarray(np.array(layout.port_matrix), x.dtype)
-    return apply(P, x[: layout.n]), apply(P, x[layout.n : 2 * layout.n])
-
-
-def _torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
-    """Smooth torques at the torque ports."""
-    layout = Layout.of(mechanism.structure)
-    position, speed = port_motion(layout, x)
-    total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
-    for i, e in effects_of(mechanism, Force):
-        k = layout.torque_ports.index(e.at)
-        total[k] = total[k] + gates[i] * e.force(position[k], speed[k], v)
-    for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
-        k = layout.torque_ports.index(e.at)
-        total[k] = total[k] + gates[i] * e.force(z[m], position[k], speed[k], v)
-    return jnp.stack(total)
-
-
-def _remember(mechanism: Mechanism, z: jax.Array, x: jax.Array, v: jax.Array, h: jax.Array) -> jax.Array:
-    """Memories after `h`, port motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
-    layout = Layout.of(mechanism.structure)
-    found = effects_of(mechanism, Memory)
-    if not found:
-        return z
-    position, speed = port_motion(layout, x)
-    new = []
-    for m, (_, e) in enumerate(found):
-        k = layout.torque_ports.index(e.at)
-        law = lambda s, e=e, k=k: e.flow(s, position[k], speed[k], v)  # noqa: E731
-        rate, slope = jax.jvp(law, (z[m],), (jnp.ones_like(z[m]),))
-        a = slope * h
-        small = jnp.abs(a) < 1e-6
-        phi = jnp.where(small, 1 + a / 2, jnp.expm1(a) / jnp.where(small, 1.0, a))
-        new.append(z[m] + h * phi * rate)
-    return jnp.stack(new)
 
 
 def _levels(

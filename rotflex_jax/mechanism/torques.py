@@ -1,0 +1,111 @@
+"""Torques of the effects that are neither linear nor dry friction, and the states these remember."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rotflex_jax.effects.kinds import Force, Linear, Memory
+from rotflex_jax.mechanism.assembly import Layout, effects_of
+from rotflex_jax.mechanism.mechanism import Mechanism
+
+
+def apply(A: jax.Array, x: jax.Array) -> jax.Array:
+    """`A @ x` for `x` of shape (n, ...) as multiply and add, which the compiler fuses into the loop."""
+    return jnp.sum(A.reshape(A.shape + (1,) * (x.ndim - 1)) * x[None], axis=1)
+
+
+def port_motion(layout: Layout, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Positions and speeds of the torque ports."""
+    P = jnp.asarray(np.array(layout.port_matrix), x.dtype)
+    return apply(P, x[: layout.n]), apply(P, x[layout.n : 2 * layout.n])
+
+
+def motor_torque(mechanism: Mechanism, at: str, x: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
+    """Torque [N m] that the linear motors at a port give at the linear state `x` and voltage `v`.
+
+    A current counts as settled: it jumps within the step with every new voltage, so its values at the
+    ends of a step tell nothing of its mean.
+    """
+    layout = Layout.of(mechanism.structure)
+    speed = apply(jnp.asarray([mechanism.port_vectors[at]], x.dtype), x[layout.n : 2 * layout.n])[0]
+    total = jnp.zeros_like(speed)
+    for i, e in effects_of(mechanism, Linear):
+        if not (e.motor and e.at == at):
+            continue
+        stamp = e.stamp()
+        total = total + gates[i] * (stamp.drive * v - stamp.damping * speed)
+        if e.order:
+            own = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in row]) for row in stamp.own])
+            columns = (stamp.from_speed, stamp.from_voltage)
+            ways = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in way]) for way in columns])
+            per_speed, per_volt = -jnp.linalg.solve(own, ways.T).T @ jnp.stack(
+                [jnp.asarray(c, x.dtype) for c in stamp.torque]
+            )
+            total = total + gates[i] * (per_speed * speed + per_volt * v)
+    return total
+
+
+class _Drives:
+    """The last argument of memory laws, formed once per kind and port."""
+
+    def __init__(self, mechanism: Mechanism, x: jax.Array, v: jax.Array, gates: jax.Array) -> None:
+        self.given = mechanism, x, v, gates
+        self.known: dict[str, jax.Array] = {}
+
+    def __call__(self, effect: Memory) -> jax.Array:
+        mechanism, x, v, gates = self.given
+        if effect.driven_by == "voltage":
+            return v
+        if effect.at not in self.known:
+            self.known[effect.at] = motor_torque(mechanism, effect.at, x, v, gates)
+        return self.known[effect.at]
+
+
+def torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
+    """Torques (ports, ...) of forces and memories at the torque ports.
+
+    Args:
+        mechanism: With (traced) numbers.
+        x: Linear part of the state (n, ...).
+        z: Memories (m, ...).
+        v: Voltage (...) [V].
+        gates: One factor per effect.
+    """
+    layout = Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    drive = _Drives(mechanism, x, v, gates)
+    total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
+    for i, e in effects_of(mechanism, Force):
+        k = layout.torque_ports.index(e.at)
+        total[k] = total[k] + gates[i] * e.force(position[k], speed[k], v)
+    for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
+        k = layout.torque_ports.index(e.at)
+        total[k] = total[k] + gates[i] * e.force(z[m], position[k], speed[k], drive(e))
+    return jnp.stack(total)
+
+
+def flows(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
+    """Time derivatives (m, ...) of the memories; arguments as for `torques`."""
+    layout = Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    drive = _Drives(mechanism, x, v, gates)
+    rates = []
+    for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
+        k = layout.torque_ports.index(e.at)
+        rates.append(jnp.asarray(e.flow(z[m], position[k], speed[k], drive(e))))
+    return jnp.stack(rates)
+
+
+def remember(
+    mechanism: Mechanism, z: jax.Array, x: jax.Array, v: jax.Array, gates: jax.Array, h: jax.Array
+) -> jax.Array:
+    """Memories after `h` [s], motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
+    if not z.shape[0]:
+        return z
+    law = lambda s: flows(mechanism, x, s, v, gates)  # noqa: E731
+    # Each flow depends on its own state only, so one direction tells all slopes.
+    rate, slope = jax.jvp(law, (z,), (jnp.ones_like(z),))
+    a = slope * h
+    small = jnp.abs(a) < 1e-6
+    phi = jnp.where(small, 1 + a / 2, jnp.expm1(a) / jnp.where(small, 1.0, a))
+    return z + h * phi * rate

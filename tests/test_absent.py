@@ -1,0 +1,186 @@
+"""Slopes along effects that are off equal those of a run that carries them, state by state."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rotflex_jax.effects as fx
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism import Exponential, Mechanism, kalman_gains, predictor_run, simulate
+from rotflex_jax.mechanism.absent import Numbers, Samples, absent_slopes, run_slopes
+from rotflex_jax.mechanism.assembly import Layout, driven_voltage, read_outputs, rest_state
+from rotflex_jax.mechanism.simulate import PredictorStep
+from rotflex_jax.precision import double_precision
+
+Ts, N = 0.004, 150
+SOLVER = Exponential(passes=2)
+# Each program runs once, so time spent on making it fast is lost.
+ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
+BASELINES = {
+    # The current and a memory stand in front of and behind the states of what is absent.
+    "memory and current": paper(inductance=0.18e-3, joint_damping=1e-3) + fx.Dahl("arm", 0.004, 0.01),
+    "dry friction": paper(joint_damping=1e-3) + fx.Coulomb("hub", 0.03),
+}
+FEW = {
+    ("second_mode", "arm"),
+    ("heating", "hub"),
+    ("lugre", "joint"),
+    ("bouc_wen", "joint"),
+    ("lag", "input"),
+    ("rectifier", "alpha"),
+}
+
+
+def places(case: str) -> list[tuple[type[fx.Effect], str]]:
+    """All that a search tries, as far as the baseline lacks it; a few of them beside dry friction.
+
+    None of these is dry friction: a contact of level zero that turns round in the very step in which
+    another one stops changes how far that one slips.
+    """
+    has = {(e.name, e.at) for e in BASELINES[case].effects}
+    pairs = [(cls, port) for cls, port in fx.candidates() if (cls.name, port) not in has]
+    return [pair for pair in pairs if case != "dry friction" or (pair[0].name, pair[1]) in FEW]
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A baseline, the same with absent effects, a recording, and directions along these effects."""
+
+    baseline: Mechanism
+    full: Mechanism
+    present: list[int]
+    numbers: Numbers
+    samples: Samples
+    names: list[str]
+    dvalues: np.ndarray
+    dgates: np.ndarray
+
+    def run(self, values: Any, gates: Any) -> jax.Array:
+        """Predicted outputs of the whole structure by an ordinary scan."""
+        structure, n, s = self.full.structure, self.numbers, self.samples
+        step, mechanism = PredictorStep(structure, SOLVER), structure.with_values(values)
+        constants = (SOLVER.prepare(structure, values, gates, s.Ts), n.K)
+        inputs = (driven_voltage(mechanism, gates, s.u, s.Ts), s.y, s.seen)
+        X = jax.lax.scan(lambda x, w: (step(x, w, constants), x), n.x0, inputs)[1]
+        return read_outputs(mechanism, gates, X.T).T
+
+
+def own_states(mechanism: Mechanism, first: int) -> list[int]:
+    """Places in the state of what belongs to the effects from `first` on, found by taking them away."""
+    kept, at = [], 2 * len(mechanism.coordinates)
+    for kind in (fx.Linear, fx.Memory):
+        for i, e in enumerate(mechanism.effects):
+            if isinstance(e, kind):
+                count = e.order if isinstance(e, fx.Linear) else 1
+                kept += [at + k for k in range(count)] if i >= first else []
+                at += count
+    return kept
+
+
+@functools.cache
+def case_of(case: str) -> Case:
+    baseline = full = BASELINES[case]
+    for cls, port in places(case):
+        shape = {n: 0.0 if n in cls.amplitudes else 1.1 * s.typical for n, s in cls.declared().items()}
+        shape |= {"limit": 0.8} if cls is fx.Saturation else {}  # one that is met
+        full = full + cls(at=port, **shape)
+    first, names = len(baseline.effects), full.parameter_names
+    listed, dvalues, dgates = [], [], []
+    for i, e in enumerate(full.effects[first:], first):
+        for name in e.amplitudes or (None,):
+            dvalues.append(np.zeros(len(names)))
+            dgates.append(np.zeros(len(full.effects)))
+            if name is None:
+                dgates[-1][i] = 1.0
+            else:
+                dvalues[-1][names.index(f"{e.at}.{e.name}.{name}")] = e.declared()[name].typical
+            listed.append(f"{e.at}.{e.name}.{name}")
+    size, absent = Layout.of(full.structure).size, own_states(full, first)
+    present = [i for i in range(size) if i not in absent]
+    rng = np.random.default_rng(0)
+    # What a predictor uses that trusts its sensors, and something for the states that are not there.
+    K = 0.05 * rng.normal(size=(size, 2))
+    K[present] = kalman_gains(baseline, [{"hub": 1e-4, "joint": 1e-5}], [5e-4, 5e-4], Ts)[0]
+    assert np.abs(K[:4]).max() > 50
+    u = 1.5 * np.repeat(rng.normal(size=N // 5), 5)
+    y = simulate(paper(stiffness=1.5), u, Ts) + 5e-4 * rng.normal(size=(N, 2))
+    x0 = rest_state(full.structure, np.float64)
+    x0[:4] = [0.1, 0.01, 0.2, -0.1]
+    gates = [1.0 if i < first or e.amplitudes else 0.0 for i, e in enumerate(full.effects)]
+    with double_precision():
+        numbers = Numbers(*map(jnp.asarray, (full.values, np.array(gates), x0, K)))
+        samples = Samples(*map(jnp.asarray, (u, y, 1.0 * (rng.random(N) < 0.9), Ts)))
+    return Case(baseline, full, present, numbers, samples, listed, np.array(dvalues), np.array(dgates))
+
+
+@functools.cache
+def found(case: str) -> np.ndarray:
+    """Slopes along the absent effects from the recursion of the baseline alone."""
+    c = case_of(case)
+    with double_precision():
+        present = jnp.array(c.present)
+        values, gates = jnp.asarray(c.baseline.values), jnp.ones(len(c.baseline.effects))
+        mine = Numbers(values, gates, c.numbers.x0[present], c.numbers.K[present])
+        slopes = jax.jit(run_slopes, static_argnums=(0, 1), compiler_options=ROUGH)
+        A = slopes(c.baseline.structure, SOLVER, mine, c.samples)
+        assert A.shape == (N, len(present), len(present))
+        along = jax.jit(absent_slopes, static_argnums=(0, 1), compiler_options=ROUGH)
+        ways = (jnp.asarray(c.dvalues), jnp.asarray(c.dgates))
+        return np.asarray(along(c.full.structure, SOLVER, c.numbers, c.samples, present, A, *ways))
+
+
+@pytest.mark.parametrize("case", BASELINES)
+def test_slopes_are_those_of_the_whole_run(case):
+    """Against JAX's own derivative of a scan that carries every effect and its states."""
+    c = case_of(case)
+    assert len(places(case)) >= len(FEW) and len(c.present) < Layout.of(c.full.structure).size
+
+    def slope(dvalues, dgates):
+        return jax.jvp(c.run, (c.numbers.values, c.numbers.gates), (dvalues, dgates))[1]
+
+    with double_precision():
+        ways = (jnp.asarray(c.dvalues), jnp.asarray(c.dgates))
+        expected = np.asarray(jax.jit(jax.vmap(slope), compiler_options=ROUGH)(*ways))
+    for name, mine, whole in zip(c.names, found(case), expected, strict=True):
+        size = np.abs(whole).max()
+        assert size > 1e-5, name
+        np.testing.assert_allclose(mine, whole, rtol=0, atol=1e-9 * size, err_msg=name)
+
+
+def test_slopes_foretell_what_a_little_of_an_effect_does():
+    """Against the difference of two runs, one with a millionth of the effect's usual size."""
+    c, h = case_of("dry friction"), 1e-6
+    with double_precision():
+        run = jax.jit(jax.vmap(c.run), compiler_options=ROUGH)
+        values = c.numbers.values[None] + h * jnp.asarray(np.vstack([0 * c.dvalues[:1], c.dvalues]))
+        gates = c.numbers.gates[None] + h * jnp.asarray(np.vstack([0 * c.dgates[:1], c.dgates]))
+        y = np.asarray(run(values, gates))
+    for name, mine, moved in zip(c.names, found("dry friction"), (y[1:] - y[0]) / h, strict=True):
+        np.testing.assert_allclose(mine, moved, rtol=0, atol=1e-5 * np.abs(moved).max(), err_msg=name)
+
+
+def test_a_run_with_absent_effects_is_the_run_without():
+    c = case_of("dry friction")
+    with double_precision():
+        gates = jnp.ones(len(c.baseline.effects))
+        present = jnp.array(c.present)
+        plain = predictor_run(
+            c.baseline.structure,
+            SOLVER,
+            jnp.asarray(c.baseline.values),
+            gates,
+            c.numbers.x0[present],
+            c.samples.u,
+            c.samples.y,
+            c.samples.seen,
+            c.numbers.K[present],
+            c.samples.Ts,
+        )[1]
+        whole = c.run(c.numbers.values, c.numbers.gates)
+    np.testing.assert_allclose(whole, plain, rtol=0, atol=1e-12)

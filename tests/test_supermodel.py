@@ -1,0 +1,219 @@
+"""A super-model runs on the part of it that is switched on, and says the same there."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rotflex_jax.effects as fx
+from rotflex_jax.discover.lanes import Bench, Directions, Lane
+from rotflex_jax.discover.probing import probe
+from rotflex_jax.discover.supermodel import SuperModel, build, state_rows
+from rotflex_jax.fit.residuals import Data
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism import Exponential, kalman_gains, simulate
+from rotflex_jax.mechanism.assembly import Layout, driven_voltage, read_outputs
+from rotflex_jax.mechanism.simulate import PredictorStep
+from rotflex_jax.precision import double_precision
+
+TS, N = (0.004, 0.005), 120
+SCALES = {p: fx.Scale(2.0, 3.0, 0.3, 0.2, 1.6, 0.006) for p in ("hub", "arm", "joint")}
+SCALES |= {p: fx.Scale(2.0, 1.0, 0.3, 0.2) for p in ("input", "theta", "alpha")}
+PROCESS = {"hub": 1e-5, "joint": 1e-6}
+WANTED = (
+    (fx.LuGre, "hub"),
+    (fx.SecondMode, "arm"),
+    (fx.CubicSpring, "joint"),
+    (fx.Heating, "hub"),
+    (fx.BoucWen, "joint"),
+    (fx.Lag, "input"),
+    (fx.Coulomb, "joint"),
+)
+SETS = {
+    "nothing": (),
+    "without states": (("cubic_spring", "joint"), ("lag", "input")),
+    "one memory": (("heating", "hub"), ("cubic_spring", "joint")),
+    "a mode and dry friction": (("second_mode", "arm"), ("coulomb", "joint")),
+    "all": tuple((cls.name, port) for cls, port in WANTED),
+}
+
+
+@functools.cache
+def supermodel() -> SuperModel:
+    """A baseline that has states of two kinds itself, with candidates that bring more of both."""
+    baseline = paper(inductance=0.18e-3, joint_damping=1e-3) + fx.Dahl("arm", 0.004, 0.01)
+    return build(baseline, WANTED, SCALES)
+
+
+@functools.cache
+def bench() -> Bench:
+    rng = np.random.default_rng(0)
+    u = 1.5 * np.repeat(rng.normal(size=(2, N // 5)), 5, axis=1)
+    y = np.stack([simulate(paper(stiffness=1.5), v, Ts) for v, Ts in zip(u, TS, strict=True)])
+    y = y + 5e-4 * rng.normal(size=y.shape)
+    data = Data(u, y, 1.0 * (rng.random((2, N)) < 0.95), np.array(TS))
+    return Bench(supermodel(), Exponential(), data)
+
+
+def numbers(name: str) -> Lane:
+    """Numbers of a set for the whole super-model, each recording with its own offsets and first state."""
+    s, rng = supermodel(), np.random.default_rng(1)
+    values, size = np.tile(s.mechanism.values, (2, 1)), Layout.of(s.mechanism.structure).size
+    values[:, s.local] = 0.01 * rng.normal(size=(2, len(s.local)))
+    K, x0 = 0.02 * rng.normal(size=(2, size, 2)), np.zeros((2, size))
+    for r, Ts in enumerate(TS):
+        K[r, s.baseline_states] = kalman_gains(s.baseline, [PROCESS], [5e-4, 5e-4], Ts)[0]
+    gates = s.gates(s.calibrations + SETS[name])
+    x0[:, list(s.part(gates).states)] = 0.1  # at rest what is off
+    return Lane(values, x0 * rng.normal(size=x0.shape), gates, K)
+
+
+def lane(name: str) -> Lane:
+    """The same as a bench takes it: the first state is that of the part that runs."""
+    whole = numbers(name)
+    return whole._replace(x0=whole.x0[:, list(supermodel().part(whole.gates).states)])
+
+
+@functools.cache
+def program():
+    """Innovations of the whole super-model by ordinary scans, and their slopes as JAX makes them."""
+    structure, solver = supermodel().mechanism.structure, Exponential()
+    step = PredictorStep(structure, solver)
+
+    def predicted(gates, values, x0, K, u, y, seen, Ts):
+        mechanism = structure.with_values(values)
+        constants = (solver.prepare(structure, values, gates, Ts), K)
+        inputs = (driven_voltage(mechanism, gates, u, Ts), y, seen)
+        X = jax.lax.scan(lambda x, w: (step(x, w, constants), x), x0, inputs)[1]
+        return (y - read_outputs(mechanism, gates, X.T).T) * seen[:, None]
+
+    def run(whole, dvalues, dgates):
+        def e(values, gates):
+            each = jax.vmap(functools.partial(predicted, gates))
+            return each(values, whole.x0, whole.K, *bench().on_device())
+
+        at = (whole.values, whole.gates)
+        return e(*at), jax.vmap(lambda dv, dg: jax.jvp(e, at, (dv, dg))[1])(dvalues, dgates)
+
+    # It runs a few times only, so time spent on making it fast is lost.
+    rough = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+    return jax.jit(run, compiler_options=rough)
+
+
+def whole_run(whole: Lane, along: Directions) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations (R, N, C) and slopes (D, R, N, C)."""
+    with double_precision():
+        e, J = program()(*jax.tree.map(jnp.asarray, (whole, along.values, along.gates)))
+        return np.asarray(e), np.asarray(J)
+
+
+def directions(name: str, *names: str) -> Directions:
+    """Along parameters by a tenth of their values, in the first state not at all; always five."""
+    m, on = supermodel().mechanism, lane(name)
+    sizes = ((2, len(m.values)), on.x0.shape[1:], on.gates.shape)
+    d = Directions(*(np.zeros((5, *size)) for size in sizes))
+    for row, parameter in enumerate(names):
+        i = m.parameter_names.index(parameter)
+        d.values[row, :, i] = 0.1 * m.values[i]
+    return d
+
+
+# -- where things are ---------------------------------------------------------------------------
+
+
+def test_states_of_linear_effects_come_first_then_memories():
+    s = supermodel()
+    rows = {(e.name, e.at): state_rows(s.mechanism).get(i) for i, e in enumerate(s.mechanism.effects)}
+    assert {place: r for place, r in rows.items() if r} == {
+        ("motor", "hub"): (4,),
+        ("second_mode", "arm"): (5, 6),
+        ("dahl", "arm"): (7,),
+        ("lugre", "hub"): (8,),
+        ("heating", "hub"): (9,),
+        ("bouc_wen", "joint"): (10,),
+    }
+    assert Layout.of(s.mechanism.structure).size == 11
+    assert s.baseline_states == [0, 1, 2, 3, 4, 7]
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_part_lacks_what_is_off_and_costs(name):
+    s, gates = supermodel(), lane(name).gates
+    part = s.part(gates)
+    costly = {("lugre", "hub"), ("second_mode", "arm"), ("heating", "hub")}
+    costly |= {("bouc_wen", "joint"), ("coulomb", "joint")}
+    expected = [e for e in s.mechanism.effects if (e.name, e.at) not in costly - set(SETS[name])]
+    assert list(part.mechanism.effects) == expected
+    assert [s.mechanism.effects[i] for i in part.effects] == expected
+    np.testing.assert_array_equal(s.mechanism.values[list(part.parameters)], part.mechanism.values)
+    assert [s.mechanism.parameter_names[i] for i in part.parameters] == [*part.mechanism.parameter_names]
+    assert len(part.states) == Layout.of(part.mechanism.structure).size
+    assert set(s.baseline_states) <= set(part.states)
+    mine, all_rows = state_rows(part.mechanism), state_rows(s.mechanism)
+    for k, i in enumerate(part.effects):
+        assert tuple(part.states[row] for row in mine.get(k, ())) == all_rows.get(i, ())
+    assert s.part(gates) is part  # compiled once
+    assert part.mechanism.trusted == s.baseline.trusted
+
+
+def test_a_part_holds_all_that_any_of_several_lanes_needs():
+    s = supermodel()
+    both = np.stack([lane("one memory").gates, lane("a mode and dry friction").gates])
+    kept = {(s.mechanism.effects[i].name) for i in s.part(both).effects}
+    assert {"heating", "second_mode", "coulomb"} <= kept and not {"lugre", "bouc_wen"} & kept
+    off = lane("nothing").gates
+    assert s.part(off).mechanism.structure == s.part(lane("without states").gates).mechanism.structure
+
+
+def test_candidates_that_could_not_act_are_left_out():
+    flat = {p: dataclasses.replace(scale, stiffness=0.0, inertia=0.0) for p, scale in SCALES.items()}
+    wanted = ((fx.Heating, "arm"), (fx.Heating, "hub"), (fx.JointPlay, "joint"), (fx.SecondMode, "arm"))
+    assert set(build(paper(), wanted, flat).candidates) == {("heating", "hub")}
+    without_motor = paper().without("motor", "hub")
+    assert set(build(without_motor, wanted, SCALES).candidates) == {
+        ("joint_play", "joint"),
+        ("second_mode", "arm"),
+    }
+
+
+# -- what they say ------------------------------------------------------------------------------
+
+
+def test_innovations_on_parts_are_those_of_the_whole():
+    names = ("nothing", "without states", "one memory", "a mode and dry friction")
+    found = bench().innovations([lane(name) for name in names])
+    for name, mine in zip(names, found, strict=True):
+        whole = whole_run(numbers(name), directions(name))[0]
+        np.testing.assert_allclose(mine, whole, rtol=0, atol=1e-10, err_msg=name)
+        assert name == "nothing" or np.abs(mine - found[0]).max() > 1e-4
+
+
+def test_slopes_on_parts_are_those_of_the_whole():
+    name = "a mode and dry friction"
+    along = directions(name, "hub.motor.torque_constant", "arm.second_mode.frequency", "joint.coulomb.level")
+    along.gates[3] = supermodel().gates([("cubic_spring", "joint")])
+    e, J = bench().slopes([lane(name)], [along])
+    whole_e, whole_J = whole_run(numbers(name), along)
+    np.testing.assert_allclose(e[0], whole_e, rtol=0, atol=1e-10)
+    for mine, whole in zip(J[0], whole_J, strict=True):
+        np.testing.assert_allclose(mine, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
+    assert np.abs(whole_J[:4]).max(axis=(1, 2, 3)).min() > 1e-5
+
+
+def test_probes_are_the_slopes_of_the_whole():
+    """Along amplitudes of what is off, and along the gate of the lag, which has no amplitude."""
+    s, now = supermodel(), lane("one memory")
+    names = ("hub.lugre.level", "joint.bouc_wen.level", "arm.second_mode.inertia", "joint.coulomb.level")
+    along = directions("one memory", *names)
+    along.gates[4] = s.gates([("lag", "input")]) - s.gates(())
+    values, put_in = now.values.copy(), lane("all").gates - along.gates[4]
+    values[:, [s.mechanism.parameter_names.index(name) for name in names]] = 0.0
+    J = probe(bench(), now, [Lane(values, now.x0, put_in, now.K)], [along])[0]
+    whole = whole_run(numbers("one memory")._replace(values=values, gates=put_in), along)[1]
+    for name, mine, expected in zip((*names, "lag"), J, whole, strict=True):
+        size = np.abs(expected).max()
+        assert size > 1e-6, name
+        np.testing.assert_allclose(mine, expected, rtol=0, atol=1e-9 * size, err_msg=name)
