@@ -1,6 +1,7 @@
 """B0: does the search find one hidden effect, and nothing where nothing is hidden?
 
-Every effect of the arena at every port where it makes sense, two inputs and two seeds each, and
+Every effect of the arena at every port where it makes sense, two inputs and two seeds each; a few
+effects that the package has no name for, of which it should say that something is unexplained; and
 20 records with nothing hidden. The arena simulates them with a plant whose constants are up to
 20 % off the baseline's; the search sees voltage and encoder readings. Nothing was tuned on the
 report seeds.
@@ -36,7 +37,7 @@ for folder in (HERE, HERE.parent):
 
 from rich.console import Console
 
-from arena.hidden import DEFAULTS
+from arena.hidden import DEFAULTS, OUTSIDE
 from arena.records import INPUTS
 from arena.table import answer, label, show
 
@@ -50,7 +51,7 @@ def jobs(seeds: list[int], inputs: list[str], nulls: int, seconds: float, only: 
     kinds = list(INPUTS)
     hidden = [
         {"effects": [list(place)], "kind": kind, "seed": seed}
-        for place in DEFAULTS
+        for place in (*DEFAULTS, *OUTSIDE)
         for kind in inputs
         for seed in seeds
     ]

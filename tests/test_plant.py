@@ -10,7 +10,8 @@ from scipy.linalg import expm
 
 from arena import plant as p
 from arena.demo_record import EFFECTS, FOLDER, HEADER, demo
-from arena.hidden import ABSORBED, DEFAULTS, EQUIVALENT, UNSEEN, laws, parameters
+from arena.hidden import ABSORBED, DEFAULTS, EQUIVALENT, UNSEEN, parameters
+from arena.laws import laws
 from arena.records import COUNT, INPUTS, JITTER, make_record
 
 BARE = p.Plant(B_hub=0.0, B_joint=0.0)
@@ -350,8 +351,8 @@ def test_look_alikes_are_known_effects():
 
 
 def test_a_mistaken_request_is_explained():
-    with pytest.raises(ValueError, match="no backlash at hub"):
-        make_record([("backlash", "hub")])
+    with pytest.raises(ValueError, match="no backlash at arm"):
+        make_record([("backlash", "arm")])
     with pytest.raises(ValueError, match="its parameters are level"):
         make_record({("coulomb", "hub"): {"mu": 0.3}})
     with pytest.raises(ValueError, match="no input 'ramp'"):

@@ -7,48 +7,39 @@ Hub angle `theta`, arm angle relative to the hub `alpha`. In the absolute speeds
     J_h \dot w_1 = g\, v + f_{hub} - f_{joint}, \qquad
     J_a \dot w_2 = f_{arm} + f_{joint}, \qquad g = \eta k_t K_g / R_m,
 
-and each of the three ports carries one torque law of its own position ``z`` and speed ``s``,
-
-.. math::
-    f = -(B + D|s|)\, s - (K + K_2 z + K_3 z^2)\, z - G \sin(z + \phi)
-        - F(s)\,\mathrm{Sgn}(s), \qquad
-    F(s) = F_\pm + E\, e^{-(s/s_0)^2},
-
-where ``Sgn(0)`` is the whole interval [-1, 1]. The voltage passes limiter, offset and dead zone,
-in this order, before it reaches the motor; back-EMF is a damper of ``g k_m K_g`` at the hub.
-
-A law is one row of a small table, a new law is one more column and one more term in `_torque`
-(or, for voltages, in `_amplifier`).
-
-Source: G. Capobianco and S. R. Eugster, Time finite element based Moreau-type integrators (2018),
-for the implicit midpoint form; J. J. Moreau, Unilateral contact and dry friction (1988).
+and each of the three ports carries the laws of `arena.tables`. The voltage passes `arena.voltage`
+before it reaches the motor; back-EMF is a damper of ``g k_m K_g`` at the hub, or at the rotor
+while play in the gear (`arena.gear`) keeps it apart.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
+
+from arena.compiled import compiled
+from arena.friction import rough
+from arena.gear import ROTOR_SHARE, geared_step
+from arena.motion import (
+    ALPHA,
+    HEAT,
+    MEMORY,
+    MODES,
+    R_ANGLE,
+    R_SPEED,
+    THETA,
+    W_ARM,
+    W_HUB,
+    Space,
+    step,
+)
+from arena.tables import GEAR_PLAY, HUB, JOINT, STIFFNESS, VISCOUS, Array, Laws, Tables
+from arena.voltage import supply
 
 STEP = 20e-6
 """Length of one integration step [s]."""
-
-HUB, ARM, JOINT = 0, 1, 2
-PORTS = {"hub": HUB, "arm": ARM, "joint": JOINT}
-
-# Columns of the torque table, one row per port, in the order of the equation above.
-VISCOUS, DRAG, STIFFNESS, QUADRATIC, CUBIC, GRAVITY, PHASE = 0, 1, 2, 3, 4, 5, 6
-FRICTION_PLUS, FRICTION_MINUS, STRIBECK, STRIBECK_SPEED = 7, 8, 9, 10
-LAWS = 11
-
-# Entries of the voltage table, in the order in which the voltage meets them.
-LIMIT, OFFSET, DEAD_PLUS, DEAD_MINUS = 0, 1, 2, 3
-VOLTAGES = 4
-
-# Sweeps of the contact solver; the slowest case (all three ports stuck) needs about 100.
-SWEEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -85,133 +76,56 @@ class Plant:
         return self.eta * self.k_t * self.K_g / self.R_m
 
 
-def _no_limits() -> NDArray[np.float64]:
-    volts = np.zeros(VOLTAGES)
-    volts[LIMIT] = np.inf
-    return volts
+class Course(NamedTuple):
+    """All that the plant went through; every row is the start of a sample.
 
-
-@dataclass(frozen=True)
-class Laws:
-    """Everything that acts on the plant beyond its own constants; nothing by default.
-
-    Args:
-        torque: coefficients of the torque laws, ``(3, LAWS)``.
-        volts: coefficients of the voltage path, ``(VOLTAGES,)``.
-        bias: constant error of the two sensors [rad], ``(2,)``.
+    Attributes:
+        motion: ``theta, alpha, theta', alpha'``, ``(N, 4)``.
+        rotor: angle and speed of the rotor, ``(N, 2)``; the hub's own without play in the gear.
+        heat: relative rise of the armature's resistance, ``(N,)``.
+        modes: angle and speed of the oscillators at hub and arm, ``(N, 4)``.
+        memory: normalised hysteretic torques in the order of their rows, ``(N, rows)``.
     """
 
-    torque: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, LAWS)))
-    volts: NDArray[np.float64] = field(default_factory=_no_limits)
-    bias: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    motion: Array
+    rotor: Array
+    heat: Array
+    modes: Array
+    memory: Array
 
 
-@njit(cache=True)
-def _amplifier(u, volts):
-    """Voltage at the motor: limiter, then offset, then dead zone."""
-    v = min(max(u, -volts[LIMIT]), volts[LIMIT]) + volts[OFFSET]
-    if v > volts[DEAD_PLUS]:
-        return v - volts[DEAD_PLUS]
-    if v < -volts[DEAD_MINUS]:
-        return v + volts[DEAD_MINUS]
-    return 0.0
-
-
-@njit(cache=True)
-def _torque(c, z, s):
-    """Smooth part of one port's law at position `z` and speed `s`."""
-    f = -(c[VISCOUS] + c[DRAG] * abs(s)) * s
-    f -= (c[STIFFNESS] + (c[QUADRATIC] + c[CUBIC] * z) * z) * z
-    if c[GRAVITY] != 0.0:
-        f -= c[GRAVITY] * np.sin(z + c[PHASE])
-    return f
-
-
-@njit(cache=True)
-def _stick_or_slip(w1, w2, low, high, impulse, J_hub, J_arm):
-    """Friction impulses of one step and the speeds they leave, by projected Gauss-Seidel.
-
-    At every port the impulse stops the motion if the interval [low, high] allows it, and sits on
-    the end that opposes the motion otherwise. `impulse` holds the guess and receives the answer.
-    """
-    w1 += (impulse[HUB] - impulse[JOINT]) / J_hub
-    w2 += (impulse[ARM] + impulse[JOINT]) / J_arm
-    reduced = J_hub * J_arm / (J_hub + J_arm)
-    tolerance = 1e-14 * (high - low).max()
-    for _ in range(SWEEPS):
-        change = 0.0
-        j = min(max(impulse[HUB] - J_hub * w1, low[HUB]), high[HUB])
-        w1 += (j - impulse[HUB]) / J_hub
-        change = max(change, abs(j - impulse[HUB]))
-        impulse[HUB] = j
-        j = min(max(impulse[ARM] - J_arm * w2, low[ARM]), high[ARM])
-        w2 += (j - impulse[ARM]) / J_arm
-        change = max(change, abs(j - impulse[ARM]))
-        impulse[ARM] = j
-        j = min(max(impulse[JOINT] - reduced * (w2 - w1), low[JOINT]), high[JOINT])
-        w1 -= (j - impulse[JOINT]) / J_hub
-        w2 += (j - impulse[JOINT]) / J_arm
-        change = max(change, abs(j - impulse[JOINT]))
-        impulse[JOINT] = j
-        if change <= tolerance:
-            break
-    # Stuck means at rest, not at 1e-17 rad/s: rounding must not let a stuck port creep.
-    hub_stuck = low[HUB] < impulse[HUB] < high[HUB]
-    arm_stuck = low[ARM] < impulse[ARM] < high[ARM]
-    joint_stuck = low[JOINT] < impulse[JOINT] < high[JOINT]
-    if hub_stuck or (joint_stuck and arm_stuck):
-        w1 = 0.0
-    if arm_stuck:
-        w2 = 0.0
-    elif joint_stuck:
-        w2 = w1
-    return w1, w2
-
-
-@njit(cache=True)
-def _run(u, substeps, h, J_hub, J_arm, gain, c, volts, start):
-    """States ``(theta, alpha, theta', alpha')`` at the start of every sample."""
-    out = np.empty((u.size, 4))
-    low, high, impulse = np.zeros(3), np.zeros(3), np.zeros(3)
-    rough = (c[:, FRICTION_PLUS : STRIBECK + 1] != 0.0).any()
-    theta, alpha = start[0], start[1]
-    w1, w2 = start[2], start[2] + start[3]
-    for k in range(u.size):
-        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = theta, alpha, w1, w2 - w1
-        drive = gain * _amplifier(u[k], volts)
-        for _ in range(substeps):
-            n1, n2 = w1, w2
-            # Implicit midpoint rule; two passes make it second order and h is far below 1/rate.
-            for _ in range(2):
-                m1, m2 = 0.5 * (w1 + n1), 0.5 * (w2 + n2)
-                a, b = theta + 0.5 * h * m1, alpha + 0.5 * h * (m2 - m1)
-                joint = _torque(c[JOINT], b, m2 - m1)
-                n1 = w1 + h * (drive + _torque(c[HUB], a, m1) - joint) / J_hub
-                n2 = w2 + h * (_torque(c[ARM], a + b, m2) + joint) / J_arm
-                if rough:
-                    for p in range(3):
-                        s = m1 if p == HUB else (m2 if p == ARM else m2 - m1)
-                        peak = 0.0
-                        if c[p, STRIBECK] != 0.0:
-                            peak = c[p, STRIBECK] * np.exp(-((s / c[p, STRIBECK_SPEED]) ** 2))
-                        low[p] = -h * (c[p, FRICTION_PLUS] + peak)
-                        high[p] = h * (c[p, FRICTION_MINUS] + peak)
-                    n1, n2 = _stick_or_slip(n1, n2, low, high, impulse, J_hub, J_arm)
-            theta += 0.5 * h * (w1 + n1)
-            alpha += 0.5 * h * (w2 + n2 - w1 - n1)
-            w1, w2 = n1, n2
+@compiled
+def _run(drive, h, tables, start):
+    """States at the start of every sample."""
+    N, substeps = drive.shape
+    x, new = start.copy(), start.copy()
+    out = np.empty((N, x.size))
+    space = Space(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    play, side = tables.motor[GEAR_PLAY] > 0, 0
+    for k in range(N):
+        out[k] = x
+        for i in range(substeps):
+            t = (k * substeps + i) * h
+            if play:
+                side = geared_step(x, new, side, drive[k, i], t, h, tables, space)
+            else:
+                step(x, new, drive[k, i], t + 0.5 * h, h, True, tables, space)
+                x, new = new, x
     return out
 
 
-def simulate(
+def course(
     plant: Plant,
     laws: Laws,
-    u: NDArray[np.float64],
+    u: Array,
     Ts: float,
     start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     step: float = STEP,
-) -> NDArray[np.float64]:
-    """Motion of the joint under a voltage that is held between samples.
+) -> Course:
+    """Motion and inner state of the joint under a voltage that is held between samples.
+
+    The motor is cold at the start, hysteretic torques are zero, oscillators move with their port,
+    and the rotor, as fast as the hub, is in the middle of its play.
 
     Args:
         plant: physical constants.
@@ -220,24 +134,37 @@ def simulate(
         Ts: sampling period [s].
         start: angles [rad] and speeds [rad/s] at the first sample.
         step: longest integration step [s].
-
-    Returns:
-        ``theta, alpha, theta', alpha'`` at the samples, ``(N, 4)``.
     """
     substeps = max(1, round(Ts / step))
-    coefficients = laws.torque.copy()
-    gain = plant.torque_per_volt
-    coefficients[HUB, VISCOUS] += plant.B_hub + gain * plant.k_m * plant.K_g
-    coefficients[JOINT, VISCOUS] += plant.B_joint
-    coefficients[JOINT, STIFFNESS] += plant.K
-    return _run(
-        np.ascontiguousarray(u, dtype=np.float64),
-        substeps,
-        Ts / substeps,
-        plant.J_hub,
-        plant.J_arm,
-        gain,
-        coefficients,
-        laws.volts,
-        np.asarray(start, dtype=np.float64),
-    )
+    h, gain = Ts / substeps, plant.torque_per_volt
+    free, emf = laws.torque.copy(), gain * plant.k_m * plant.K_g
+    free[JOINT, VISCOUS] += plant.B_joint
+    free[JOINT, STIFFNESS] += plant.K
+    engaged = free.copy()
+    engaged[HUB, VISCOUS] += plant.B_hub + emf
+    free[HUB, VISCOUS] += plant.B_hub
+    J = np.array([plant.J_hub, plant.J_arm, ROTOR_SHARE * plant.J_hub])
+    tables = Tables(J, emf, engaged, free, rough(free), laws.hysteresis, laws.modes, laws.motor)
+    x = np.zeros(MEMORY + len(laws.hysteresis))
+    theta, alpha, hub, joint = start
+    arm = hub + joint
+    x[[THETA, ALPHA, W_HUB, W_ARM]] = theta, alpha, hub, arm
+    x[[R_ANGLE, R_SPEED]] = theta, hub
+    x[MODES:MEMORY] = theta, hub, theta + alpha, arm
+    drive = gain * supply(np.ascontiguousarray(u, dtype=np.float64), laws.volts, substeps, h)
+    out = _run(drive, h, tables, x)
+    motion = out[:, [THETA, ALPHA, W_HUB, W_ARM]]
+    motion[:, 3] -= motion[:, 2]
+    return Course(motion, out[:, [R_ANGLE, R_SPEED]], out[:, HEAT], out[:, MODES:MEMORY], out[:, MEMORY:])
+
+
+def simulate(
+    plant: Plant,
+    laws: Laws,
+    u: Array,
+    Ts: float,
+    start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    step: float = STEP,
+) -> Array:
+    """``theta, alpha, theta', alpha'`` at the samples, ``(N, 4)``; arguments as in `course`."""
+    return course(plant, laws, u, Ts, start, step).motion

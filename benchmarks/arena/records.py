@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arena.excite import INPUTS, voltage
-from arena.hidden import ABSORBED, DEFAULTS, EQUIVALENT, UNSEEN, Place, laws, parameters
+from arena.hidden import ABSORBED, DEFAULTS, EQUIVALENT, OUTSIDE, UNSEEN, parameters
+from arena.laws import Place, laws
 from arena.plant import Plant, simulate
+from arena.sensors import read
 
 __all__ = [
     "ABSORBED",
@@ -20,6 +22,7 @@ __all__ = [
     "EQUIVALENT",
     "INPUTS",
     "JITTER",
+    "OUTSIDE",
     "UNSEEN",
     "make_record",
     "perturbed",
@@ -85,7 +88,7 @@ def make_record(
 
     Returns:
         `u` [V] ``(N,)``; `y` [rad] ``(N, 2)`` as encoders report (theta, alpha); `Ts` [s]; `clean`,
-        what perfect sensors would have reported, a hidden bias included; `state`, the true
+        what the sensors would have reported without noise and counting; `state`, the true
         ``(theta, alpha, theta', alpha')``; and `truth`, a dictionary fit for JSON.
 
     Raises:
@@ -111,7 +114,7 @@ def make_record(
     joint, tables = perturbed(of_plant, perturb, nominal), laws(hidden)
     u = voltage(kind, round(seconds * fs), fs, of_input, rms)
     state = simulate(joint, tables, u, 1 / fs)
-    clean = state[:, :2] + tables.bias
+    clean = read(state[:, :2], tables.sensors)
     return {
         "u": u,
         "y": _measured(clean, of_noise),

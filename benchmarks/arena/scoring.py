@@ -6,7 +6,9 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from arena.hidden import ABSORBED, EQUIVALENT, UNSEEN, Place
+from arena.hidden import ABSORBED, EQUIVALENT, OUTSIDE, UNSEEN
+from arena.laws import Place
+from arena.plant import Plant
 
 # Arena's parameter -> the parameters of the same effect in the package.
 _RENAMED: dict[str, dict[str, tuple[str, ...]]] = {
@@ -14,15 +16,17 @@ _RENAMED: dict[str, dict[str, tuple[str, ...]]] = {
     "quadratic_spring": {"coefficient": ("stiffness",)},
     "cubic_spring": {"coefficient": ("stiffness",)},
     "dead_zone": {"width": ("positive", "negative")},
+    "lugre": {"speed": ("slow",)},
 }
 
 
-def renamed(place: Place, values: Mapping[str, float]) -> dict[str, float]:
+def renamed(place: Place, values: Mapping[str, float], K: float = Plant.K) -> dict[str, float]:
     """An effect's parameters under the package's names.
 
     Args:
         place: name and port.
         values: parameters under the arena's names.
+        K: stiffness of the plant's joint [N m/rad], which play takes away.
 
     Returns:
         Parameter names and values as `rotflex_jax.effects` has them.
@@ -30,6 +34,15 @@ def renamed(place: Place, values: Mapping[str, float]) -> dict[str, float]:
     if place[0] == "gravity":  # -m sin(z + phase), expanded
         m, phase = values["moment"], values["phase"]
         return {"sine": m * math.cos(phase), "cosine": m * math.sin(phase)}
+    if place[0] == "cogging":
+        a, phase = values["amplitude"], values["phase"]
+        return {
+            "sine": a * math.cos(phase),
+            "cosine": a * math.sin(phase),
+            "periods": values["periods"],
+        }
+    if place[0] == "joint_play":
+        return {**values, "stiffness": K}
     names = _RENAMED.get(place[0], {})
     return {new: value for old, value in values.items() for new in names.get(old, (old,))}
 
@@ -71,7 +84,8 @@ def scored(
     Returns:
         `first`: the first effect is true, look-alikes allowed; `strict`: true by name; `exact`: the
         whole set; `inside`: every true effect is found or listed; `extra`: effects that are neither
-        true nor look-alikes; `verdict_right`.
+        true nor look-alikes; `verdict_right`, which for an effect outside the package is that
+        something remains unexplained; `outside`: whether there was one.
     """
     listed = set(rounds) | {p for group in equivalents for p in group}
     allowed = {p for place in wanted for p in alike(place)}
@@ -82,17 +96,20 @@ def scored(
         "inside": all(alike(p) & listed for p in wanted),
         "extra": [list(p) for p in rounds if p not in allowed],
     }
-    if not wanted:
+    outside = any(p in OUTSIDE for p in wanted)
+    if outside:
+        right = verdict == "unexplained"
+    elif not wanted:
         right = verdict in ("nothing_missing", "not_excited") and not rounds
     elif verdict == "ambiguous":
         right = marks["inside"]
     else:
         right = verdict == "found" and marks["exact"]
-    return {**marks, "verdict_right": right}
+    return {**marks, "verdict_right": right, "outside": outside}
 
 
 def parameter_errors(
-    hidden: Mapping[Place, Mapping[str, float]], estimates: Mapping[str, Any]
+    hidden: Mapping[Place, Mapping[str, float]], estimates: Mapping[str, Any], K: float = Plant.K
 ) -> dict[str, dict[str, Any]]:
     """True values beside the estimates of the same full name; effects not found are left out.
 
@@ -101,6 +118,7 @@ def parameter_errors(
     Args:
         hidden: parameters under the arena's names.
         estimates: full name `port.effect.parameter` -> object with `value` and `ci95`.
+        K: stiffness of the plant's joint [N m/rad].
 
     Returns:
         Full name -> true value, estimate, error [%], and whether the interval holds the truth.
@@ -109,7 +127,7 @@ def parameter_errors(
     for place, values in hidden.items():
         if place in ABSORBED:
             continue
-        for name, true in renamed(place, values).items():
+        for name, true in renamed(place, values, K).items():
             full = f"{place[1]}.{place[0]}.{name}"
             if full not in estimates:
                 continue

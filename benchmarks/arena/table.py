@@ -53,7 +53,8 @@ def show(console: Console, records: list[dict[str, Any]]) -> None:
     console.print(table)
     console.print(summary(records))
     for row in records:
-        if "error" in row or not (row["first"] and row["exact"] and row["verdict_right"]):
+        marks = ("verdict_right",) if row.get("outside") else ("first", "exact", "verdict_right")
+        if "error" in row or not all(row[m] for m in marks):
             got = row.get("error") or f"{answer(row)}, {row['verdict']}"
             text = f"  miss: {label(row)} ({row['kind']}, {row['seed']}) -> {got}"
             console.print(text, markup=False)
@@ -62,7 +63,9 @@ def show(console: Console, records: list[dict[str, Any]]) -> None:
 def summary(records: list[dict[str, Any]]) -> str:
     """The numbers that a release is judged by."""
     good = [r for r in records if "error" not in r]
-    seen, null = [r for r in good if r["wanted"]], [r for r in good if not r["wanted"]]
+    outside = [r for r in good if r.get("outside")]
+    seen = [r for r in good if r["wanted"] and not r.get("outside")]
+    null = [r for r in good if not r["wanted"]]
     part = lambda rows, name: f"{sum(bool(r[name]) for r in rows)}/{len(rows)}"  # noqa: E731
     lines = [
         f"effects: first {part(seen, 'first')} (by name {part(seen, 'strict')}), exact set "
@@ -70,6 +73,8 @@ def summary(records: list[dict[str, Any]]) -> str:
         f"{part(seen, 'verdict_right')}, with false extras {part(seen, 'extra')}",
         f"nothing to find: false alarms {part(null, 'extra')}, verdict {part(null, 'verdict_right')}",
     ]
+    if outside:
+        lines.append(f"effects outside the package: said to be unexplained {part(outside, 'verdict_right')}")
     numbers = [p for r in seen for p in r["parameters"].values()]
     if numbers:
         errors = [abs(p["error_percent"]) for p in numbers]

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 import rotflex_jax as rf
-from arena.hidden import ABSORBED, DEFAULTS, Place
+from arena.hidden import ABSORBED, DEFAULTS, SHAPES
+from arena.laws import Place
 from arena.records import make_record
 from arena.scoring import parameter_errors, renamed, scored, visible
 from rotflex_jax.effects import CATALOG
@@ -42,7 +43,8 @@ def oracle(places: list[Place], train: rf.Recording, test: rf.Recording) -> dict
     for place in places:
         if place in ABSORBED:
             continue
-        half = {n: (v if n in ("speed", "phase") else v / 2) for n, v in DEFAULTS[place].items()}
+        kept = SHAPES.get(place[0], set())
+        half = {n: (v if n in kept else v / 2) for n, v in DEFAULTS[place].items()}
         m = m + CATALOG[place[0]](at=place[1], **renamed(place, half))
     fitted = rf.fit(m, train)
     return {"windows": windows_error(fitted.model, test), "status": fitted.status}
@@ -93,14 +95,17 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
             ],
             notes=list(result.notes),
             ranking=[[s.effect, s.port, _finite(s.score), s.excited] for s in result.ranking[:8]],
-            parameters=parameter_errors(hidden, {e.name: e for e in result.final.estimates}),
+            parameters=parameter_errors(
+                hidden, {e.name: e for e in result.final.estimates}, truth["plant"]["K"]
+            ),
             windows=result.final.held_out_rmse_windows,
             windows_baseline=result.baseline.held_out_rmse_windows,
             noise_floor=result.noise_floor,
         )
-        best = oracle(list(hidden), train, test)
-        row["oracle"] = best
-        row["over_oracle"] = {c: row["windows"][c] / v for c, v in best["windows"].items()}
+        if not row["outside"]:
+            best = oracle(list(hidden), train, test)
+            row["oracle"] = best
+            row["over_oracle"] = {c: row["windows"][c] / v for c, v in best["windows"].items()}
     except Exception as problem:  # the benchmark reports it and goes on
         row["error"] = f"{type(problem).__name__}: {problem}"
         row["traceback"] = traceback.format_exc()
