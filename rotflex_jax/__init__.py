@@ -8,16 +8,17 @@
 Importing the package changes no setting of JAX and loads neither matplotlib nor pandas.
 """
 
-from rotflex_jax import data, effects, joints, metrics
+from rotflex_jax import adaptive, basis, data, effects, joints, metrics
 from rotflex_jax.compare import Comparison, compare
 from rotflex_jax.data import load
 from rotflex_jax.discover import Discovery, discover, locate
 from rotflex_jax.errors import InputError
 from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
-from rotflex_jax.fit import fit
+from rotflex_jax.fit import SeriesFit, fit, forward_regression, least_squares
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, linearise, simulate
 from rotflex_jax.model import Fit, Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.series import Series
 
 __version__ = "0.1.0"
 
@@ -30,7 +31,11 @@ __all__ = [
     "Mechanism",
     "Model",
     "Recording",
+    "Series",
+    "SeriesFit",
     "SmoothRK4",
+    "adaptive",
+    "basis",
     "compare",
     "data",
     "discover",
@@ -38,7 +43,9 @@ __all__ = [
     "enable_compilation_cache",
     "enable_fast_loops",
     "fit",
+    "forward_regression",
     "joints",
+    "least_squares",
     "linearise",
     "load",
     "locate",

@@ -1,0 +1,57 @@
+"""Adaptive filters: weights that are corrected after every sample.
+
+Beside the filters stand the theory of the simplest of them, LMS (`Moments`, `analyse`, bounds and
+learning curves), and the search for settings by gradient (`tune`) or on a grid (`grid`).
+"""
+
+from rotflex_jax.adaptive.apa import AffineProjection
+from rotflex_jax.adaptive.bounds import Stability, analyse, mean_bound, mean_square_bound
+from rotflex_jax.adaptive.filter import AdaptiveFilter, scan
+from rotflex_jax.adaptive.grid import grid
+from rotflex_jax.adaptive.identify import Identified, identify
+from rotflex_jax.adaptive.kalman import Kalman
+from rotflex_jax.adaptive.lattice import VolterraLattice
+from rotflex_jax.adaptive.learning import (
+    LearningCurve,
+    learning_curve,
+    settling_factor,
+    settling_samples,
+    settling_step_size,
+)
+from rotflex_jax.adaptive.lms import LMS
+from rotflex_jax.adaptive.moments import Moments, ar1_covariance
+from rotflex_jax.adaptive.nlms import NLMS, fixed_point
+from rotflex_jax.adaptive.rls import RLS
+from rotflex_jax.adaptive.running import Run, run
+from rotflex_jax.adaptive.tune import tune
+from rotflex_jax.adaptive.tuned import Tuned
+
+__all__ = [
+    "LMS",
+    "NLMS",
+    "RLS",
+    "AdaptiveFilter",
+    "AffineProjection",
+    "Identified",
+    "Kalman",
+    "LearningCurve",
+    "Moments",
+    "Run",
+    "Stability",
+    "Tuned",
+    "VolterraLattice",
+    "analyse",
+    "ar1_covariance",
+    "fixed_point",
+    "grid",
+    "identify",
+    "learning_curve",
+    "mean_bound",
+    "mean_square_bound",
+    "run",
+    "scan",
+    "settling_factor",
+    "settling_samples",
+    "settling_step_size",
+    "tune",
+]

@@ -1,0 +1,225 @@
+"""The regressors of a Volterra series turned orthonormal: for a Gaussian input, or for a sample of it.
+
+Equal speeds for all weights of a gradient filter are the aim. Least squares gives the same model with
+or without, since the regressors span the same. Nor is it always faster on real data: where nearly all
+power sits in a few linear directions, the raw regressors with a step size per degree may win.
+"""
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rotflex_jax.basis.bank import evaluate, signal
+from rotflex_jax.basis.monomials import Index, from_tensor, indices
+from rotflex_jax.basis.volterra import Volterra, spread
+from rotflex_jax.errors import InputError
+
+# A column of which less than this share is left depends on those before it.
+DEPENDENT = 1e-10
+
+
+class Orthogonalised(eqx.Module):
+    """Regressors of a Volterra series times a matrix.
+
+        psi = T' phi,  y_hat = v' psi = (T v)' phi
+
+    Made by `Hermite.of` or `GramSchmidt.of`. The weights have the unit of the output.
+
+    Args:
+        volterra: The raw regressors.
+        transform: T (P, P'), upper triangular in blocks of the degrees.
+        names: Of the columns.
+        degrees: Of the columns.
+    """
+
+    volterra: Volterra
+    transform: Any
+    names: tuple[str, ...] = eqx.field(static=True)
+    degree_list: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of regressors."""
+        return len(self.names)
+
+    @property
+    def degrees(self) -> Int[np.ndarray, " P"]:
+        """Highest degree in each regressor."""
+        return np.array(self.degree_list, int)
+
+    def respond(self, u: Float[Array, " N"]) -> Float[Array, "N P"]:
+        """Regressors for a signal, inside of traced code too."""
+        return self.volterra.respond(u) @ jnp.asarray(self.transform).astype(u.dtype)
+
+    def regressors(self, u: Any) -> Float[np.ndarray, "N P"]:
+        """Regressors for a signal, in its precision.
+
+        Args:
+            u: Signal (N,); zero before its first sample.
+        """
+        return evaluate(self, u)
+
+    def raw_weights(self, w: Any) -> Float[np.ndarray, " P"]:
+        """Weights of the raw regressors that give the same output."""
+        w = np.asarray(w, float)
+        if w.shape != (self.size,):
+            raise InputError(
+                f"The basis has {self.size} regressors, but the weights have the shape {w.shape}; "
+                "give one weight per regressor."
+            )
+        return np.asarray(self.transform) @ w
+
+    def kernels(self, w: Any, length: int | None = None) -> dict[int, Any]:
+        """Symmetric kernels in the domain of delays, as `Volterra.kernels` gives them."""
+        return self.volterra.kernels(self.raw_weights(w), length)
+
+    def units(self, input_unit: str = "V", output_unit: str = "rad") -> tuple[str, ...]:
+        """Of the weights: that of the output."""
+        return (output_unit,) * self.size
+
+    def step_sizes(self, by_degree: Mapping[int, Any]) -> Any:
+        """A step size per weight (P,), from one per degree.
+
+        Args:
+            by_degree: Degree -> step size, a number or a traced one.
+        """
+        return spread(by_degree, self.degrees)
+
+
+class Hermite(Orthogonalised):
+    """Hermite polynomials of the whitened outputs of the bank, orthonormal for a Gaussian input.
+
+        v = L^-1 z,  R1 = E[z z'] = L L';  psi = product of He_k(v_i) / sqrt(k!),  E[psi psi'] = I
+
+    The square of a Gaussian has a mean, so `(v^2 - 1) / sqrt(2)` needs the constant, and a cube the
+    linear terms: without these the polynomials leave the span of the series. For another input they
+    are no more than nearly orthogonal; `GramSchmidt` takes the sample as it is.
+
+    Source: Wiener 1958; Schetzen 1980, chapter 13; the whitening by Cholesky is free to choose.
+
+    >>> from rotflex_jax.basis import Delays
+    >>> basis = Hermite.of(Volterra(Delays(2)), [[1.0, 0.8], [0.8, 1.0]])
+    >>> basis.names
+    ('1', 'H1(v1)', 'H1(v2)', 'H2(v1)', 'H1(v1) * H1(v2)', 'H2(v2)')
+    """
+
+    @classmethod
+    def of(cls, volterra: Volterra, covariance: Any) -> Self:
+        """The polynomials for a covariance of the bank's outputs.
+
+        Args:
+            volterra: The raw regressors, with every lower degree of the same parity.
+            covariance: R1 (M, M) of the outputs of its bank, whose mean is zero.
+
+        Raises:
+            InputError: Degrees that do not close the span, or a matrix that is no covariance.
+        """
+        m, chosen = volterra.bank.size, set(volterra.chosen)
+        for d in sorted(chosen):
+            if d >= 2 and d - 2 not in chosen:
+                what = "the constant (constant=True)" if d == 2 else f"the degree {d - 2}"
+                raise InputError(
+                    f"Hermite polynomials of degree {d} contain terms of degree {d - 2}, but the basis has "
+                    f"only the degrees {', '.join(map(str, sorted(chosen)))}; add {what}, or use GramSchmidt."
+                )
+        whitening = np.linalg.inv(_cholesky(covariance, m))
+        listed = [i for d in volterra.chosen for i in indices(m, d, "triangular")]
+        columns = [_column(volterra, index, whitening) for index in listed]
+        return cls(volterra, np.stack(columns, axis=1), tuple(map(_name, listed)), tuple(map(len, listed)))
+
+
+class GramSchmidt(Orthogonalised):
+    """Each regressor without what those before it explain, on a sample; no law of the input assumed.
+
+        phi = Q R,  T = sqrt(N) R^-1
+
+    Columns that depend on earlier ones are left out. Orthonormal on that sample only: another input,
+    even of the same law but short, is not.
+
+    Source: Golub and Van Loan 2013, section 5.2 (QR); Korenberg 1988 for its use with Volterra series.
+
+    >>> from rotflex_jax.basis import Delays
+    >>> u = np.random.default_rng(0).standard_normal(500)
+    >>> psi = GramSchmidt.of(Volterra(Delays(2)), u).regressors(u)
+    >>> bool(np.max(np.abs(psi.T @ psi / 500 - np.eye(6))) < 1e-12)
+    True
+    """
+
+    @classmethod
+    def of(cls, volterra: Volterra, u: Any) -> Self:
+        """The transform for a sample of the input.
+
+        Args:
+            volterra: The raw regressors.
+            u: Input (N,), at least as many samples as there are regressors.
+
+        Raises:
+            InputError: Too few samples.
+        """
+        phi = volterra.regressors(signal(u).astype(float))
+        if len(phi) < volterra.size:
+            raise InputError(
+                f"Orthogonalising {volterra.size} regressors needs as many samples, but `u` has {len(phi)}; "
+                "give a longer sample of the input."
+            )
+        size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+        kept: list[int] = []
+        for k, left in enumerate(np.abs(np.diag(np.linalg.qr(phi / size, mode="r")))):
+            if left > DEPENDENT:
+                kept.append(k)
+        R = np.linalg.qr(phi[:, kept], mode="r")
+        R *= np.sign(np.diag(R))[:, None]  # so that each column keeps the sign of its regressor
+        transform = np.zeros((volterra.size, len(kept)))
+        transform[kept] = np.linalg.inv(R) * np.sqrt(len(phi))
+        names, degrees = volterra.names, volterra.degrees
+        titles = tuple(names[k] if k == 0 and names[k] == "1" else f"GS({names[k]})" for k in kept)
+        return cls(volterra, transform, titles, tuple(int(degrees[k]) for k in kept))
+
+
+def _cholesky(covariance: Any, m: int) -> np.ndarray:
+    R1 = np.asarray(covariance, float)
+    if R1.shape != (m, m) or not np.allclose(R1, R1.T, rtol=1e-8, atol=0):
+        raise InputError(
+            f"Argument `covariance` must be a symmetric matrix of {m} rows, one per output of the bank, but "
+            f"has the shape {R1.shape}; give E[z z'] of the bank's outputs."
+        )
+    try:
+        return np.linalg.cholesky((R1 + R1.T) / 2)
+    except np.linalg.LinAlgError as error:
+        low = np.linalg.eigvalsh((R1 + R1.T) / 2)[0]
+        raise InputError(
+            f"Argument `covariance` must be positive definite, but has the eigenvalue {low:.2g}; take "
+            "fewer outputs, or an input with more bandwidth."
+        ) from error
+
+
+def _hermite(power: int) -> dict[int, float]:
+    """Power of v -> coefficient of `He_power(v) / sqrt(power!)`."""
+    terms = np.polynomial.hermite_e.herme2poly([0.0] * power + [1.0]) / math.sqrt(math.factorial(power))
+    return {k: float(c) for k, c in enumerate(terms) if c}
+
+
+def _column(volterra: Volterra, index: Index, whitening: np.ndarray) -> np.ndarray:
+    """Raw weights of one product of Hermite polynomials."""
+    m = volterra.bank.size
+    by_degree = {d: np.zeros((m,) * d) for d in volterra.chosen}
+    powers = Counter(index)
+    for combination in itertools.product(*(_hermite(p).items() for p in powers.values())):
+        factor, tensor = 1.0, np.ones(())
+        for i, (power, coefficient) in zip(powers, combination, strict=True):
+            factor *= coefficient
+            for _ in range(power):
+                tensor = np.multiply.outer(tensor, whitening[i])
+        by_degree[tensor.ndim] += factor * tensor
+    return np.concatenate([from_tensor(by_degree[d], m, volterra.layout) for d in volterra.chosen])
+
+
+def _name(index: Index) -> str:
+    return " * ".join(f"H{power}(v{i + 1})" for i, power in Counter(index).items()) or "1"

@@ -1,0 +1,219 @@
+"""Poles of orthonormal filters from data: weights by least squares inside, poles outside."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rotflex_jax.basis.bank import signal, whole
+from rotflex_jax.basis.orthonormal import Orthonormal
+from rotflex_jax.basis.sections import Kinds, coordinates, numbers_of, poles_of
+from rotflex_jax.basis.volterra import Volterra
+from rotflex_jax.errors import InputError
+from rotflex_jax.precision import double_precision
+
+# Beyond this modulus a pole decays over a million samples: the search ran to the edge.
+EDGE = 1 - 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class PoleStart:
+    """One start of a search: where it ended, with which error, and how."""
+
+    poles: tuple[complex, ...]
+    nmse: float
+    status: str
+    steps: int
+
+
+@dataclasses.dataclass(frozen=True)
+class PoleSearch:
+    """What a search for poles found.
+
+    Attributes:
+        status: Of the best start: "converged", or in words what stopped it.
+        nmse: Squared error over the squared deviation from the mean (of the output itself where
+            there is no constant).
+        starts: Every start, the best first; like errors with unlike poles mean that the data do not
+            tell them apart.
+    """
+
+    status: str
+    nmse: float
+    starts: tuple[PoleStart, ...]
+
+    @property
+    def poles(self) -> tuple[complex, ...]:
+        """Of the best start, without repetitions."""
+        return self.starts[0].poles
+
+    def __str__(self) -> str:
+        lines = [f"Poles: {self.status}, NMSE {self.nmse:.4g}"]
+        for start in self.starts:
+            # One of each pair says it all.
+            listed = ", ".join(
+                f"{p.real:.4f}" + (f" ± {p.imag:.4f}j" if p.imag else "") for p in start.poles if p.imag >= 0
+            )
+            lines.append(f"  NMSE {start.nmse:.4g} at {listed} ({start.status}, {start.steps} evaluations)")
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Residual:
+    """What least squares leaves of the output, as a function of the poles; hashable, compiled once."""
+
+    kinds: Kinds
+    signs: tuple[float, ...]
+    degrees: tuple[int, ...]
+    constant: bool
+    repeat: int
+
+    def __call__(self, z: Float[Array, " D"], args: Any) -> Float[Array, " N"]:
+        bank, u, y, seen = args
+        numbers = jnp.tile(numbers_of(self.kinds, self.signs, z), self.repeat)
+        basis = Volterra(bank.with_numbers(numbers), degrees=self.degrees, constant=self.constant)
+        phi = jax.vmap(basis.respond)(u) * seen[:, :, None]
+        Q, _ = jnp.linalg.qr(phi.reshape(-1, phi.shape[2]))
+        y = (y * seen).ravel()
+        return y - Q @ (Q.T @ y)
+
+
+_left = jax.jit(lambda residual, z, args: residual(z, args), static_argnums=0)
+_slopes = jax.jit(lambda residual, z, args: jax.jacfwd(residual)(z, args), static_argnums=0)
+
+
+def _descend(residual: _Residual, z: np.ndarray, args: Any, most: int) -> PoleStart:
+    """One start of the search."""
+    from scipy.optimize import least_squares  # takes long to import
+
+    with double_precision():
+        args = (args[0], *map(jnp.asarray, args[1:]))
+        try:
+            end = least_squares(
+                lambda z: np.asarray(_left(residual, jnp.asarray(z), args)),
+                z,
+                lambda z: np.asarray(_slopes(residual, jnp.asarray(z), args)),  # pyright: ignore[reportArgumentType]
+                method="lm",
+                ftol=1e-12,
+                xtol=1e-9,
+                gtol=1e-12,
+                max_nfev=most,
+            )
+            z, nmse, steps = end.x, 2 * float(end.cost), int(end.nfev)
+            status = "converged" if end.status > 0 else f"stopped after {most} evaluations"
+        except ValueError:  # what scipy says where a number is not finite
+            nmse, steps, status = float("nan"), 0, "failed: the error is not finite"
+        numbers = numbers_of(residual.kinds, residual.signs, jnp.asarray(z))
+    poles = poles_of(residual.kinds, np.asarray(numbers))
+    if any(abs(p) > EDGE for p in poles):
+        status += ", a pole at the edge of the unit circle"
+    return PoleStart(poles, nmse, status, steps)
+
+
+def optimise_poles(
+    u: Any,
+    y: Any,
+    poles0: Sequence[complex],
+    *,
+    degrees: Sequence[int] = (1,),
+    constant: bool = True,
+    repeat: int = 1,
+    first: int = 1,
+    skip: int = 0,
+    starts: int = 4,
+    spread: float = 0.3,
+    max_steps: int = 100,
+    seed: int = 0,
+) -> tuple[Orthonormal, PoleSearch]:
+    """Find the poles with which a series comes closest to a recording.
+
+        minimise over the poles  |y - phi(poles) w|^2,  w = least squares for these poles
+
+    Variable projection: only the poles are searched, by Levenberg-Marquardt with exact derivatives,
+    in the logarithms of decay and angle, so that no pole can leave the unit circle. Several starts
+    show whether the answer depends on where one begins. The plant's own poles, where friction does not
+    move them, are the answer for a linear plant.
+
+    Not for many free poles: beyond about six the error is flat and they trade places.
+
+    Args:
+        u: Input (N,), or several recordings as a list.
+        y: Output (N,), or a list.
+        poles0: Where to begin, in the z domain, each complex pole with its conjugate; their number,
+            and which are real, stay.
+        degrees: Of the Volterra series whose weights are fitted inside.
+        constant: Whether it has a constant.
+        repeat: How often the poles repeat: one real pole four times is a Laguerre bank of four.
+        first: Delay of the bank [samples].
+        skip: Samples at the start of each recording that do not count.
+        starts: The first is `poles0`, the others are drawn around it.
+        spread: Deviation of the others, in the logarithms.
+        max_steps: Most evaluations of each start.
+        seed: Of the starts.
+
+    Returns:
+        The bank with the best poles, and what every start came to.
+
+    Raises:
+        InputError: Shapes that do not fit, poles that do not decay.
+
+    Source: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10; for Laguerre-Volterra series Kibangou,
+    Favier and Hassani 2005, EURASIP J. Appl. Signal Process.
+
+    >>> import scipy.signal
+    >>> u = np.random.default_rng(0).standard_normal(300)
+    >>> y = scipy.signal.lfilter([0.0, 1.0], [1.0, -0.8], u)
+    >>> bank, search = optimise_poles(u, y, [0.5], starts=2)
+    >>> round(bank.poles[0].real, 6), search.status
+    (0.8, 'converged')
+    """
+    skip = whole(skip, "skip", 0)
+    U, Y, seen = _stack(u, y, skip, constant)
+    bank = Orthonormal(poles0, first)
+    chosen = Volterra(bank, degrees=degrees, constant=constant)
+    repeat = whole(repeat, "repeat", 1)
+    z, signs = coordinates(bank.kinds, np.asarray(bank.numbers))
+    rng = np.random.default_rng(seed)
+    shifts = spread * rng.standard_normal((whole(starts, "starts", 1), len(z)))
+    shifts[0] = 0.0
+    residual = _Residual(bank.kinds, signs, chosen.chosen, constant, repeat)
+    repeated = Orthonormal(bank.poles * repeat, first, _label(bank, repeat))
+    most = whole(max_steps, "max_steps", 1)
+    ends = [_descend(residual, z + shift, (repeated, U, Y, seen), most) for shift in shifts]
+    ends.sort(key=lambda end: end.nmse if np.isfinite(end.nmse) else np.inf)
+    best = ends[0]
+    search = PoleSearch(best.status, best.nmse, tuple(ends))
+    if not np.isfinite(best.nmse) or any(abs(p) >= 1 for p in best.poles):
+        return repeated, search  # rather the poles that were given than none
+    return Orthonormal(best.poles * repeat, first, repeated.label), search
+
+
+def _label(bank: Orthonormal, repeat: int) -> str:
+    if repeat == 1 or len(bank.kinds) > 1:
+        return bank.label
+    return "Laguerre" if bank.kinds == ("real",) else "Kautz"
+
+
+def _stack(u: Any, y: Any, skip: int, constant: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inputs, scaled outputs and what counts of them, (R, N) each."""
+    many = isinstance(u, (list, tuple)) and len(u) > 0 and np.ndim(u[0]) == 1
+    us = [signal(x).astype(float) for x in (u if many else [u])]
+    ys = [signal(x, "y").astype(float) for x in (y if many else [y])]
+    if [len(x) for x in us] != [len(x) for x in ys] or min(map(len, us)) <= skip:
+        raise InputError(
+            f"Inputs of {[len(x) for x in us]} and outputs of {[len(x) for x in ys]} samples were given, the "
+            f"first {skip} left out; give as many outputs as inputs, and more than are left out."
+        )
+    N = max(map(len, us))
+    U, Y, seen = np.zeros((3, len(us), N))
+    for k, (a, b) in enumerate(zip(us, ys, strict=True)):
+        U[k, : len(a)], Y[k, : len(b)], seen[k, skip : len(a)] = a, b, 1.0
+    counted = Y[seen > 0]
+    spread = np.linalg.norm(counted - counted.mean() if constant else counted)
+    if not spread > 0:
+        raise InputError("Argument `y` does not change, so no pole can be found; give a moving output.")
+    return U, Y / spread, seen

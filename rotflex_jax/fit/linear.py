@@ -1,0 +1,94 @@
+"""Linear least squares from a triangular factor: minimum norm, ridge, and what it is worth."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+# Singular values below this share of the largest one are rounding: the columns depend on each other.
+DEPENDENT = 1e-12
+CHUNK = 8192  # rows that are factored at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """Weights of a linear least-squares problem.
+
+    Attributes:
+        w: Weights (P,).
+        basis: Directions (P, r) in which least squares determines them; `w` lies in their span.
+        shrink: Factor of each direction that a ridge leaves of the least-squares solution (r,).
+        rank: Number of directions, r.
+        condition: Largest over smallest eigenvalue of `phi' phi` within them.
+    """
+
+    w: Float[np.ndarray, " P"]
+    basis: Float[np.ndarray, "P r"]
+    shrink: Float[np.ndarray, " r"]
+    rank: int
+    condition: float
+
+
+def factor(A: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "K K"]:
+    """R of the QR decomposition `A = Q R`, in pieces, so that Q is never held.
+
+    Source: Golub, Plemmons and Sameh 1988 (QR of a tall matrix by blocks of rows).
+    """
+    K = A.shape[1]
+    R = np.zeros((0, K))
+    for start in range(0, len(A), CHUNK):
+        R = np.linalg.qr(np.concatenate([R, A[start : start + CHUNK]]), mode="r")
+    return np.concatenate([R, np.zeros((max(K - len(R), 0), K))])
+
+
+def solve(R: Float[np.ndarray, "K K"], ridge: float = 0.0) -> Solution:
+    """Least squares from the triangular factor of `[phi, y]`.
+
+        minimise |y - phi w|^2 + ridge |w|^2
+
+    Without a ridge, columns that depend on each other share the weight (minimum norm); columns that are
+    equal get equal weights.
+    """
+    A, z = R[:, :-1], R[:, -1]
+    size = np.linalg.norm(A, axis=0)
+    # A ridge weighs the weights as they are; without it, columns of one size tell rank from scale.
+    unit = np.where(size > 0, size, 1.0) if ridge == 0 else np.ones_like(size)
+    U, s, Vt = np.linalg.svd(A / unit, full_matrices=False)
+    kept = s > DEPENDENT * max(s[0], 1e-300)
+    U, s, V = U[:, kept], s[kept], Vt[kept].T
+    shrink = s**2 / (s**2 + ridge)
+    basis = V / unit[:, None]
+    w = basis @ (shrink / s * (U.T @ z))
+    raw = np.linalg.svd(A @ np.linalg.qr(basis)[0], compute_uv=False) if len(s) else np.ones(1)
+    condition = float((raw[0] / raw[-1]) ** 2) if raw[-1] > 0 else np.inf
+    return Solution(w, basis, shrink, len(s), condition)
+
+
+def squared_error(R: Float[np.ndarray, "K K"], w: Float[np.ndarray, " P"]) -> float:
+    """|y - phi w|^2 of the rows behind a triangular factor."""
+    return float(np.sum((R[:, -1] - R[:, :-1] @ w) ** 2))
+
+
+def cross_validated_ridge(
+    parts: list[Float[np.ndarray, "K K"]], count: int = 31
+) -> tuple[float, Float[np.ndarray, " G"], Float[np.ndarray, " G"]]:
+    """The ridge whose error on blocks that it did not see is least.
+
+    Args:
+        parts: Triangular factor of each block.
+        count: Ridges to try, from rounding to the mean eigenvalue.
+
+    Returns:
+        The ridge, all ridges, their squared errors summed over the blocks.
+    """
+    P = parts[0].shape[1] - 1
+    power = sum(np.sum(R[:, :-1] ** 2) for R in parts) / P
+    ridges = power * np.logspace(-14, 0, count)
+    errors = np.zeros(count)
+    for k, held in enumerate(parts):
+        R = factor(np.concatenate([p for j, p in enumerate(parts) if j != k]))
+        # One decomposition serves all ridges, as columns of weights.
+        U, s, Vt = np.linalg.svd(R[:, :-1], full_matrices=False)
+        filtered = s[:, None] / (s[:, None] ** 2 + ridges) * (U.T @ R[:, -1])[:, None]
+        errors += np.sum((held[:, -1:] - held[:, :-1] @ (Vt.T @ filtered)) ** 2, axis=0)
+    return float(ridges[np.argmin(errors)]), ridges, errors
