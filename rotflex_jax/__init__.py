@@ -8,7 +8,7 @@
 Importing the package changes no setting of JAX and loads neither matplotlib nor pandas.
 """
 
-from rotflex_jax import adaptive, basis, data, effects, joints, metrics
+from rotflex_jax import adaptive, basis, data, effects, joints, kernels, metrics
 from rotflex_jax.compare import Comparison, compare
 from rotflex_jax.data import load
 from rotflex_jax.discover import Discovery, discover, locate
@@ -45,6 +45,7 @@ __all__ = [
     "fit",
     "forward_regression",
     "joints",
+    "kernels",
     "least_squares",
     "linearise",
     "load",

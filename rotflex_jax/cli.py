@@ -1,4 +1,4 @@
-"""The command line: `rotflex demo`, `discover`, `compare`, `simulate`, `effects`, `data`.
+"""The command line: `rotflex demo`, `discover`, `compare`, `reproduce`, `simulate` and others.
 
 Exit status 0 on any verdict, 2 on bad input with one sentence on stderr. Everything heavy is
 imported inside the commands, so that `rotflex --help` answers at once.
@@ -15,6 +15,7 @@ import typer
 from rotflex_jax import arguments as given, terminal
 from rotflex_jax.data_commands import data_app
 from rotflex_jax.errors import InputError
+from rotflex_jax.reproduce_command import reproduce
 
 if TYPE_CHECKING:
     from rotflex_jax.recording import Recording
@@ -25,6 +26,7 @@ app = typer.Typer(
     help="Find the physics a model of a rotary flexible joint is missing, from a recording of it.",
 )
 app.add_typer(data_app, name="data")
+app.command()(reproduce)
 
 # The class of every mistake in the arguments; typer does not export it by name.
 _UsageError: Any = typer.BadParameter.__bases__[0]

@@ -12,7 +12,7 @@ import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.mechanism.propagate import CHUNK, states
-from rotflex_jax.mechanism.simulate import PredictorStep, _FreeStep
+from rotflex_jax.mechanism.simulate import PredictorStep, FreeStep
 from rotflex_jax.precision import double_precision
 
 # Shorter than a chunk, one chunk, a little more than one, and no multiple of it.
@@ -55,7 +55,7 @@ def joint(N: int):
     c = solver.prepare(structure, values, jnp.ones(len(mechanism.effects)), jnp.asarray(0.004))
     K = jnp.asarray(0.1 * rng.normal(size=(6, 2)))
     y, seen = jnp.asarray(0.01 * rng.normal(size=(N, 2))), jnp.asarray(1.0 * (rng.random(N) < 0.8))
-    free = (_FreeStep(structure, solver), jnp.zeros(6), jnp.asarray(u), c)
+    free = (FreeStep(structure, solver), jnp.zeros(6), jnp.asarray(u), c)
     predictor = (PredictorStep(structure, solver), jnp.zeros(6), (jnp.asarray(u), y, seen), (c, K))
     return free, predictor
 

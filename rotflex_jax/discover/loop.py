@@ -4,20 +4,25 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
 
-import numpy as np
-
-from rotflex_jax.discover.decide import WINDOWS_BETTER, choose, describe, samples_of
-from rotflex_jax.discover.heldout import Away, Trial, held_out
-from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.calibrations import own_notes, settle
+from rotflex_jax.discover.decide import choose, describe, samples_of
+from rotflex_jax.discover.heldout import Away, held_out
 from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.locate import locate
-from rotflex_jax.discover.moves import begin, eliminate, is_physical, ladder, remaining_rivals, with_each
+from rotflex_jax.discover.moves import (
+    begin,
+    eliminate,
+    is_physical,
+    ladder,
+    remaining_rivals,
+    with_each,
+)
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Discovery, Ranked, Round
 from rotflex_jax.discover.scales import scales
 from rotflex_jax.discover.score import Score, promising, scores
 from rotflex_jax.discover.stages import Scribe
-from rotflex_jax.discover.supermodel import CALIBRATIONS, Place, build
+from rotflex_jax.discover.supermodel import Place, build
 from rotflex_jax.discover.verdict import judge_end
 from rotflex_jax.effects import CATALOG, candidates as first_family
 from rotflex_jax.effects.kinds import Effect
@@ -130,7 +135,7 @@ def discover(
     final, worth = eliminate(judge, base.hypothesis, [p for p, _ in taken], samples)
     order = [p for p, _ in taken if p in final.places]
     order += sorted(set(final.places) - set(order), key=lambda p: -worth[p])
-    order, own = _carried_over(away, held_out(away, final), order)
+    final, order, own, left_out = settle(judge, away, final, order)
     kept = remaining_rivals(judge, away, final, equivalents, [p for p in order if p in dict(taken)])
     say("simulating the held-out recordings")
     trials = [held_out(away, h) for h in ladder(judge, final, order, own, passed)]
@@ -172,52 +177,5 @@ def discover(
         ),
         noise_floor=floor,
         elapsed_s=time.perf_counter() - began,
-        notes=_notes(judge, away, trials[-1], own),
+        notes=(*own_notes(judge, away, trials[-1], own), *left_out),
     )
-
-
-def _carried_over(away: Away, final: Trial, order: list[Place]) -> tuple[list[Place], list[Place]]:
-    """Effects of the machine, and calibrations that belong to the training recordings alone.
-
-    A calibration is one of the machine if its trained value makes the held-out free runs clearly better.
-    """
-    kept, own = list(order), []
-    for place in [p for p in order if p in CALIBRATIONS]:
-        with_it, without = (
-            away.windows(
-                [
-                    away.runner(_trained(final, away), places, r).simulate_windows(recording, away.seconds)
-                    for r, recording in enumerate(away.recordings)
-                ]
-            )
-            for places in (kept, [p for p in kept if p != place])
-        )
-        if float(np.mean(np.log(with_it / without))) > -WINDOWS_BETTER:
-            kept.remove(place)
-            own.append(place)
-    return kept, own
-
-
-def _trained(trial: Trial, away: Away) -> Hypothesis:
-    """The trained hypothesis shaped for the held-out recordings, calibrations as trained."""
-    h = trial.hypothesis
-    R = len(away.recordings)
-    return dataclasses.replace(trial.adapted, own=np.tile(h.own.mean(axis=0), (R, 1)))
-
-
-def _notes(judge: Judge, away: Away, final: Trial, own: list[Place]) -> tuple[str, ...]:
-    """What differs between recordings, in sentences."""
-    out = []
-    s = judge.bench.supermodel
-    for place in own:
-        for i in s.parameter_indices(place):
-            unit = s.mechanism.parameter_specifications[i].unit
-            trained = final.hypothesis.values(judge.bench)[:, i]
-            unseen = final.adapted.values(away.judge.bench)[:, i]
-            numbers = [", ".join(f"{v:+.3g} {unit}" for v in row) for row in (trained, unseen)]
-            out.append(
-                f"{CATALOG[place[0]].title} at {place[1]} belongs to each recording, not to the machine: "
-                f"{numbers[0]} in the training data, {numbers[1]} in the held-out data; it was fitted, "
-                f"but not carried over."
-            )
-    return tuple(out)

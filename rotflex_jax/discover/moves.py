@@ -110,7 +110,7 @@ def _grown(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesi
     for place in simpler:
         names = [s.mechanism.parameter_names[i].rpartition(".")[2] for i in s.parameter_indices(place)]
         known |= dict(zip(names, values[s.parameter_indices(place)], strict=True))
-        h = _without(judge, h, place)
+        h = without(judge, h, place)
     start = score.start.copy()
     for k, i in enumerate(s.candidates[score.place].parameters):
         parameter = s.mechanism.parameter_names[i].rpartition(".")[2]
@@ -148,7 +148,8 @@ def is_physical(judge: Judge, h: Hypothesis, place: Place) -> bool:
     return all(specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(place))
 
 
-def _without(judge: Judge, h: Hypothesis, place: Place) -> Hypothesis:
+def without(judge: Judge, h: Hypothesis, place: Place) -> Hypothesis:
+    """The hypothesis less one effect, its other numbers as they are."""
     s = judge.bench.supermodel
     gone = set(s.parameter_indices(place))
     kept = [k for k, i in enumerate(h.local) if i not in gone]
@@ -176,7 +177,7 @@ def eliminate(
     """
     s = judge.bench.supermodel
     while on_trial := [p for p in h.places if p not in added[-1:]]:
-        rivals = refit(judge, [_without(judge, h, p) for p in on_trial], turns=1)
+        rivals = refit(judge, [without(judge, h, p) for p in on_trial], turns=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)}
         each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
         surplus = {p: worth[p] - TRAIN_NATS - 0.5 * each[p] * np.log(samples) for p in worth}
@@ -214,7 +215,7 @@ def remaining_rivals(
     for p, r in pairs:
         c = s.candidates[r]
         start = Score(r, 0.0, 0.0, np.array(c.probes[0]).max(axis=0), True, 1.0, 1.0)
-        swapped.append(_with(judge, _without(judge, final, p), start, 0.4))
+        swapped.append(_with(judge, without(judge, final, p), start, 0.4))
     best = held_out(away, final)
     trials = [held_out(away, h) for h in refit(judge, swapped)]
     same = {pr for pr, t in zip(pairs, trials, strict=True) if not told_apart(best, t, judge.bench.data)}
@@ -239,6 +240,6 @@ def ladder(
         known = [h for h in passed if wanted - set(CALIBRATIONS) == set(h.places) - set(CALIBRATIONS)]
         h = known[0] if known and wanted <= set(known[0].places) else final
         for place in set(h.places) - wanted:
-            h = _without(judge, h, place)
+            h = without(judge, h, place)
         below.append(h)
     return [*(refit(judge, below, wide=True, turns=2) if below else []), final]

@@ -71,7 +71,7 @@ class SuperModel:
         mechanism: With calibrations and candidates.
         calibrations: Places of the calibrations that were added.
         candidates: By place.
-        parts: Parts formed so far, by the stateful candidates in them.
+        parts: Parts formed so far, by the costly candidates in them.
     """
 
     baseline: Mechanism
@@ -81,8 +81,8 @@ class SuperModel:
     parts: dict[frozenset[int], Part] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
-    def stateful(self) -> frozenset[int]:
-        """Candidates' effects that have states of their own."""
+    def costly(self) -> frozenset[int]:
+        """Candidates' effects that make a run dearer: states of their own, or a friction contact."""
         own = state_rows(self.mechanism)
         dry = [i for i, _ in effects_of(self.mechanism, DryFriction)]
         return frozenset(i for i in (*own, *dry) if i >= len(self.baseline.effects))
@@ -95,14 +95,14 @@ class SuperModel:
         return sorted([*moving, *(row for i, rows in own.items() if i < count for row in rows)])
 
     def part(self, gates: np.ndarray) -> Part:
-        """The super-model without the stateful candidates whose gate (..., E) is zero."""
-        on = frozenset(i for i in self.stateful if np.any(gates[..., i] != 0))
+        """The super-model without the costly candidates whose gate (..., E) is zero."""
+        on = frozenset(i for i in self.costly if np.any(gates[..., i] != 0))
         if on not in self.parts:
             self.parts[on] = self._part(on)
         return self.parts[on]
 
     def _part(self, on: frozenset[int]) -> Part:
-        kept = [i for i in range(len(self.mechanism.effects)) if i not in self.stateful or i in on]
+        kept = [i for i in range(len(self.mechanism.effects)) if i not in self.costly or i in on]
         effects = tuple(self.mechanism.effects[i] for i in kept)
         mechanism = dataclasses.replace(self.mechanism, effects=effects)
         names = {n: k for k, n in enumerate(self.mechanism.parameter_names)}

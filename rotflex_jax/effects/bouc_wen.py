@@ -38,7 +38,7 @@ class BoucWen(Memory):
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     contains: ClassVar[tuple[str, ...]] = ("coulomb", "dahl")
-    searched: ClassVar[tuple[str, ...]] = ("joint",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="torque at saturation")
     width: float = parameter(0.02, unit="rad", lower=1e-6, meaning="deflection over which it builds up")

@@ -49,7 +49,8 @@ class LuGre(Memory):
     searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque when it slides fast")
-    rise: float = parameter(0.5, unit="", lower=0.0, meaning="breakaway level over it, less one")
+    # Where it hardly slides at all (a large rise, a small level), only their product shows.
+    rise: float = parameter(0.5, unit="", lower=0.0, upper=10.0, meaning="breakaway level over it, less one")
     slow: float = parameter(0.3, unit="rad/s", lower=1e-3, meaning="speed over which the rise is lost")
     # Stribeck friction is the limit of none at all; the bound keeps the rate finite.
     presliding: float = parameter(

@@ -36,7 +36,7 @@ class SecondMode(Linear):
         "tau = -inertia * r''"
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("inertia",)
-    searched: ClassVar[tuple[str, ...]] = ("arm",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "arm")
 
     inertia: float = parameter(5e-4, unit="kg m^2", lower=0.0, meaning="inertia of the part")
     frequency: float = parameter(15.0, unit="Hz", lower=1e-3, meaning="frequency while the port is held")

@@ -30,7 +30,7 @@ class SensorCubic(Sensing):
     equation: ClassVar[str] = "y = value + cubic * value**3"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("cubic",)
-    searched: ClassVar[tuple[str, ...]] = ("alpha",)
+    searched: ClassVar[tuple[str, ...]] = ("theta", "alpha")
 
     cubic: float = parameter(
         0.0, unit="1/unit^2", typical=3.0, meaning="relative error per square of the value"

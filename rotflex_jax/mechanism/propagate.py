@@ -42,7 +42,7 @@ def states(step: StepFunction, x0: jax.Array, inputs: Any, constants: Any) -> ja
 CHUNK = 512
 
 
-def _chunks(tree: Any) -> Any:
+def chunks(tree: Any) -> Any:
     """Leading time axis N -> (chunks, ..., CHUNK): time last, along which vector units run."""
 
     def cut(leaf: jax.Array) -> jax.Array:
@@ -55,7 +55,7 @@ def _chunks(tree: Any) -> Any:
     return jax.tree.map(cut, tree)
 
 
-def _joined(chunks: jax.Array, N: int) -> jax.Array:
+def joined(chunks: jax.Array, N: int) -> jax.Array:
     """(chunks, ..., CHUNK) -> (N, ...)."""
     pieces = jnp.moveaxis(chunks, -1, 1)
     return pieces.reshape(-1, *pieces.shape[2:])[:N]
@@ -63,7 +63,7 @@ def _joined(chunks: jax.Array, N: int) -> jax.Array:
 
 def slopes(step: StepFunction, X: jax.Array, inputs: Any, constants: Any) -> jax.Array:
     """`df/dx` along the states X (N, n): entry [k, j] is the column of `A[k]` for state j (N, n, n)."""
-    x, w = _chunks((X, inputs))
+    x, w = chunks((X, inputs))
     ways = jnp.eye(X.shape[1], dtype=X.dtype)
 
     def here(pair: Any) -> jax.Array:
@@ -71,20 +71,20 @@ def slopes(step: StepFunction, X: jax.Array, inputs: Any, constants: Any) -> jax
         wide = jnp.broadcast_to(ways[:, :, None], (len(ways), *s.shape))
         return jax.vmap(lambda way: jax.jvp(lambda q: step(q, v, constants), (s,), (way,))[1])(wide)
 
-    return _joined(jax.lax.map(here, (x, w)), len(X))
+    return joined(jax.lax.map(here, (x, w)), len(X))
 
 
 def forcing(
     step: StepFunction, X: jax.Array, inputs: Any, dinputs: Any, constants: Any, dconstants: Any
 ) -> jax.Array:
     """`b[k] = df/dw dw[k] + df/dc dc` (N, n) along the states X (N, n)."""
-    x, w, dw = _chunks((X, inputs, dinputs))
+    x, w, dw = chunks((X, inputs, dinputs))
 
     def here(triple: Any) -> jax.Array:
         s, v, dv = triple
         return jax.jvp(functools.partial(step, s), (v, constants), (dv, dconstants))[1]
 
-    return _joined(jax.lax.map(here, (x, w, dw)), len(X))
+    return joined(jax.lax.map(here, (x, w, dw)), len(X))
 
 
 def recursion(A: jax.Array, b: jax.Array, dx0: jax.Array) -> jax.Array:

@@ -19,7 +19,7 @@ Solver = Exponential | SmoothRK4
 
 
 @dataclasses.dataclass(frozen=True)
-class _FreeStep:
+class FreeStep:
     """State to state under the recorded voltage."""
 
     structure: Mechanism
@@ -67,7 +67,7 @@ def free_run(
     """
     mechanism = structure.with_values(values)
     c = solver.prepare(structure, values, gates, Ts)
-    X = states(_FreeStep(structure, solver), x0, driven_voltage(mechanism, gates, u, Ts), c)
+    X = states(FreeStep(structure, solver), x0, driven_voltage(mechanism, gates, u, Ts), c)
     return X, read_outputs(mechanism, gates, X.T).T
 
 

@@ -1,0 +1,176 @@
+# ---
+# jupyter:
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Did the quadratic model win, or did identification?
+#
+# "Nonlinear Identification of a Rotary Flexible Joint Experiment" drives a flexible joint with noise,
+# adapts a Volterra model of degree 2 by LMS, watches a coefficient rest after 7000 iterations, and
+# finds its answer to a pulse better than that of a linearised model. This notebook does the same on a
+# simulated joint, where the truth is known, and adds the curve that is missing in the paper: a *linear*
+# model identified from the same data.
+#
+# On the command line the same is `rotflex reproduce`; with `--data run.csv` it takes your recording.
+
+# %%
+from collections import Counter
+
+import numpy as np
+
+import rotflex_jax as rf
+from rotflex_jax.basis import Delays, Volterra
+from rotflex_jax.fit import least_squares
+from rotflex_jax.reproduce import Settings, reproduce, signals
+from rotflex_jax.reproduce.figures import pictures
+from rotflex_jax.reproduce.plants import SCENARIOS, plant, response
+
+# Models run in double precision by themselves; seeds are settings.
+rf.enable_fast_loops()
+rf.enable_compilation_cache()
+
+# %matplotlib inline
+
+# %% [markdown]
+# ## What does the paper leave open?
+#
+# Sampling interval, filter, step sizes, friction, dead zone, signs: most of it. Each is a setting that
+# says where its default comes from.
+
+# %%
+print(Counter(row["source"] for row in Settings.table()))
+for row in Settings.table():
+    if row["name"] in ("Ts", "cutoff", "scenario", "coefficient", "mu2", "variance", "memory"):
+        print(f"{row['name']:12} {row['default']!s:8} {row['source']:11} {row['why']}")
+
+# %% [markdown]
+# The simulated joint has the paper's constants, dry friction, a dead zone, and an amplifier that is 0.3 V
+# off (S6). The offset matters: why, is the question of the section after next.
+
+# %%
+settings = Settings()
+print(SCENARIOS[settings.scenario].about)
+result = reproduce(settings)
+drawn = pictures(result)
+
+# %%
+drawn["figure_07"].figure
+
+# %%
+drawn["figure_08"].figure
+
+# %% [markdown]
+# ## Why 0.1 s between samples?
+#
+# The joint remembers a voltage for about 0.4 s. Five samples hold that only if they lie far enough
+# apart; at 1 ms the best linear model of memory 5, by whatever algorithm, is as good as none.
+
+# %%
+drawn["span"].figure
+
+# %% [markdown]
+# ## What do 7000 iterations mean?
+#
+# The step size was computed from the filter that makes the input, *before* the run: ln 20 / (7000 ×
+# eigenvalue). So 7000 is a choice. Left: eight runs, their mean, and the mean that theory predicts.
+# Right: the same input to a joint whose friction and dead zone are the same both ways.
+
+# %%
+a = result.adaptation
+print(f"predicted {a.prediction.settle:.0f}, measured {a.settle:.0f} iterations")
+print(a.prediction.stability)
+drawn["figure_09"].figure
+
+# %% [markdown]
+# On the right the true value is zero. A joint with symmetric friction is an *odd* machine: turn the voltage
+# round, and the motion turns round. A quadratic kernel answers both voltages alike. Fitted to a record
+# and its mirror image, it vanishes to the last digit, and with an offset it does not:
+
+# %%
+basis = Volterra(Delays(settings.memory))
+u = signals.filtered_noise(settings, 2000, 7)
+quadratic = {}
+for name in ("S1", "S6"):
+    mirrored = [
+        rf.Recording(u=v, y=response(plant(name), v, settings.Ts)[:, 1], Ts=settings.Ts, channels="alpha")
+        for v in (u, -u)
+    ]
+    weights = least_squares(basis, mirrored, "alpha").weights
+    quadratic[name] = np.max(np.abs(weights[basis.degrees == 2]))
+    print(f"{name}: largest quadratic coefficient {quadratic[name]:.1e} rad/V²")
+
+# %% [markdown]
+# ## How good is the model?
+#
+# Errors are squared, over the variance of the output, on data that no model has learnt from, with frozen
+# weights; beside that on pulses of 2 V either way.
+
+# %%
+print(f"{'':20}{'learnt':>8}{'held out':>10}{'+2 V':>8}{'-2 V':>8}")
+for row in result.rows:
+    print(f"{row.name:20}{row.size:8}{row.held_out:10.4f}{row.pulses[0]:8.3f}{row.pulses[1]:8.3f}")
+
+# %% [markdown]
+# Against the linearised joint the quadratic model looks very good. Against an identified linear model it
+# gains a tenth of the error. The pulses say it again; at +2 V the offset happens to make up for friction
+# and dead zone, and the linearised joint beats everything, at -2 V it does not.
+
+# %%
+drawn["figure_10"].figure
+
+# %%
+drawn["figure_11"].figure
+
+# %% [markdown]
+# ## What does the online error hide?
+#
+# LMS reports the error it makes while its weights move. That can be small when the model is worthless:
+# the same filter, five samples of 1 ms.
+
+# %%
+drawn["trap"].figure
+
+# %% [markdown]
+# ## Where do the kernels come from?
+#
+# The equations of the simulated joint have kernels too: differentiate the simulator, average over the
+# input. They agree with those from the data, and switching effects off one by one says who makes what.
+
+# %%
+print(result.bridge)
+drawn["kernels"].figure
+
+# %% [markdown]
+# ## What stays
+#
+# - The curve of Figure 9 can be had for any number of iterations; it says nothing about the model.
+# - Friction and dead zone, if symmetric, leave nothing for degree 2. Degree 3 gets a part of them.
+# - The advantage over a linearised model is the advantage of identification.
+# - Which physics is missing, a kernel does not say. For that, see the first notebook.
+#
+# The last cell checks what the text says.
+
+# %%
+row = {r.name: r for r in result.rows}
+linearised, linear = row["linearised joint"].held_out, row["M=5 linear"].held_out
+lms, cubic = row["M=5 quadratic, LMS"], row["M=5 cubic"].held_out
+assert abs(a.settle / a.prediction.settle - 1) < 0.15
+assert a.prediction.stability.stable
+assert np.std(a.symmetric[len(a.symmetric) // 2 :]) < abs(a.target) / 5  # it stays near zero
+assert quadratic["S1"] < 1e-12 < 1e-3 < quadratic["S6"]
+assert linear < linearised / 2  # identification, and then a tenth by degree 2, more by degree 3
+assert 0.05 < 1 - row["M=5 quadratic"].held_out / linear < 0.2
+assert cubic < 0.75 * row["M=5 quadratic"].held_out
+assert np.argmin([r.pulses[0] for r in result.rows]) == 0  # the linearised joint, by luck
+assert np.argmax([r.pulses[1] for r in result.rows]) == 0
+kernels = lms.series.kernels()
+plateau = kernels[0] + 2 * np.sum(kernels[1]) + 4 * np.sum(kernels[2])
+assert np.allclose(lms.pulse_hat[0][9:15], plateau)  # five samples after the pulse began
+assert result.trap.online < result.trap.least_squares < 1 < result.trap.frozen
+agreement = result.bridge.physics.against(result.bridge.data)
+assert max(agreement.relative) < 0.03
+print("All claims hold.")

@@ -1,0 +1,239 @@
+"""Everything the paper leaves open, as settings that say where their default comes from.
+
+The paper gives the memory, the variance of the input, the pulse and a table of constants. It gives
+neither sampling interval, filter, step sizes nor number of samples, no friction and no dead zone, no
+sign convention, and no error as a number. None of these is hidden here.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal, Self
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.reproduce.declared import ASSUMPTION, NUMERICS, PAPER, TINY, checked, read, setting
+from rotflex_jax.reproduce.plants import SCENARIOS
+
+FILTERS = ("ar1", "butterworth", "fir")
+TRANSFORMS = ("none", "hermite", "gram_schmidt")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """One run of the paper's experiment.
+
+    Raises:
+        InputError: A value that is no such number, out of range, or none of the choices.
+
+    >>> Settings().memory, Settings(Ts=0.05).Ts
+    (5, 0.05)
+    """
+
+    # The machine.
+    scenario: str = setting(
+        "S6",
+        ASSUMPTION,
+        "symmetric friction and dead zone alone leave every quadratic coefficient at zero, so nothing "
+        "could converge; an amplifier offset of 0.3 V gives them something to find",
+        choices=tuple(SCENARIOS),
+    )
+    arm_friction: str = setting(
+        "joint",
+        ASSUMPTION,
+        "friction between hub and arm; 'the rotational speeds of the two rotating masses' may also "
+        "mean against the table",
+        choices=("joint", "arm"),
+    )
+    plant: tuple[tuple[str, float], ...] = setting(
+        (),
+        ASSUMPTION,
+        "other numbers of the machine by their full names, such as hub.coulomb.level=0.05; no friction or "
+        "dead zone of this module has been published",
+    )
+    efficiency: float = setting(
+        1.0, ASSUMPTION, "of motor and gear; the paper lists none, the maker 0.62", least=TINY, most=1.0
+    )
+    inductance: float = setting(
+        0.0,
+        ASSUMPTION,
+        "the listed 0.18 mH acts within 0.1 ms and changes the deflection by 2e-6 (NMSE); 0 for none",
+        unit="H",
+        least=0.0,
+    )
+    saturation: float = setting(5.0, PAPER, "largest voltage of its table", unit="V", least=TINY)
+    sign: int = setting(
+        1,
+        ASSUMPTION,
+        "1: a positive voltage leaves the arm behind, so that the first deflection is negative",
+        choices=(1, -1),
+    )
+    sensor_noise: float = setting(
+        0.0,
+        ASSUMPTION,
+        "standard deviation; an ideal sensor shows the method's own errors",
+        unit="rad",
+        least=0,
+    )
+
+    # The recording.
+    Ts: float = setting(
+        0.1,
+        ASSUMPTION,
+        "sampling interval; five samples hold the 0.4 s that the joint remembers only from 0.08 s on",
+        unit="s",
+        least=TINY,
+    )
+    filter: str = setting("ar1", ASSUMPTION, "the simplest filter that makes coloured noise", choices=FILTERS)
+    cutoff: float = setting(
+        5.0,
+        ASSUMPTION,
+        "of the filter; convergence in 7000 iterations needs samples that are nearly white",
+        unit="Hz",
+        least=TINY,
+    )
+    variance: float = setting(1.0, PAPER, "of the input, section 5", unit="V²", least=TINY)
+    samples: int = setting(14000, ASSUMPTION, "twice the 7000 iterations, so that rest shows", least=200)
+    held_out: int = setting(10000, ASSUMPTION, "samples that no model learns from", least=200)
+    seed: int = setting(1, ASSUMPTION, "of the random numbers", least=0)
+
+    # The model and its adaptation.
+    memory: int = setting(5, PAPER, "M of section 5", least=2, most=10)
+    layout: Literal["triangular", "full"] = setting(
+        "triangular",
+        ASSUMPTION,
+        "each product once; (13) may also mean twice ('full'), which doubles step sizes off the diagonal",
+        choices=("triangular", "full"),
+    )
+    constant: bool = setting(
+        True,
+        PAPER,
+        "h0 of (10); (13) and (14) drop it, which biases the quadratic kernel",
+        choices=(True, False),
+    )
+    transform: str = setting(
+        "none",
+        ASSUMPTION,
+        "(15) to (17) update the raw kernels; the orthogonalisation that the paper mentions is not shown",
+        choices=TRANSFORMS,
+    )
+    settle_at: float = setting(
+        7000.0, PAPER, "iterations after which the coefficient of Fig. 9 rests", unit="iterations", least=10
+    )
+    coefficient: tuple[int, int] = setting(
+        (1, 1),
+        ASSUMPTION,
+        "lags of the quadratic coefficient in Fig. 9; lag 0 cannot act yet, so this is the first that can",
+    )
+    mu1: float = setting(
+        0.01, ASSUMPTION, "step size of h0 and the linear kernel: 3 % excess error", unit="1/V²", least=TINY
+    )
+    mu2: float = setting(
+        0.0,
+        ASSUMPTION,
+        "step size of the quadratic kernel; 0: predicted from settle_at",
+        unit="1/V⁴",
+        least=0.0,
+    )
+    runs: int = setting(
+        8,
+        NUMERICS,
+        "repetitions with other inputs, to tell the mean of Fig. 9 from its noise",
+        least=1,
+        most=64,
+    )
+
+    # The pulse.
+    pulse: float = setting(2.0, PAPER, "height, section 5", unit="V")
+    pulse_width: float = setting(1.0, PAPER, "section 5", unit="s", least=TINY)
+    pulse_delay: float = setting(0.5, NUMERICS, "rest before it", unit="s", least=0.0)
+    pulse_after: float = setting(1.5, NUMERICS, "watched after it", unit="s", least=0.0)
+
+    grey_box: bool = setting(
+        False,
+        NUMERICS,
+        "whether to fit the joint's equations with friction too; takes a minute",
+        choices=(True, False),
+    )
+    step: float = setting(
+        1e-3, NUMERICS, "longest step of the simulator; errs by less than 1e-9 (NMSE)", unit="s", least=1e-6
+    )
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = checked(field, getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
+        _consistent(self)
+
+    def replace(self, changes: Mapping[str, Any]) -> Self:
+        """The same settings with some changed; text is read as the kind of value that is needed.
+
+        A name with dots is that of a number of the machine and goes to `plant`.
+
+        >>> Settings().replace({"memory": "8", "coefficient": "1,2"}).coefficient
+        (1, 2)
+        """
+        fields = {field.name: field for field in dataclasses.fields(self)}
+        numbers = {name: value for name, value in changes.items() if "." in name}
+        changes = {name: value for name, value in changes.items() if name not in numbers}
+        if numbers:
+            changes["plant"] = tuple((dict(self.plant) | numbers).items())
+        for name in changes:
+            if name not in fields:
+                raise InputError(
+                    f"{name!r} is no setting of the experiment, which has {', '.join(fields)}; "
+                    "choose one of these."
+                )
+        values = {name: read(fields[name], value) for name, value in changes.items()}
+        return dataclasses.replace(self, **values)
+
+    @classmethod
+    def table(cls) -> list[dict[str, Any]]:
+        """Every setting with default, unit, source ("paper", "assumption", "numerics") and reason."""
+        return [
+            {
+                "name": field.name,
+                "default": field.default,
+                **{key: field.metadata[key] for key in ("unit", "source", "why", "choices")},
+            }
+            for field in dataclasses.fields(cls)
+        ]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """`table` with the values of this run and whether they were changed."""
+        return [
+            row
+            | {"value": getattr(self, row["name"]), "changed": getattr(self, row["name"]) != row["default"]}
+            for row in self.table()
+        ]
+
+
+def _consistent(s: Settings) -> None:
+    """What one value alone cannot tell."""
+    lags = s.coefficient
+    if not (
+        isinstance(lags, tuple | list)
+        and len(lags) == 2
+        and all(isinstance(lag, int) and 0 <= lag < s.memory for lag in lags)
+    ):
+        raise InputError(
+            f"Setting coefficient was given {lags!r}, but it needs two lags from 0 to {s.memory - 1}, the "
+            "memory less one; give for instance 1,1."
+        )
+    object.__setattr__(s, "coefficient", tuple(sorted(lags)))
+    object.__setattr__(s, "plant", tuple((name, _number(name, value)) for name, value in s.plant))
+    if not s.cutoff < 0.5 / s.Ts and s.filter == "butterworth":
+        raise InputError(
+            f"Setting cutoff was given {s.cutoff:g} Hz, but a Butterworth filter needs one below half the "
+            f"sampling rate, {0.5 / s.Ts:g} Hz; lower it, or take the filter ar1."
+        )
+    if round(s.pulse_width / s.Ts) < 1:
+        raise InputError(
+            f"Setting pulse_width was given {s.pulse_width:g} s, but a pulse lasts at least one sample of "
+            f"{s.Ts:g} s; lengthen it or shorten Ts."
+        )
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} was given {value!r}, but it needs a number; give one.") from None
