@@ -12,7 +12,7 @@ import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.mechanism.propagate import CHUNK, states
-from rotflex_jax.mechanism.simulate import PredictorStep, FreeStep
+from rotflex_jax.mechanism.simulate import FreeStep, PredictorStep
 from rotflex_jax.precision import double_precision
 
 # Shorter than a chunk, one chunk, a little more than one, and no multiple of it.

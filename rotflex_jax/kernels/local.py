@@ -13,7 +13,7 @@ from rotflex_jax.kernels.subject import Modelled, lags_of, subject
 from rotflex_jax.mechanism.assembly import driven_voltage, read_outputs, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import states
-from rotflex_jax.mechanism.simulate import Solver, FreeStep, free_run
+from rotflex_jax.mechanism.simulate import FreeStep, Solver, free_run
 from rotflex_jax.precision import double_precision
 
 # Directions that are differentiated at once: enough for the vector units, few enough for the cache.

@@ -16,7 +16,7 @@ from rotflex_jax.effects.kinds import Actuation
 from rotflex_jax.mechanism.assembly import driven_voltage, effects_of, read_outputs
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import chunks, joined, states
-from rotflex_jax.mechanism.simulate import Solver, FreeStep
+from rotflex_jax.mechanism.simulate import FreeStep, Solver
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))

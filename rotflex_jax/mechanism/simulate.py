@@ -26,6 +26,7 @@ class FreeStep:
     solver: Solver
 
     def __call__(self, x: jax.Array, v: jax.Array, c: Any) -> jax.Array:
+        """State one sample later under the voltage `v`."""
         return self.solver.advance(self.structure, x, v, c)
 
 

@@ -1,17 +1,14 @@
 """What `rotflex reproduce` leaves behind: a page, its figures as PNG, and the numbers as JSON."""
 
 import datetime
+import io
 import json
 import math
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import jinja2
-import matplotlib
-
-from rotflex_jax.errors import InputError
 from rotflex_jax.report.figures import Picture
+from rotflex_jax.report.page import save, template
 from rotflex_jax.report.style import data_address
 from rotflex_jax.reproduce import wording
 from rotflex_jax.reproduce.experiment import Reproduction
@@ -32,21 +29,17 @@ def write(result: Reproduction, folder: Path) -> Path:
         InputError: The folder is a file, or cannot be written to.
     """
     drawn = pictures(result)
-    page = _template().render(content(result, drawn))
+    page = template("reproduce.html.j2", "rotflex_jax.reproduce").render(content(result, drawn))
     text = json.dumps(result.to_dict(), indent=2, ensure_ascii=False) + "\n"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, picture in drawn.items():
-            with matplotlib.rc_context({"svg.fonttype": "path"}):
-                picture.figure.savefig(folder / f"{name}.png", dpi=DPI)
-        (folder / "result.json").write_text(text, encoding="utf-8")
-        (folder / "reproduce.html").write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise InputError(
-            f"{folder} cannot be written to ({error.strerror or error}), but the figures and the page need a "
-            "folder of their own; name another folder."
-        ) from error
+    images = {f"{name}.png": _png(picture) for name, picture in drawn.items()}
+    save(folder, {**images, "result.json": text, "reproduce.html": page})
     return folder / "reproduce.html"
+
+
+def _png(picture: Picture) -> bytes:
+    file = io.BytesIO()
+    picture.figure.savefig(file, dpi=DPI, format="png")
+    return file.getvalue()
 
 
 def content(result: Reproduction, drawn: dict[str, Picture]) -> dict[str, Any]:
@@ -149,15 +142,3 @@ def _plain(value: Any) -> str:
         pairs = (f"{v[0]}={v[1]:g}" if isinstance(v, tuple) else str(v) for v in value)
         return ", ".join(pairs) or "none"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-@cache
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("rotflex_jax.reproduce"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("reproduce.html.j2")
