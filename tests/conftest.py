@@ -1,13 +1,14 @@
 """A strict JAX session, and the measured recordings where they are at hand."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
 import pytest
 
 from rotflex_jax.data.datasets import DATASETS, FOLDER_VARIABLE, load_dataset
+from rotflex_jax.discover.room import make_room
 from rotflex_jax.recording import Recording
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -16,6 +17,13 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 if BESIDE.is_dir():
     os.environ.setdefault(FOLDER_VARIABLE, str(BESIDE))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room() -> Iterator[None]:
+    """A process that runs all tests would hold more compiled code than the system has room for."""
+    make_room()
+    yield
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from rotflex_jax.discover.moves import (
 )
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Discovery, Ranked, Round
+from rotflex_jax.discover.room import make_room
 from rotflex_jax.discover.scales import scales
 from rotflex_jax.discover.score import Score, promising, scores
 from rotflex_jax.discover.stages import Scribe
@@ -73,6 +74,7 @@ def discover(
         InputError: No recording, or channels that the model lacks.
     """
     began, say = time.perf_counter(), progress or (lambda _: None)
+    make_room()
     model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
     trained = (train,) if isinstance(train, Recording) else tuple(train)
     unseen = (test,) if isinstance(test, Recording) else tuple(test)

@@ -36,6 +36,7 @@ class Cogging(Force):
     equation: ClassVar[str] = "tau = -(sine * sin(periods * position) + cosine * cos(periods * position))"
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm")
     amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")
+    contains: ClassVar[tuple[str, ...]] = ("gravity",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm")
 
     sine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the sine")
