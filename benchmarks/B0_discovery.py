@@ -85,8 +85,7 @@ def rows(todo: list[Job], workers: int) -> Iterator[tuple[Job, dict[str, Any]]]:
         prepare()
         yield from ((job, one(job)) for job in todo)
         return
-    # A process may hold only so many memory maps, and a record can bring many compiled structures.
-    with ProcessPoolExecutor(workers, get_context("spawn"), prepare, max_tasks_per_child=12) as pool:
+    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=prepare) as pool:
         running = {pool.submit(one, job): job for job in todo}
         for done in as_completed(running):
             job = running[done]

@@ -48,7 +48,6 @@ DEFAULTS: dict[Place, dict[str, float]] = {
     ("second_mode", "hub"): {"inertia": 4e-4, "frequency": 18.0, "damping": 0.03},
     ("second_mode", "arm"): {"inertia": 8e-4, "frequency": 10.0, "damping": 0.03},
     ("heating", "hub"): {"rate": 1.1, "time": 30.0},
-    ("backlash", "hub"): {"play": 0.011},
     ("dead_zone", "input"): {"width": 0.2},
     ("saturation", "input"): {"limit": 1.2},
     ("voltage_offset", "input"): {"offset": 0.25},
@@ -68,6 +67,7 @@ A bias of `theta` is left out: it shifts an origin that nobody knows.
 """
 
 OUTSIDE: dict[Place, dict[str, float]] = {
+    ("backlash", "hub"): {"play": 0.011},
     ("patchy_friction", "hub"): {"level": 0.04, "share": 0.8},
     ("drifting_spring", "joint"): {"drift": 0.01},
     ("shaking", "arm"): {"amplitude": 0.02, "frequency": 1.7},
@@ -76,9 +76,9 @@ OUTSIDE: dict[Place, dict[str, float]] = {
 }
 r"""Effects that the package has nothing for: an honest search says that something is missing.
 
-Friction of level ``F (1 + r sin 3 theta)``; a stiffness that grows by 1 % per second; a torque
-``A sin 2 pi f t`` that nobody measures; a cable that takes a torque over an angle and lets it fade
-while it rests, ``x' = (s - |s| x) / w - x / T``; a gear that passes on less at speed,
+Play between rotor and hub; friction of level ``F (1 + r sin 3 theta)``; a stiffness that grows by 1 %
+per second; a torque ``A sin 2 pi f t`` that nobody measures; a cable that takes a torque over an angle
+and lets it fade while it rests, ``x' = (s - |s| x) / w - x / T``; a gear that passes on less at speed,
 ``1 - loss |s| / (|s| + s_0)`` of the motor torque.
 """
 
