@@ -1,7 +1,5 @@
 """Offsets and biases: do they belong to the machine, to a recording alone, or to neither?"""
 
-import dataclasses
-
 import numpy as np
 
 from rotflex_jax.discover.decide import WINDOWS_BETTER
@@ -23,8 +21,9 @@ def settle(
         recordings alone; and a note where calibrations were left out altogether.
     """
     asked = [p for p in order if p in CALIBRATIONS]
-    order, own = _carried_over(away, held_out(away, final), order)
-    bare = _without(judge, away, final, order)
+    trial = held_out(away, final)
+    order, own = _carried_over(away, trial, order)
+    bare = _without(judge, away, trial, order)
     if bare is None:
         return final, order, own, ()
     names = " and ".join(f"{CATALOG[p[0]].title} at {p[1]}" for p in asked)
@@ -42,47 +41,30 @@ def _carried_over(away: Away, final: Trial, order: list[Place]) -> tuple[list[Pl
     """
     kept, own = list(order), []
     for place in [p for p in order if p in CALIBRATIONS]:
-        with_it = _windows(away, final, kept)
-        less = _windows(away, final, [p for p in kept if p != place])
+        with_it = away.short_runs(final.trained, kept)
+        less = away.short_runs(final.trained, [p for p in kept if p != place])
         if float(np.mean(np.log(with_it / less))) > -WINDOWS_BETTER:
             kept.remove(place)
             own.append(place)
     return kept, own
 
 
-def _without(judge: Judge, away: Away, final: Hypothesis, order: list[Place]) -> Hypothesis | None:
+def _without(judge: Judge, away: Away, final: Trial, order: list[Place]) -> Hypothesis | None:
     """The final model fitted without calibrations, where that runs better on the held-out recordings.
 
     Training recordings may ask for offsets that the held-out ones do not share; numbers fitted beside
     such offsets are then further off than those fitted as if there were none.
     """
-    if not set(final.places) & set(CALIBRATIONS):
+    bare = final.hypothesis
+    asked = set(bare.places) & set(CALIBRATIONS)
+    if not asked:
         return None
-    bare = final
-    for place in set(final.places) & set(CALIBRATIONS):
+    for place in asked:
         bare = without(judge, bare, place)
     bare = refit(judge, [bare])[0]
-    with_them = _windows(away, held_out(away, final), order)
-    alone = _windows(away, held_out(away, bare), [p for p in order if p in bare.places])
+    with_them = away.short_runs(final.trained, order)
+    alone = away.short_runs(held_out(away, bare).trained, [p for p in order if p in bare.places])
     return bare if float(np.mean(np.log(alone / with_them))) < -WINDOWS_BETTER else None
-
-
-def _windows(away: Away, trial: Trial, places: list[Place]) -> np.ndarray:
-    """Held-out errors of short free runs with the trained numbers and these effects alone."""
-    trained = _trained(trial, away)
-    return away.windows(
-        [
-            away.runner(trained, places, r).simulate_windows(recording, away.seconds)
-            for r, recording in enumerate(away.recordings)
-        ]
-    )
-
-
-def _trained(trial: Trial, away: Away) -> Hypothesis:
-    """The trained hypothesis shaped for the held-out recordings, calibrations as trained."""
-    h = trial.hypothesis
-    R = len(away.recordings)
-    return dataclasses.replace(trial.adapted, own=np.tile(h.own.mean(axis=0), (R, 1)))
 
 
 def own_notes(judge: Judge, away: Away, final: Trial, own: list[Place]) -> tuple[str, ...]:

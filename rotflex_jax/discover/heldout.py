@@ -38,6 +38,12 @@ class Trial:
     numbers: int = 0
 
     @property
+    def trained(self) -> Hypothesis:
+        """The hypothesis on the held-out recordings with calibrations as trained, not as adapted."""
+        own = np.tile(self.hypothesis.own.mean(axis=0), (len(self.adapted.x0), 1))
+        return dataclasses.replace(self.adapted, own=own)
+
+    @property
     def held_out(self) -> float:
         """Held-out log-likelihood [nat]."""
         return float(np.sum(self.blocks))
@@ -66,6 +72,12 @@ class Away:
         part = bench.supermodel.part(gates)
         mechanism = part.mechanism.with_values(h.values(bench)[recording, part.parameters])
         return Model(mechanism, bench.solver, tuple(gates[list(part.effects)]))
+
+    def short_runs(self, h: Hypothesis, places: Iterable[Place]) -> np.ndarray:
+        """Root mean square error per channel of short free runs with these effects."""
+        on = tuple(places)
+        pairs = enumerate(self.recordings)
+        return self.windows([self.runner(h, on, r).simulate_windows(x, self.seconds) for r, x in pairs])
 
     def windows(self, runs: Sequence[np.ndarray]) -> np.ndarray:
         """Root mean square error per channel of short free runs, their first samples not counted."""
@@ -100,11 +112,7 @@ def held_out(away: Away, h: Hypothesis) -> Trial:
         if gained < 0.05:
             break
     blocks = in_blocks(h.whitener.log_densities(e, bench.data.seen), bench.data)
-    runs = [
-        away.runner(now, h.places, r).simulate_windows(recording, away.seconds)
-        for r, recording in enumerate(away.recordings)
-    ]
-    return Trial(h, blocks, now, away.windows(runs))
+    return Trial(h, blocks, now, away.short_runs(now, h.places))
 
 
 def _settle(bench: Bench, h: Hypothesis, e: np.ndarray) -> tuple[float, Hypothesis, np.ndarray]:

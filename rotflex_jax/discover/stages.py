@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rotflex_jax.discover.heldout import Away, Trial
-from rotflex_jax.discover.hypothesis import Hypothesis, constrain, seat
+from rotflex_jax.discover.hypothesis import Hypothesis, constrain
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.discover.supermodel import Place
@@ -42,9 +42,7 @@ class Scribe:
         h, away = trial.hypothesis, self.away
         bench = self.judge.bench
         values = h.values(bench).mean(axis=0)
-        x0, own = seat(away.judge.bench, h.places, away.first), h.own.mean(axis=0)
-        trained = dataclasses.replace(h, x0=x0, own=np.tile(own, (len(x0), 1)))
-        runners = [away.runner(trained, places, r) for r in range(len(away.recordings))]
+        runners = [away.runner(trial.trained, places, r) for r in range(len(away.recordings))]
         pairs = list(zip(runners, away.recordings, strict=True))
         simulated = tuple(runner.simulate(r) for runner, r in pairs)
         windowed = tuple(runner.simulate_windows(r, away.seconds) for runner, r in pairs)

@@ -45,20 +45,9 @@ def motor_torque(mechanism: Mechanism, at: str, x: jax.Array, v: jax.Array, gate
     return total
 
 
-class _Drives:
-    """The last argument of memory laws, formed once per kind and port."""
-
-    def __init__(self, mechanism: Mechanism, x: jax.Array, v: jax.Array, gates: jax.Array) -> None:
-        self.given = mechanism, x, v, gates
-        self.known: dict[str, jax.Array] = {}
-
-    def __call__(self, effect: Memory) -> jax.Array:
-        mechanism, x, v, gates = self.given
-        if effect.driven_by == "voltage":
-            return v
-        if effect.at not in self.known:
-            self.known[effect.at] = motor_torque(mechanism, effect.at, x, v, gates)
-        return self.known[effect.at]
+def _drive(mechanism: Mechanism, e: Memory, x: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
+    """The last argument of a memory law."""
+    return v if e.driven_by == "voltage" else motor_torque(mechanism, e.at, x, v, gates)
 
 
 def torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
@@ -73,14 +62,14 @@ def torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gate
     """
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
-    drive = _Drives(mechanism, x, v, gates)
     total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
     for i, e in effects_of(mechanism, Force):
         k = layout.torque_ports.index(e.at)
         total[k] = total[k] + gates[i] * e.force(position[k], speed[k], v)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        total[k] = total[k] + gates[i] * e.force(z[m], position[k], speed[k], drive(e))
+        drive = _drive(mechanism, e, x, v, gates)
+        total[k] = total[k] + gates[i] * e.force(z[m], position[k], speed[k], drive)
     return jnp.stack(total)
 
 
@@ -88,11 +77,11 @@ def flows(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates:
     """Time derivatives (m, ...) of the memories; arguments as for `torques`."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
-    drive = _Drives(mechanism, x, v, gates)
     rates = []
     for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        rates.append(jnp.asarray(e.flow(z[m], position[k], speed[k], drive(e))))
+        drive = _drive(mechanism, e, x, v, gates)
+        rates.append(jnp.asarray(e.flow(z[m], position[k], speed[k], drive)))
     return jnp.stack(rates)
 
 
