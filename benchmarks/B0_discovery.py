@@ -8,8 +8,12 @@ report seeds.
 
     python benchmarks/B0_discovery.py --workers 2
     python benchmarks/B0_discovery.py --tuning --seeds 100 --inputs noise
+    python benchmarks/B0_discovery.py --size 1,0.3,0.1 --inputs noise --seeds 1000
+    python benchmarks/B0_discovery.py --channels theta --inputs noise --seeds 1000
+    python benchmarks/B0_discovery.py --pairs 36 --triples 12 --inputs noise --seeds 1000
 
-Records that the file has already are skipped unless `--fresh` is given.
+Records that the file has already are skipped unless `--fresh` is given; every run adds to the file, and
+the tables and figures beside it are of all its records.
 """
 
 from __future__ import annotations
@@ -37,7 +41,9 @@ for folder in (HERE, HERE.parent):
 
 from rich.console import Console
 
+from arena.draws import drawn
 from arena.hidden import DEFAULTS, OUTSIDE
+from arena.pages import publish
 from arena.records import INPUTS
 from arena.table import answer, label, show
 
@@ -45,19 +51,29 @@ TUNING, REPORT = tuple(range(100, 120)), tuple(range(1000, 1020))
 Job = dict[str, Any]
 
 
-def jobs(seeds: list[int], inputs: list[str], nulls: int, seconds: float, only: str) -> list[Job]:
+def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job]:
     """Records of a run; the ones with nothing hidden take a seed each and the inputs in turn."""
-    base = seeds[0] // 100 * 100
-    kinds = list(INPUTS)
+    groups = [(place,) for place in (*DEFAULTS, *OUTSIDE)]
+    if a.pairs or a.triples:
+        groups = [*drawn(a.pairs, 2), *drawn(a.triples, 3)]
+    sizes = [float(x) for x in a.size.split(",")]
+    channels = {"both": ["theta", "alpha"]}.get(a.channels, [a.channels])
+    plain = sizes == [1.0] and len(channels) == 2 and not (a.pairs or a.triples)
     hidden = [
-        {"effects": [list(place)], "kind": kind, "seed": seed}
-        for place in (*DEFAULTS, *OUTSIDE)
+        {"effects": [list(place) for place in group], "kind": kind, "seed": seed, "size": size}
+        for size in sizes
+        for group in groups
         for kind in inputs
         for seed in seeds
+        if all(place[1] in channels or place[1] not in ("theta", "alpha") for place in group)
     ]
-    nothing = [{"effects": [], "kind": kinds[k % len(kinds)], "seed": base + k} for k in range(nulls)]
-    chosen = [j for j in hidden + nothing if not only or only in label(j)]
-    return [{**j, "seconds": seconds} for j in chosen]
+    base, kinds = seeds[0] // 100 * 100, list(INPUTS)
+    count = a.nulls if a.nulls is not None else 20 * plain
+    nothing = [
+        {"effects": [], "kind": kinds[k % len(kinds)], "seed": base + k, "size": 1.0} for k in range(count)
+    ]
+    every = [{**j, "seconds": a.seconds, "channels": channels} for j in hidden + nothing]
+    return [j for j in every if not a.only or a.only in label(j)]
 
 
 def key(job: Job) -> str:
@@ -129,7 +145,11 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", default="", help="as 1000,1001; the first two if omitted")
     parser.add_argument("--inputs", default="noise,multisine", help=", ".join(INPUTS))
     parser.add_argument("--only", default="", help="part of a name, as coulomb@hub or nothing")
-    parser.add_argument("--nulls", type=int, default=20, help="records with nothing hidden")
+    parser.add_argument("--nulls", type=int, default=None, help="records with nothing hidden")
+    parser.add_argument("--size", default="1", help="shares of the usual sizes, as 1,0.3,0.1")
+    parser.add_argument("--channels", default="both", choices=["both", "theta", "alpha"], help="sensors")
+    parser.add_argument("--pairs", type=int, default=0, help="machines with two effects, instead of one")
+    parser.add_argument("--triples", type=int, default=0, help="machines with three effects")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a record [s]")
     parser.add_argument("--quick", action="store_true", help="one seed, one input, 10 s, 5 nulls")
     parser.add_argument("--workers", type=int, default=1, help="processes")
@@ -150,10 +170,11 @@ def main() -> int:
         kind = "tuning" if a.tuning else "report"
         raise SystemExit(f"--seeds was given {wrong}, which are no {kind} seeds.")
     if a.quick:
-        seeds, inputs, a.seconds, a.nulls = seeds[:1], inputs[:1], 10.0, min(a.nulls, 5)
+        seeds, inputs, a.seconds = seeds[:1], inputs[:1], 10.0
+        a.nulls = min(5 if a.nulls is None else a.nulls, 5)
     suffix = ("_tuning" if a.tuning else "") + ("_quick" if a.quick else "")
     path = a.out or HERE / "results" / f"B0{suffix}.json"
-    wanted = jobs(seeds, inputs, a.nulls, a.seconds, a.only)
+    wanted = jobs(a, seeds, inputs)
     made = provenance()
     results: dict[str, Any] = {"benchmark": "B0", "runs": [], "records": {}}
     if path.exists() and not a.fresh:
@@ -176,7 +197,8 @@ def main() -> int:
     codes = {r.get("code") for r in shown}
     if len(codes) > 1:
         console.print(f"[yellow]These records come from {len(codes)} versions of the package.[/]")
-    console.print(f"saved: {path}", markup=False, soft_wrap=True)
+    for file in (path, *publish(list(known.values()), path)):
+        console.print(f"saved: {file}", markup=False, soft_wrap=True)
     return int(any("error" in r for r in shown))
 
 

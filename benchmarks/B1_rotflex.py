@@ -1,27 +1,37 @@
-"""Discovery on a measured rotary flexible joint: two runs under two controllers, one held out at a time.
+"""A measured rotary flexible joint: two runs under two controllers, one held out at a time.
 
 Needs the `rotflex` recordings: `rotflex data fetch rotflex`, or a folder named by `ROTFLEX_DATA`.
-Prints the tables of the README and writes `results/B1.json`.
+`python benchmarks/B1_rotflex.py` does all of it; `search`, `fits` or `figures` does one part. Prints the
+tables of the README and of docs/measured_joint.md, writes `results/B1.json` and `docs/figures/`.
+
+    search   discovery: which effects are missing, on each way of holding data out
+    repeats  how far the same step, made twice in one run, differs from itself
+    arm      the joint by itself: the arm behind the measured hub, with one law after the other
+    fits     named structures by an integrator of its own, fitted for free runs of 2 s; what differs between
+             the runs
+    figures  from the results of `fits`
 """
 
 import json
 import pathlib
+import sys
 import time
 
 import numpy as np
 
 import rotflex_jax as rf
+from measured_joint import arm_alone, drawing, fine_run
 
-RESULTS = pathlib.Path(__file__).parent / "results"
+HERE = pathlib.Path(__file__).parent
+RESULTS = HERE / "results" / "B1.json"
 
 
-def degrees(errors: dict[str, float]) -> str:
+def degrees(errors) -> str:
     return " / ".join(f"{np.degrees(errors[c]):.2f}" for c in ("theta", "alpha"))
 
 
-def main() -> None:
-    rf.enable_fast_loops()
-    A, B = rf.data.load_dataset("rotflex")
+def search(A: rf.Recording, B: rf.Recording) -> dict:
+    """Discovery, as a user meets it."""
     (A1, A2), (B1, B2) = A.split(0.7), B.split(0.7)
     cases = {
         "A to B": (A, B),
@@ -37,16 +47,99 @@ def main() -> None:
         labels = ["the joint as it is", *(f"+ {r.effect} at {r.port}" for r in d.rounds)]
         for label, stage in zip(labels, d.stages, strict=True):
             print(f"| {label} | {degrees(stage.held_out_rmse_windows)} | {degrees(stage.held_out_rmse)} |")
-        for r in d.rounds:
-            print(f"- {r.sentence}")
-        for note in d.notes:
-            print(f"- {note}")
+        for line in (*(f"- {r.sentence}" for r in d.rounds), *(f"- {note}" for note in d.notes)):
+            print(line)
         for e in d.final.estimates:
-            print(f"    {e}  {e.note}")
+            print(f"    {e}  {e.note}", flush=True)
         out[name] = d.to_dict()
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "B1.json").write_text(json.dumps(out, indent=1) + "\n")
+    return out
+
+
+def fits(A: rf.Recording, B: rf.Recording) -> dict:
+    """Named structures: learnt from one run and judged on the other, on both, and on the same run."""
+    runs, out = {"A": A, "B": B}, {}
+    print(
+        "\n| structure | from | judged on | no offset | its own offset | whole, its own offset | offset [V] |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for name, free in fine_run.STRUCTURES.items():
+        lugre = "presliding" in free
+        for learnt in ("A", "B", "AB"):
+            found = fine_run.fit({k: runs[k] for k in learnt}, free)
+            rows = {}
+            for key, run in runs.items():
+                bare = found.numbers[learnt[0]] | {"offset": 0.0, "bias": 0.0}
+                own = found.numbers.get(key)
+                if own is None:  # one number, fitted to the run that is judged
+                    own = fine_run.fit({key: run}, (), ("offset",), bare, lugre).numbers[key]
+                rows[key] = {
+                    "no_offset": fine_run.rms(bare, lugre, run),
+                    "own_offset": fine_run.rms(own, lugre, run),
+                    "offset": own["offset"],
+                    "whole": fine_run.rms(own, lugre, run, run.N),
+                }
+                errors = " | ".join(
+                    " / ".join(f"{e:.2f}" for e in rows[key][k]) for k in ("no_offset", "own_offset", "whole")
+                )
+                kind = "" if key not in learnt else " (seen)"
+                print(f"| {name} | {learnt} | {key}{kind} | {errors} | {own['offset']:+.4f} |", flush=True)
+            out[f"{name}, from {learnt}"] = {"judged": rows, "numbers": found.numbers, "std": found.std}
+    return out
+
+
+def repeats(A: rf.Recording, B: rf.Recording) -> dict:
+    """How far the same step, made twice in one run, differs from itself, voltage of the feedback included."""
+    out = {}
+    for name, run in (("A", A), ("B", B)):
+        windows = np.degrees(run.y[: 5 * fine_run.WINDOW]).reshape(5, fine_run.WINDOW, 2)
+        for way, first, second in (("up", 2, 4), ("down", 1, 3)):
+            d = (windows[first] - windows[second])[fine_run.SEEN :]
+            out[f"{name} {way}"] = np.sqrt(np.mean(d**2, axis=0)).tolist()
+    print("\n| the same step twice | difference [deg] |\n|---|---|")
+    for name, (theta, alpha) in out.items():
+        print(f"| {name} | {theta:.2f} / {alpha:.2f} |")
+    return out
+
+
+def differences(A: rf.Recording, B: rf.Recording) -> dict:
+    """Both runs fitted together, friction levels and offsets each run's own."""
+    free = [k for k in fine_run.STRUCTURES[fine_run.TAKEN] if k not in ("level", "rise")]
+    own = ("level", "rise", "offset", "bias")
+    found = fine_run.fit({"A": A, "B": B}, free, own)
+    print("\n| number | A | B |\n|---|---|---|")
+    for k in own:
+        cells = (f"{found.numbers[r][k]:.4g} +- {1.96 * found.std[r][k]:.2g}" for r in "AB")
+        print(f"| {k} | " + " | ".join(cells) + " |")
+    errors = {r: fine_run.rms(found.numbers[r], True, run) for r, run in (("A", A), ("B", B))}
+    print("errors", errors)
+    return {"numbers": found.numbers, "std": found.std, "errors_deg": errors}
+
+
+def arm(A: rf.Recording, B: rf.Recording) -> dict:
+    """Laws of the joint, each learnt from one run and judged on both."""
+    out = arm_alone.compare({"A": A, "B": B})
+    print("\n| law of the joint | from A: A / B [deg] | from B: A / B [deg] |\n|---|---|---|")
+    for law in arm_alone.LAWS:
+        rows = [out[f"{law}, from {k}"]["errors_deg"] for k in "AB"]
+        print(f"| {law} | " + " | ".join(f"{e['A']:.3f} / {e['B']:.3f}" for e in rows) + " |")
+    return out
+
+
+def main(parts: list[str]) -> None:
+    rf.enable_fast_loops()
+    A, B = rf.data.load_dataset("rotflex")
+    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    kept = kept if set(kept) & {"search", "repeats", "arm", "fits"} else {}
+    for part in parts or ["search", "repeats", "arm", "fits", "figures"]:
+        if part == "figures":
+            drawing.draw(A, B, kept["fits"], HERE.parent / "docs" / "figures")
+            continue
+        kept[part] = {"search": search, "repeats": repeats, "arm": arm, "fits": fits}[part](A, B)
+        if part == "fits":
+            kept["differences"] = differences(A, B)
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

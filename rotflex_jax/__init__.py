@@ -8,15 +8,18 @@
 Importing the package changes no setting of JAX and loads neither matplotlib nor pandas.
 """
 
-from rotflex_jax import adaptive, basis, data, effects, joints, kernels, metrics
+from rotflex_jax import adaptive, basis, data, effects, export, joints, kernels, metrics
 from rotflex_jax.compare import Comparison, compare
 from rotflex_jax.data import load
-from rotflex_jax.discover import Discovery, discover, locate
+from rotflex_jax.discover import Discovery, LearnedTorqueResult, discover, learn_torque, locate
 from rotflex_jax.errors import InputError
+from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
 from rotflex_jax.fit import SeriesFit, fit, forward_regression, least_squares
+from rotflex_jax.fit.fitted import Fit
+from rotflex_jax.latent import LatentTorque, latent_torque
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, linearise, simulate
-from rotflex_jax.model import Fit, Model
+from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.series import Series
 
@@ -25,9 +28,13 @@ __version__ = "0.1.0"
 __all__ = [
     "Comparison",
     "Discovery",
+    "Experiment",
     "Exponential",
     "Fit",
     "InputError",
+    "LatentTorque",
+    "LearnedTorqueResult",
+    "Limits",
     "Mechanism",
     "Model",
     "Recording",
@@ -42,14 +49,18 @@ __all__ = [
     "effects",
     "enable_compilation_cache",
     "enable_fast_loops",
+    "export",
     "fit",
     "forward_regression",
     "joints",
     "kernels",
+    "latent_torque",
+    "learn_torque",
     "least_squares",
     "linearise",
     "load",
     "locate",
     "metrics",
+    "next_experiment",
     "simulate",
 ]

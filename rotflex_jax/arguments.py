@@ -1,22 +1,20 @@
 """What can be given on the command line, and its checks: all made before any long work starts."""
 
 import dataclasses
-import difflib
-import inspect
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rotflex_jax.choices import JOINTS, choose as choose, effect as effect, joint as joint, model as model
 from rotflex_jax.errors import InputError
 
 if TYPE_CHECKING:
     from rotflex_jax.recording import Recording
 
 STDOUT = Path("-")
-JOINTS = ("paper", "quanser_2002", "quanser_2010", "single_inertia")
 
 Files = Annotated[
     list[Path],
@@ -26,8 +24,10 @@ JointName = Annotated[
     str,
     typer.Option(
         "--joint",
+        "--model",
         metavar="NAME",
-        help=f"Textbook model to start from: {', '.join(JOINTS)}; numbers as paper:stiffness=1.2.",
+        help=f"Model to start from: {', '.join(JOINTS)}, numbers as paper:stiffness=1.2; your own as "
+        "FILE.py:NAME; or a saved MODEL.json.",
     ),
 ]
 InputColumn = Annotated[
@@ -55,6 +55,10 @@ JsonFile = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Write the result as JSON; - means stdout."),
 ]
+ModelFile = Annotated[
+    Path | None,
+    typer.Option("--save-model", metavar="FILE", help="Write the fitted model as JSON for later use."),
+]
 ReportFolder = Annotated[
     Path | None,
     typer.Option("--report", metavar="FOLDER", help="Write a self-contained HTML report here."),
@@ -79,6 +83,7 @@ class Columns:
     Ts: float | None
     time: str | None
     accept: Sequence[str] | None
+    mechanism: Any = None  # whose channels are read where the options name none
 
     def __post_init__(self) -> None:
         if self.Ts is not None and self.time is not None:
@@ -99,12 +104,15 @@ class Columns:
         if file.is_dir():
             raise InputError(f"{file} is a folder, but a recording is one file; name the file.")
         from rotflex_jax.data import load
+        from rotflex_jax.mechanism.states import output_units
 
+        units = {} if self.mechanism is None else output_units(self.mechanism)
         try:
             return load(
                 file,
                 input=self.input,
-                outputs=_channels(self.outputs or ()),
+                outputs=_channels(self.outputs or (), tuple(units)),
+                units=units,
                 degrees=self.degrees,
                 Ts=self.Ts,
                 time=self.time,
@@ -124,11 +132,14 @@ class Columns:
         return [a for a, _ in parts], [b for _, b in parts]
 
 
-def _channels(outputs: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
-    """`theta=servo` names the channel too; a plain column name leaves that to the order."""
+def _channels(outputs: Sequence[str], model: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
+    """`theta=servo` names the channel too; plain column names come in the order of the model's channels."""
     if outputs and all("=" in text for text in outputs):
         return dict(text.split("=", 1) for text in outputs)
-    return outputs or None
+    if not outputs and model:
+        return dict(zip(model, model, strict=True))
+    named = model and len(outputs) == len(model)
+    return dict(zip(model, outputs, strict=True)) if named else outputs or None
 
 
 def _as_options(sentence: str) -> str:
@@ -182,56 +193,3 @@ def check_writable(*, json_file: Path | None = None, folder: Path | None = None)
             )
     if folder is not None and folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, but the report needs a folder; name another.")
-
-
-def choose(name: str, choices: Iterable[str], what: str) -> str:
-    """`name` if it is one of the choices; otherwise a sentence with the likely one."""
-    choices = list(choices)
-    if name in choices:
-        return name
-    close = difflib.get_close_matches(name, choices, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
-    raise InputError(f"There is no {what} called {name!r}; {hint}")
-
-
-def joint(text: str) -> Any:
-    """The mechanism meant by `paper`, or by `quanser_2010:spring=3,hub_anchor=A`."""
-    from rotflex_jax import joints
-
-    name, _, values = text.partition(":")
-    preset = getattr(joints, choose(name, JOINTS, "joint"))
-    # A motor is not a number; whoever needs another one writes Python.
-    names = [key for key in inspect.signature(preset).parameters if key != "motor"]
-    return preset(**_numbers(values, names, f"option of {name}"))
-
-
-def effect(text: str) -> Any:
-    """The effect meant by `coulomb@hub`, or by `coulomb@hub:level=0.03`."""
-    from rotflex_jax.effects import CATALOG
-
-    place, _, values = text.partition(":")
-    name, separator, port = place.partition("@")
-    kind = CATALOG[choose(name, CATALOG, "effect")]
-    ports = list(kind.ports)
-    if not separator and len(ports) > 1:
-        raise InputError(
-            f"The effect {name} was given no port, but can act at {', '.join(ports)}; give for "
-            f"instance {name}@{ports[0]}."
-        )
-    numbers = _numbers(values, kind.declared(), f"parameter of {name}")
-    return kind(at=port or ports[0], **numbers)
-
-
-def _numbers(text: str, names: Iterable[str], what: str) -> dict[str, Any]:
-    """`a=1,b=C` as a dict; what does not read as a number stays text."""
-    found: dict[str, Any] = {}
-    for pair in filter(None, text.split(",")):
-        key, separator, value = (part.strip() for part in pair.partition("="))
-        if not separator or not value:
-            raise InputError(f"{pair!r} has no value, but needs one; write {key}=VALUE.")
-        choose(key, names, what)
-        try:
-            found[key] = int(value) if value.lstrip("+-").isdigit() else float(value)
-        except ValueError:
-            found[key] = value
-    return found

@@ -15,7 +15,10 @@ import typer
 from rotflex_jax import arguments as given, terminal
 from rotflex_jax.data_commands import data_app
 from rotflex_jax.errors import InputError
+from rotflex_jax.experiment_command import experiment
+from rotflex_jax.export_command import export
 from rotflex_jax.reproduce_command import reproduce
+from rotflex_jax.simulate_command import simulate
 
 if TYPE_CHECKING:
     from rotflex_jax.recording import Recording
@@ -27,6 +30,9 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 app.command()(reproduce)
+app.command()(simulate)
+app.command()(experiment)
+app.command()(export)
 
 # The class of every mistake in the arguments; typer does not export it by name.
 _UsageError: Any = typer.BadParameter.__bases__[0]
@@ -98,15 +104,17 @@ def discover(
     accept: given.Accept = None,
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
+    save_model: given.ModelFile = None,
 ) -> None:
     """Find the effects that the model lacks, with evidence on data the fit never saw."""
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, held_out or [])
     given.check_writable(json_file=json_file, folder=report)
-    mechanism = given.joint(joint)
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
+    given.check_writable(json_file=save_model)
+    model, options = given.model(joint), (degrees, Ts, time_column, accept)
+    columns = given.Columns(input_column, output_columns, *options, model.mechanism)
     train, test = columns.load_parts(files, held_out or [], share)
-    _discover(mechanism, train, test, report, json_file)
+    _discover(model, train, test, report, json_file, save_model)
 
 
 @app.command()
@@ -115,6 +123,7 @@ def compare(
     methods: Annotated[
         str | None, typer.Option(metavar="A,B", help="Methods to compare; all unless given.")
     ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Only methods without a long search.")] = False,
     joint: given.JointName = "paper",
     held_out: given.HeldOut = None,
     split: given.Share = None,
@@ -124,17 +133,24 @@ def compare(
     Ts: given.SamplingPeriod = None,
     time_column: given.TimeColumn = None,
     accept: given.Accept = None,
+    report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
 ) -> None:
     """Run every method on the same data, judged by its free run over what it has not seen."""
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, held_out or [])
-    given.check_writable(json_file=json_file)
+    given.check_writable(json_file=json_file, folder=report)
+    if quick and methods is not None:
+        raise InputError(
+            "Options --quick and --methods were both given, but each says which methods to run; give one."
+        )
     mechanism, names = given.joint(joint), methods if methods is None else methods.split(",")
+    from rotflex_jax.compare import QUICK
     from rotflex_jax.compare.method import chosen
 
-    wanted = chosen(names)  # an unknown one is refused before any file is read
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
+    wanted = chosen(QUICK if quick else names)  # an unknown one is refused before any file is read
+    options = (degrees, Ts, time_column, accept)
+    columns = given.Columns(input_column, output_columns, *options, mechanism)
     train, test = columns.load_parts(files, held_out or [], share)
     terminal.print_findings([*train, *test])
     _quicken()
@@ -142,57 +158,10 @@ def compare(
 
     with terminal.progress("Comparing") as step:
         result = rf.compare(train, wanted, mechanism=mechanism, test=test, progress=step)
+        page = None if report is None else result.report(report)
     _give(result, terminal.print_comparison, json_file)
-
-
-@app.command()
-def simulate(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording to simulate.")],
-    joint: given.JointName = "paper",
-    add: Annotated[
-        list[str] | None,
-        typer.Option(metavar="EFFECT@PORT", help="Add an effect: coulomb@hub or coulomb@hub:level=0.03."),
-    ] = None,
-    fit: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="Fit the model to this recording before."),
-    ] = None,
-    save: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Write what was measured and simulated.")
-    ] = None,
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
-) -> None:
-    """Simulate a recording in free run and compare with what was measured."""
-    given.check_distinct([file], fit or [])
-    given.check_writable(json_file=save)
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
-    mechanism = given.joint(joint)
-    for text in add or []:
-        mechanism = mechanism + given.effect(text)
-    recording = columns.load(file)
-    train = [columns.load(other) for other in fit or []]
-    terminal.print_findings([recording, *train])
-    _quicken()
-    import rotflex_jax as rf
-    from rotflex_jax.model import Model
-
-    model = Model(mechanism)
-    if train:
-        with terminal.progress("Fitting"):
-            model = rf.fit(model, train).model
-    y, y_hat = model.measured(recording), model.simulate(recording)
-    rmse = rf.metrics.rmse(y, y_hat, recording.n_init).tolist()
-    units = {name: terminal.unit_of(recording, name) for name in mechanism.channels}
-    errors = dict(zip(units, rmse, strict=True))
-    console = terminal.output()
-    console.print(terminal.error_table([("RMS error of the free run", errors)], units))
-    if save is not None:
-        terminal.save_simulation(save, recording, dict(zip(units, y_hat.T, strict=True)))
+    if page is not None:
+        terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
 
 
 @app.command()
@@ -223,6 +192,7 @@ def _discover(
     test: "list[Recording]",
     report: Path | None,
     json_file: Path | None,
+    save_model: Path | None = None,
 ) -> None:
     terminal.print_findings([*train, *test])
     _quicken()
@@ -231,6 +201,8 @@ def _discover(
     with terminal.progress("Searching for missing effects") as step:
         result = rf.discover(mechanism, train, test, progress=step)
         page = None if report is None else result.report(report)
+    if save_model is not None:
+        result.save(save_model)
     _give(result, terminal.print_discovery, json_file)
     if page is not None:
         terminal.message(f"Report: {page}", error=json_file == given.STDOUT)

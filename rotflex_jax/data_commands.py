@@ -17,11 +17,15 @@ def _start(context: typer.Context) -> None:
 
 @data_app.command("list")
 def data_list() -> None:
-    """List the public recordings that can be fetched."""
+    """List the public recordings: those that can be fetched, then those to get by hand."""
+    from rotflex_jax.data.by_hand import BY_HAND
     from rotflex_jax.data.datasets import list_datasets
 
     rows = [(d.name, d.about, d.units, d.licence, d.source) for d in list_datasets()]
     terminal.print_rows(("name", "what", "units", "licence", "source"), rows)
+    print("\nTo get by hand, and to read with rf.load from what nonlinear_benchmarks gives:\n")
+    for d in BY_HAND.values():
+        print(f"{d.name}: {d.about}\n  {d.address}\n  nonlinear_benchmarks.{d.loader}")
 
 
 @data_app.command("fetch")
@@ -29,10 +33,11 @@ def data_fetch(
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names that `list` shows.")],
 ) -> None:
     """Fetch public recordings into the user's cache folder, check their hash, print their paths."""
+    from rotflex_jax.data.by_hand import BY_HAND
     from rotflex_jax.data.datasets import DATASETS, fetch
 
     for name in names:
-        given.choose(name, DATASETS, "data set")
+        given.choose(name, (*DATASETS, *BY_HAND), "data set")
     for name in names:
         with terminal.progress(f"Fetching {name}"):
             paths = fetch(name)

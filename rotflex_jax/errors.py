@@ -31,7 +31,7 @@ def optional(module: str, purpose: str) -> ModuleType:
     Traceback (most recent call last):
         ...
     rotflex_jax.errors.InputError: Reading a stone tablet needs the package no_such_package, \
-which is not installed; install it with `pip install "rotflex_jax[io]"`.
+which is not installed; install it with `pip install "rotflex_jax[all]"`.
     """
     try:
         return importlib.import_module(module)
@@ -39,5 +39,5 @@ which is not installed; install it with `pip install "rotflex_jax[io]"`.
         package = module.partition(".")[0]
         raise InputError(
             f"{purpose} needs the package {package}, which is not installed; "
-            'install it with `pip install "rotflex_jax[io]"`.'
+            'install it with `pip install "rotflex_jax[all]"`.'
         ) from error

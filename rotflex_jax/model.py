@@ -2,7 +2,8 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Self
+from pathlib import Path
+from typing import Self
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from rotflex_jax.mechanism import (
 )
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.initial import initial_states
-from rotflex_jax.parameters import Estimate
+from rotflex_jax.mechanism.movable import check_movable
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 
@@ -44,10 +45,26 @@ class Model:
     solver: Solver = Exponential()
     gates: tuple[float, ...] | None = None
 
+    def __post_init__(self) -> None:
+        check_movable(self.mechanism)
+
     def __add__(self, effect: Effect) -> Self:
         """The model with one more effect."""
         gates = None if self.gates is None else (*self.gates, 1.0)
         return dataclasses.replace(self, mechanism=self.mechanism + effect, gates=gates)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the model as JSON; `Model.load` reads it back bit for bit."""
+        from rotflex_jax.export.files import Saved, save  # the layer above, on request
+
+        return save(Saved(self), path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Model":
+        """The model in a file that `save` of a model, a fit or a discovery has written."""
+        from rotflex_jax.export.files import read  # the layer above, on request
+
+        return read(path).model
 
     def measured(self, recording: Recording) -> np.ndarray:
         """The channels of a recording that the mechanism has as outputs, in its order (N, C)."""
@@ -60,7 +77,8 @@ class Model:
             )
         return np.stack([recording.channel(c) for c in self.mechanism.channels], axis=1)
 
-    def _arguments(self) -> tuple[Any, ...]:
+    def numbers(self) -> tuple[jax.Array, jax.Array]:
+        """Parameter values and gates, in the precision of the context."""
         return jnp.asarray(self.mechanism.values), jnp.asarray(self._switches())
 
     def _switches(self) -> np.ndarray:
@@ -72,10 +90,18 @@ class Model:
         return initial_states(self.mechanism, self.solver, self._switches(), u, y, Ts, hidden)
 
     def _start(self, recording: Recording) -> np.ndarray:
-        """State at the beginning of a recording, from its first `n_init` samples."""
+        """State at the beginning of a recording, from its first `n_init` samples.
+
+        What no sensor shows is as a free run over the recording that this one continues leaves it; at
+        rest where it continues none.
+        """
         u, y = recording.u.astype(float), self.measured(recording).astype(float)
-        m = recording.n_init
-        return self._starts(u[None, :m], y[None, :m], recording.Ts)[0]
+        m, moving, before = recording.n_init, 2 * len(self.mechanism.coordinates), recording.continues
+        hidden = None
+        if before is not None and len(rest_state(self.mechanism.structure, np.float64)) > moving:
+            left = self._run(before, self._start(before))[0][-1:, moving:]
+            hidden = left if np.all(np.isfinite(left)) else None
+        return self._starts(u[None, :m], y[None, :m], recording.Ts, hidden)[0]
 
     def _run(self, recording: Recording, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (N, n) and outputs (N, C) of a free run."""
@@ -83,7 +109,7 @@ class Model:
             run = _free(
                 self.mechanism.structure,
                 self.solver,
-                *self._arguments(),
+                *self.numbers(),
                 jnp.asarray(start),
                 jnp.asarray(recording.u.astype(float)),
                 jnp.asarray(float(recording.Ts)),
@@ -105,6 +131,10 @@ class Model:
         start = rest_state(self.mechanism.structure, np.float64)
         start[: len(x0)] = x0
         return self._run(recording, start)[1]
+
+    def simulate_states(self, recording: Recording) -> np.ndarray:
+        """States (N, n) of the free run of `simulate`: positions, speeds, then what no sensor shows."""
+        return self._run(recording, self._start(recording))[0]
 
     def simulate_windows(self, recording: Recording, seconds: float = 2.0) -> np.ndarray:
         """Free runs that start anew every few seconds: outputs (N, C).
@@ -133,7 +163,7 @@ class Model:
             run = _free_many(
                 self.mechanism.structure,
                 self.solver,
-                *self._arguments(),
+                *self.numbers(),
                 jnp.asarray(x0),
                 jnp.asarray(u[inside]),
                 jnp.asarray(float(recording.Ts)),
@@ -161,7 +191,7 @@ class Model:
             run = _predict(
                 self.mechanism.structure,
                 self.solver,
-                *self._arguments(),
+                *self.numbers(),
                 jnp.asarray(x0),
                 *map(jnp.asarray, (u, y, np.ones(len(u)), K)),
                 jnp.asarray(float(recording.Ts)),
@@ -175,47 +205,3 @@ def window_starts(recording: Recording, seconds: float) -> tuple[np.ndarray, int
     width = min(N, max(round(seconds / recording.Ts), 2 * m))
     starts = np.arange(0, max(N - 2 * m, 1), width)
     return starts, max(width, N - int(starts[-1]))
-
-
-@dataclasses.dataclass(frozen=True)
-class Fit:
-    """A fitted model and how it was reached.
-
-    Attributes:
-        model: The fitted model.
-        cost: Negative log-likelihood per recording sample set, constants included [nat].
-        status: "converged", or in words what stopped the fit.
-        parameters: Estimates, free and held.
-        noise: Standard deviation of the residual per channel [unit of the channel].
-        covariance: Of the free parameters [declared units], in the order of `free_names`.
-        free_names: Full names of the free parameters.
-        steps: Iterations.
-        history: Cost after each stage.
-        weakest: Direction of the free parameters (in shares of their values) that the data say least of.
-    """
-
-    model: Model
-    cost: float
-    status: str
-    parameters: tuple[Estimate, ...]
-    noise: dict[str, float]
-    covariance: np.ndarray
-    free_names: tuple[str, ...]
-    steps: int
-    history: tuple[float, ...] = ()
-    weakest: dict[str, float] = dataclasses.field(default_factory=dict)
-
-    def __getitem__(self, name: str) -> Estimate:
-        """An estimate by full name."""
-        for estimate in self.parameters:
-            if estimate.name == name:
-                return estimate
-        raise InputError(
-            f"Parameter {name!r} was asked for, but the fit has "
-            f"{', '.join(e.name for e in self.parameters)}; use one of these names."
-        )
-
-    def __str__(self) -> str:
-        lines = [f"Fit: {self.status} after {self.steps} steps, cost {self.cost:.1f}"]
-        lines += [f"  residual {c}: {s:.3g} rms" for c, s in self.noise.items()]
-        return "\n".join(lines + [f"  {e}" for e in self.parameters])

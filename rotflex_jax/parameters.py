@@ -45,8 +45,12 @@ def parameter(default: float | None, **declared: Any) -> Any:
 def specifications(owner: Any) -> dict[str, Specification]:
     """Name -> `Specification` of every parameter of a dataclass (class or instance), in order.
 
-    A parameter whose value is None belongs to a part that the instance lacks and is left out.
+    A parameter whose value is None belongs to a part that the instance lacks and is left out. An instance
+    with as many parameters as its shape asks for tells them by a method `own_specifications`.
     """
+    own = getattr(owner, "own_specifications", None)
+    if own and not isinstance(owner, type):
+        return own()
     found = {f.name: f.metadata["parameter"] for f in dataclasses.fields(owner) if "parameter" in f.metadata}
     if isinstance(owner, type):
         return found
@@ -57,8 +61,9 @@ def specifications(owner: Any) -> dict[str, Specification]:
 class Transform:
     """Unconstrained `z` <-> physical `p`, elementwise, by the bounds of each parameter.
 
-    Positive parameters move as `p = lower + exp(z)`, doubly bounded ones on a logistic curve, free
-    ones as `p = typical z`. A step of one in `z` is always a sizeable step in `p`.
+    One with a lower bound moves as `p = lower + exp(z)`, with an upper bound as `p = upper - exp(z)`, with
+    both on a logistic curve, one that is free as `p = typical z`. A step of one in `z` is always a
+    sizeable step in `p`.
     """
 
     lower: np.ndarray
@@ -71,40 +76,40 @@ class Transform:
         columns = ("lower", "upper", "typical")
         return cls(*(np.array([getattr(s, c) for s in specs], dtype=float) for c in columns))
 
-    def _kinds(self) -> tuple[np.ndarray, np.ndarray]:
-        positive = np.isfinite(self.lower) & ~np.isfinite(self.upper)
-        boxed = np.isfinite(self.lower) & np.isfinite(self.upper)
-        return positive, boxed
+    def _kinds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Which have one bound, which have two, the bound (of two the lower), and the way away from it."""
+        low, high = np.isfinite(self.lower), np.isfinite(self.upper)
+        edge = np.where(low, self.lower, np.where(high, self.upper, 0.0))
+        return low != high, low & high, edge, np.where(low, 1.0, -1.0)
 
     def constrain(self, z: jax.Array) -> jax.Array:
         """Physical values [declared units] of the unconstrained coordinates."""
-        positive, boxed = self._kinds()
-        low = jnp.asarray(np.where(np.isfinite(self.lower), self.lower, 0.0), z.dtype)
+        single, boxed, edge, way = self._kinds()
+        low, sign = jnp.asarray(edge, z.dtype), jnp.asarray(way, z.dtype)
         span = jnp.asarray(np.where(boxed, self.upper - self.lower, 1.0), z.dtype)
         # The exponent is capped where it would overflow: a rejected trial step may ask for anything.
-        grown = jnp.exp(jnp.minimum(jnp.where(jnp.asarray(positive), z, 0.0), 60.0))
-        p = jnp.where(jnp.asarray(positive), low + grown, z * jnp.asarray(self.typical, z.dtype))
+        grown = jnp.exp(jnp.minimum(jnp.where(jnp.asarray(single), z, 0.0), 60.0))
+        p = jnp.where(jnp.asarray(single), low + sign * grown, z * jnp.asarray(self.typical, z.dtype))
         return jnp.where(jnp.asarray(boxed), low + span * jax.nn.sigmoid(z), p)
 
     def physical(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Outside of traced code: `constrain(z)` for z of shape (..., P), and its derivative."""
-        positive, boxed = self._kinds()
-        low = np.where(np.isfinite(self.lower), self.lower, 0.0)
+        single, boxed, edge, way = self._kinds()
         span = np.where(boxed, self.upper - self.lower, 1.0)
-        grown = np.exp(np.minimum(np.where(positive, z, 0.0), 60.0))
+        grown = way * np.exp(np.minimum(np.where(single, z, 0.0), 60.0))
         share = expit(np.where(boxed, z, 0.0))
-        p = np.where(positive, low + grown, z * self.typical)
-        slope = np.where(positive, grown, self.typical)
-        return np.where(boxed, low + span * share, p), np.where(boxed, span * share * (1 - share), slope)
+        p = np.where(single, edge + grown, z * self.typical)
+        slope = np.where(single, grown, self.typical)
+        return np.where(boxed, edge + span * share, p), np.where(boxed, span * share * (1 - share), slope)
 
     def unconstrain(self, p: np.ndarray) -> np.ndarray:
         """Unconstrained coordinates of physical values; a value on its bound starts just inside."""
         p = np.asarray(p, dtype=float)
-        positive, boxed = self._kinds()
+        single, boxed, edge, way = self._kinds()
         z = p / self.typical
-        inside = np.maximum(p - np.where(positive, self.lower, 0.0), 1e-3 * self.typical)
-        z = np.where(positive, np.log(inside), z)
-        share = (p - np.where(boxed, self.lower, 0.0)) / np.where(boxed, self.upper - self.lower, 1)
+        inside = np.maximum(way * (p - edge), 1e-3 * self.typical)
+        z = np.where(single, np.log(inside), z)
+        share = (p - np.where(boxed, edge, 0.0)) / np.where(boxed, self.upper - self.lower, 1)
         share = np.clip(share, 1e-3, 1 - 1e-3)
         return np.where(boxed, np.log(share / (1 - share)), z)
 
@@ -142,6 +147,8 @@ class Estimate:
             remarks.append("not determined by these data")
         elif math.isfinite(spec.lower) and value - spec.lower < 1e-6 * spec.typical:
             remarks.append("at its lower bound")
+        elif math.isfinite(spec.upper) and spec.upper - value < 1e-6 * spec.typical:
+            remarks.append("at its upper bound")
         return cls(
             name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note="; ".join(remarks)
         )

@@ -345,7 +345,7 @@ def test_discover_judges_on_held_out_files_and_maps_columns(run, search, tmp_pat
     for channel, column in (("theta", 2), ("alpha", 3)):
         np.testing.assert_allclose(train[0].channel(channel), DEMO[:, column], atol=1e-7)
     softest = rf.joints.quanser_2010().effect("spring", "joint").values["stiffness"]
-    assert joint.effect("spring", "joint").values["stiffness"] > softest
+    assert joint.mechanism.effect("spring", "joint").values["stiffness"] > softest
 
 
 def test_discover_writes_json_and_report(run, search, recorded, tmp_path) -> None:

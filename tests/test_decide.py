@@ -141,6 +141,18 @@ def test_what_cannot_be_told_apart_is_named_together():
     assert choose([steady, best], BASE, DATA, NOISE) == (best, [])
 
 
+def test_a_rival_need_not_pass_what_the_winner_passed():
+    """Small effects: the winner just passes, the truth just fails, and nothing tells the two apart."""
+    best = trial(DRAG, **GOOD | {"held_out": 30.0, "train": 30.0, "scatter": 1.0}, seed=1)
+    missed = trial(ARM, **GOOD | {"held_out": 4.0, "train": 25.0, "scatter": 1.0}, seed=2)
+    assert not admissible(missed, BASE, DATA, NOISE)
+    assert choose([missed, best], BASE, DATA, NOISE) == (best, [missed])
+    # One that gains nothing is none, nor one whose free runs are clearly worse.
+    assert choose([trial(ARM, held_out=-4.0, train=25.0, scatter=1.0), best], BASE, DATA, NOISE)[1] == []
+    far = trial(ARM, **GOOD | {"held_out": 4.0, "train": 25.0, "scatter": 1.0, "windows": 5.0 * 1.2}, seed=2)
+    assert choose([far, best], BASE, DATA, NOISE) == (best, [])
+
+
 def test_both_sides_tell_apart():
     best = trial(DRAG, **GOOD | {"held_out": 201.0, "train": 400.0, "scatter": 1.0})
     close = trial(ARM, **GOOD | {"scatter": 1.0}, seed=2)

@@ -3,6 +3,7 @@
 import pytest
 
 import rotflex_jax as rf
+import rotflex_jax.effects as fx
 from arena.hidden import Place
 from arena.records import make_record
 from arena.scoring import alike, parameter_errors, scored
@@ -45,6 +46,28 @@ def test_finds_the_hidden_effect(place: Place, kind: str, seed: int, tolerance: 
     assert all(after[c] < before[c] for c in before)
     # As good as the sensor allows.
     assert all(after[c] < 1.2 * result.noise_floor[c] for c in after)
+
+
+def test_an_asymmetric_friction_is_one_law() -> None:
+    """A calibration would take its asymmetry away, and the answer would have two effects."""
+    record = make_record([("coulomb_asymmetric", "hub")], seed=2004, seconds=6.0, fs=FS)
+    train, test = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"]).split(0.7)
+    pairs = [(fx.Coulomb, "hub"), (fx.CoulombAsymmetric, "hub")]
+    (found,) = rf.discover(rf.joints.paper(), train, test, candidates=pairs).rounds
+    assert (found.effect, found.port) == ("coulomb_asymmetric", "hub")
+    # A voltage offset does the same with as many numbers.
+    assert set(found.equivalent) == {("coulomb", "hub"), ("voltage_offset", "input")}
+    assert found.parameters["forward"].value == pytest.approx(0.045, rel=0.03)
+    assert found.parameters["backward"].value == pytest.approx(0.015, rel=0.06)
+
+
+def test_hysteresis_takes_the_place_of_the_friction_it_contains() -> None:
+    """Dahl friction comes first to first order, and its slope says little of what is missing then."""
+    record = make_record([("bouc_wen", "hub")], seed=2005, seconds=6.0, fs=FS)
+    train, test = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"]).split(0.7)
+    result = rf.discover(rf.joints.paper(), train, test, candidates=[(fx.Dahl, "hub"), (fx.BoucWen, "hub")])
+    assert [(r.effect, r.port) for r in result.rounds] == [("bouc_wen", "hub")]
+    assert result.verdict == "found"
 
 
 def test_finds_nothing_where_nothing_is_hidden() -> None:

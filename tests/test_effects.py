@@ -29,6 +29,7 @@ from rotflex_jax.effects import (
     DryFriction,
     Effect,
     Force,
+    Gear,
     Gravity,
     Heating,
     Inertia,
@@ -52,10 +53,11 @@ from rotflex_jax.effects import (
     Stribeck,
     Viscous,
     VoltageOffset,
-    candidates,
     register,
 )
 from rotflex_jax.errors import InputError
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.parameters import specifications
 from rotflex_jax.precision import double_precision
 
@@ -68,6 +70,7 @@ SCALES = [
 PASSIVE = {
     "viscous",
     "motor",
+    "current_drive",
     "coulomb",
     "coulomb_asymmetric",
     "stribeck",
@@ -125,6 +128,8 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
             effect.force(z, position, speed, voltage),
             effect.flow(z, position, speed, voltage),
         ]
+    elif isinstance(effect, Gear):  # a rotor with no room to turn is no rotor
+        said = [effect.stops(), effect.stops() * effect.rotor()]
     elif isinstance(effect, Actuation):
         voltages = voltage * jnp.array([1.0, -1.0, 0.3], voltage.dtype)
         return effect.drive(voltages, 0.002)
@@ -250,10 +255,12 @@ def test_jit_vmap_and_arrays_agree_with_one_point(cls):
 
 
 @pytest.mark.parametrize(
-    "cls", [c for c in CLASSES if not issubclass(c, (Actuation, Sensing))], ids=lambda c: c.name
+    "cls", [c for c in CLASSES if not issubclass(c, (Actuation, Sensing, Gear))], ids=lambda c: c.name
 )
 def test_gives_no_energy(cls):
     """A torque takes energy at every moment but for what it stores, or is a function of the position."""
+    if cls.name == "viscous_asymmetric":
+        pytest.skip("a share of the damping beside it: passive together with it, not alone")
     assert (cls.name in PASSIVE) != (cls.name in CONSERVATIVE), "say which of the two it is"
     effect = example(cls)
     if cls.name == "viscous":
@@ -364,6 +371,8 @@ def test_what_may_be_negative():
         "cogging.sine",
         "cogging.cosine",
         "voltage_offset.offset",
+        "voltage_drift.rate",
+        "viscous_asymmetric.asymmetry",
         "sensor_bias.bias",
         "sensor_gain.error",
         "sensor_cubic.cubic",
@@ -373,7 +382,7 @@ def test_what_may_be_negative():
 
 def test_every_file_registers_and_knows_no_sibling():
     folder = Path(effects.__file__).parent
-    apart = {"__init__", "kinds", "catalogue"}
+    apart = {"__init__", "kinds", "stamp", "catalogue", "learned"}
     registered = {c.__module__.rpartition(".")[2] for c in CLASSES}
     assert {f.stem for f in folder.glob("*.py")} - apart == registered
     allowed = {"effects.kinds", "effects.catalogue", "parameters", "errors"}
@@ -406,15 +415,16 @@ def test_a_users_own_effect_enters_the_catalogue_and_the_search():
 
     try:
         assert register(Cog) is Cog
-        assert (Cog, "arm") in candidates()
+        assert (Cog, "arm") in search_places(paper())
         register(Cog)  # a cell that is run twice
     finally:
         del CATALOG["cog_of_a_user"]
 
 
 def test_candidates_cover_the_first_family():
-    pairs = {(cls.name, port) for cls, port in candidates()}
-    assert len(pairs) == len(candidates())
+    found = search_places(paper())
+    pairs = {(cls.name, port) for cls, port in found}
+    assert len(pairs) == len(found)
     for name in ("coulomb", "coulomb_asymmetric", "stribeck", "quadratic_drag", "viscous"):
         assert {(name, p) for p in ("hub", "arm", "joint")} <= pairs
     assert {p for n, p in pairs if n == "gravity"} == {"hub", "arm"}
@@ -500,16 +510,24 @@ def test_actuation_laws_and_their_order():
     assert DeadZone().at == "input"
 
 
+def like_on_a_mass(mean, moment):
+    """Voltages to hold that move a mass at rest as the true ones do, from their means and first moments.
+
+    The moment of a sample is `int (t - middle) v dt / Ts^2`: it moves the mass back by as much, which a
+    pulse in this sample and its opposite in the next do as well.
+    """
+    return mean - np.diff(moment, prepend=0.0)
+
+
 @pytest.mark.parametrize("samples", [0, 1, 3, 0.25, 1.5, 2.999, 40, 41.3])
-def test_delay_is_the_mean_of_the_shifted_staircase(samples):
-    """By its integral, a line between samples: what has come by one edge less what had by the one before."""
-    rng, Ts, N = np.random.default_rng(0), 0.004, 30
+def test_delay_moves_a_mass_like_the_shifted_staircase(samples):
+    """The staircase on a grid a thousand times as fine, on which its steps lie exactly."""
+    rng, Ts, N, fine = np.random.default_rng(0), 0.004, 30, 1000
     u = rng.normal(size=N)
     late = np.asarray(Delay(time=samples * Ts).drive(jnp.asarray(u), Ts))
-    before = 50  # the command was there before the recording
-    edges = np.arange(-before, N + 1) * Ts
-    come = np.concatenate([[0.0], np.cumsum(np.concatenate([np.full(before, u[0]), u]))]) * Ts
-    expected = np.diff(np.interp(edges[before:] - samples * Ts, edges, come)) / Ts
+    middles = (np.arange(N * fine) + 0.5) / fine
+    v = u[np.maximum(np.floor(middles - samples).astype(int), 0)].reshape(N, fine)
+    expected = like_on_a_mass(v.mean(axis=1), (v * (middles.reshape(N, fine) % 1 - 0.5)).mean(axis=1))
     np.testing.assert_allclose(late, expected, rtol=0, atol=1e-12)
     if samples in (0, 1, 3):
         np.testing.assert_allclose(late[samples:], u[: N - samples], rtol=0, atol=1e-12)
@@ -518,16 +536,19 @@ def test_delay_is_the_mean_of_the_shifted_staircase(samples):
 
 
 @pytest.mark.parametrize("time", [3e-4, 0.006, 0.5])
-def test_lag_is_the_mean_of_a_low_pass(time):
+def test_lag_moves_a_mass_like_a_low_pass(time):
     """Against scipy's simulation on a grid a hundred times as fine, Simpson's rule over each sample."""
     rng, Ts, N, fine = np.random.default_rng(0), 0.004, 30, 100
     u = rng.normal(size=N)
     t = np.arange(N * fine + 1) * Ts / fine
     held = np.append(np.repeat(u, fine), u[-1])
     v = scipy.signal.lsim(([1.0], [time, 1.0]), held - u[0], t, interp=False)[1] + u[0]
-    expected = [scipy.integrate.simpson(v[k * fine : (k + 1) * fine + 1], dx=1 / fine) for k in range(N)]
+    parts = np.stack([v[k * fine : (k + 1) * fine + 1] for k in range(N)])
+    mean = scipy.integrate.simpson(parts, dx=1 / fine, axis=1)
+    moment = scipy.integrate.simpson(parts * np.linspace(-0.5, 0.5, fine + 1), dx=1 / fine, axis=1)
     found = np.asarray(Lag(time=time).drive(jnp.asarray(u), Ts))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 if time < 1e-3 else 1e-9)
+    expected = like_on_a_mass(mean, moment)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=4e-6 if time < 1e-3 else 1e-8)
     assert found[0] == u[0]
 
 

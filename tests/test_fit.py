@@ -12,6 +12,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit import fit
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.mechanism import Exponential, simulate
+from rotflex_jax.metrics import rmse
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
@@ -183,12 +184,54 @@ def test_each_recording_has_an_offset_of_its_own():
     assert own[name].value == pytest.approx(0.05, abs=4 * own[name].std)
     assert own[name].std < 0.01
     np.testing.assert_allclose(list(own.noise.values()), NOISE, rtol=0.08)
+    # Each recording's own value, and the model with it: the machine but for its offset is one.
+    assert list(own.local) == [name]
+    for number, (rec, v, e) in enumerate(zip(recs, (0.15, -0.05), own.local[name], strict=True)):
+        assert e.value == pytest.approx(v, abs=4 * e.std) and 0 < e.std < 0.01
+        there = own.model_of(number)
+        assert rmse(rec, there.simulate(rec))["theta"] < 1.3 * np.max(NOISE)
+        assert rmse(rec, own.model.simulate(rec))["theta"] > 3 * np.max(NOISE)
+    mean = np.mean([e.value for e in own.local[name]])
+    assert own[name].value == pytest.approx(mean, rel=1e-9)
+    # Two separate voltages have a mean that is surer than each.
+    k = own.free_names.index(name)
+    assert own[name].std == pytest.approx(np.sqrt(own.covariance[k, k]), rel=1e-9)
+    assert own[name].std < max(e.std for e in own.local[name])
     shared = fit(joint, recs)
     assert shared.cost > own.cost + 1000
     # One at a time, each has its own.
     for rec, v in zip(recs, (0.15, -0.05), strict=True):
         alone = fit(joint, rec)
         assert alone[name].value == pytest.approx(v, abs=4 * alone[name].std)
+
+
+def test_windows_begin_anew_but_a_recording_keeps_its_own_offset():
+    """Cut into thirds: as right as in one piece, and one offset for each recording, not for each third."""
+    pairs = [
+        make_record({("voltage_offset", "input"): {"offset": v}}, seed=6, seconds=1.5, fs=400.0)
+        for v in (0.15, -0.05)
+    ]
+    recs = [Recording(u=r["u"], y=r["y"], Ts=r["Ts"]) for r in pairs]
+    name = "input.voltage_offset.offset"
+    cut = fit(paper() + fx.VoltageOffset(offset=0.0), recs, local=[name], window_seconds=0.5)
+    assert cut.status == "converged"
+    assert len(cut.local[name]) == 2
+    for e, v in zip(cut.local[name], (0.15, -0.05), strict=True):
+        assert e.value == pytest.approx(v, abs=4 * e.std)
+    np.testing.assert_allclose(list(cut.noise.values()), NOISE, rtol=0.08)
+
+
+def test_windows_give_the_numbers_with_which_short_free_runs_are_best():
+    """A model without the friction that the plant has: bent for windows, or bent for the whole."""
+    rec, truth = record(3)
+    lacking = off(truth, 3, friction=False)
+    cut, whole = fit(lacking, rec, window_seconds=0.5), fit(lacking, rec)
+    errors = [
+        np.mean(np.log(list(rmse(rec, f.model.simulate_windows(rec, 0.5)).values()))) for f in (cut, whole)
+    ]
+    assert errors[0] < errors[1] - 0.02
+    with pytest.raises(InputError, match="window_seconds"):
+        fit(lacking, rec, window_seconds=0.0)
 
 
 def test_a_fit_that_stops_early_says_so():

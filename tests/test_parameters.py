@@ -16,7 +16,7 @@ POSITIVE = Specification(unit="kg m^2", typical=0.002, lower=0.0)
 RAISED = Specification(unit="ohm", typical=2.6, lower=0.5)
 BOXED = Specification(unit="rad", typical=1.0, lower=-0.5, upper=3.0)
 CAPPED = Specification(unit="V", typical=1.0, upper=5.0)
-ALL = (FREE, POSITIVE, RAISED, BOXED)
+ALL = (FREE, POSITIVE, RAISED, BOXED, CAPPED)
 
 
 def constrain(specs, z):
@@ -31,6 +31,8 @@ def inside(spec: Specification) -> st.SearchStrategy[float]:
         return st.floats(spec.lower + 0.01 * span, spec.upper - 0.01 * span)
     if math.isfinite(spec.lower):
         return st.floats(-2, 6).map(lambda k: spec.lower + spec.typical * 10**k)
+    if math.isfinite(spec.upper):
+        return st.floats(-2, 6).map(lambda k: spec.upper - spec.typical * 10**k)
     return st.floats(-1e4, 1e4).map(lambda k: spec.typical * k)
 
 
@@ -42,7 +44,7 @@ def test_there_and_back(p):
 
 
 @settings(deadline=None, max_examples=60, derandomize=True)
-@given(st.lists(st.floats(-1e6, 1e6), min_size=4, max_size=4))
+@given(st.lists(st.floats(-1e6, 1e6), min_size=len(ALL), max_size=len(ALL)))
 def test_bounds_are_never_left(z):
     for p in (constrain(ALL, z), Transform.of(ALL).physical(np.array(z))[0]):
         assert np.isfinite(p).all()
@@ -51,7 +53,7 @@ def test_bounds_are_never_left(z):
 
 
 @settings(deadline=None, max_examples=40, derandomize=True)
-@given(st.lists(st.floats(-50, 50), min_size=4, max_size=4))
+@given(st.lists(st.floats(-50, 50), min_size=len(ALL), max_size=len(ALL)))
 def test_physical_is_constrain_with_its_derivative(z):
     transform, z = Transform.of(ALL), np.array(z)
     with double_precision():
@@ -64,31 +66,32 @@ def test_physical_is_constrain_with_its_derivative(z):
 
 def test_closed_forms():
     """ln 2 above the bound doubles the way to it; a third of a box is at the logit of a third."""
-    z = np.array([1.5, np.log(2.0), np.log(2.0), np.log(0.5)])
-    np.testing.assert_allclose(constrain(ALL, z), [0.03, 2.0, 2.5, -0.5 + 3.5 / 3], rtol=1e-12)
+    z = np.array([1.5, np.log(2.0), np.log(2.0), np.log(0.5), np.log(2.0)])
+    np.testing.assert_allclose(constrain(ALL, z), [0.03, 2.0, 2.5, -0.5 + 3.5 / 3, 3.0], rtol=1e-12)
     # Far from the bound of 0.5 as well as near it.
     near = Transform.of([RAISED]).unconstrain(np.array([0.6]))
     np.testing.assert_allclose(near, np.log(0.1), rtol=1e-12)
 
 
 def test_several_sets_side_by_side():
-    transform, z = Transform.of(ALL), np.random.default_rng(0).normal(size=(2, 3, 4))
+    transform, z = Transform.of(ALL), np.random.default_rng(0).normal(size=(2, 3, len(ALL)))
     rows = np.array([[transform.physical(row) for row in block] for block in z])
     together = np.stack(transform.physical(z), axis=2)
     np.testing.assert_array_equal(together, rows)
 
 
 def test_a_value_on_its_bound_starts_where_it_can_move():
-    specs = (POSITIVE, BOXED, BOXED)
-    z = Transform.of(specs).unconstrain(np.array([0.0, -0.5, 3.0]))
+    specs = (POSITIVE, BOXED, BOXED, CAPPED)
+    z = Transform.of(specs).unconstrain(np.array([0.0, -0.5, 3.0, 5.0]))
     p, slope = Transform.of(specs).physical(z)
     assert 0 < p[0] <= 1e-3 * POSITIVE.typical * (1 + 1e-9)
-    np.testing.assert_allclose(p[1:], [-0.5, 3.0], atol=0.004)
-    assert (slope > 0).all()
+    np.testing.assert_allclose(p[1:], [-0.5, 3.0, 5.0], atol=0.004)
+    assert p[3] < 5.0
+    assert (slope != 0).all()
 
 
 def test_single_precision_stays_single():
-    p = Transform.of(ALL).constrain(jnp.zeros(4, jnp.float32))
+    p = Transform.of(ALL).constrain(jnp.zeros(len(ALL), jnp.float32))
     assert p.dtype == jnp.float32
 
 
@@ -111,3 +114,10 @@ def test_an_estimate_says_what_it_is(free):
         "ci95": [1.8, 2.2] if free else None,
         "unit": "N m",
     }
+
+
+@pytest.mark.parametrize(("value", "word"), [(0.0, "lower"), (10.0, "upper"), (5.0, "")])
+def test_an_estimate_tells_that_it_is_at_a_bound(value, word):
+    spec = Specification(unit="", typical=1.0, lower=0.0, upper=10.0)
+    note = Estimate.of("x", value, 0.1, spec).note
+    assert note == (f"at its {word} bound" if word else "")

@@ -419,7 +419,7 @@ def test_only_the_ratio_of_two_gains_shows():
 
 
 def test_outside_effects_agree_with_scipy():
-    elsewhere = {"backlash", "patchy_friction", "slack_cable"}  # tested on their own
+    elsewhere = {"patchy_friction", "slack_cable"}  # tested on their own
     v = {place[0]: parameters(place) for place in OUTSIDE if place[0] not in elsewhere}
     plant, u = p.Plant(), noise(300, hold=30)
 

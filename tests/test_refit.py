@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 from rotflex_jax.discover.refit import (
     LONGEST,
     _grid,
-    _moved,
     choose_process_noise,
     levenberg_marquardt,
+    moved,
     normal_equations,
     refit,
 )
@@ -200,7 +200,7 @@ def test_process_noise_is_nil_where_the_model_is_right_and_not_where_it_is_wrong
 
 def test_one_step_is_no_longer_than_allowed(plain):
     _, h = plain
-    far = _moved(h, np.full(len(numbers_of(h)), 50.0))
+    far = moved(h, np.full(len(numbers_of(h)), 50.0))
     free = list(h.free)
     np.testing.assert_allclose(far.z[free] - h.z[free], LONGEST)
     np.testing.assert_allclose(far.own - h.own, LONGEST)

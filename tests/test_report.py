@@ -15,10 +15,14 @@ from matplotlib import image
 from rich.console import Console
 
 from rotflex_jax.discover import locate
+from rotflex_jax.discover.formula import Formula, Term
+from rotflex_jax.discover.learned_result import LearnedTorqueResult
+from rotflex_jax.discover.photographs import Photographs
 from rotflex_jax.discover.result import VERDICTS, Discovery, Ranked, Round, Stage, Where
-from rotflex_jax.effects import Coulomb, CubicSpring
+from rotflex_jax.effects import Coulomb, CubicSpring, LearnedTorque
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper, single_inertia
+from rotflex_jax.latent import LatentTorque
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
@@ -167,6 +171,53 @@ def one_channel() -> Discovery:
     return Discovery("unexplained", "Something remains", (test,), (test,), base, (), (), where, {}, 1.0)
 
 
+def photographed() -> LatentTorque:
+    """A friction at the hub less a line, as if a smoother had found it."""
+    t = 0.005 * np.arange(1500)
+    speed = np.stack([np.sin(t), np.cos(3 * t)], axis=1)
+    return LatentTorque(
+        ports=("hub", "joint"),
+        torque=(0.01 * speed - 0.02 * np.sign(speed)) * [1.0, 1e-6],
+        std=np.full_like(speed, 0.002),
+        time=t,
+        position=0.1 * speed,
+        speed=speed,
+        voltage=speed[:, 0],
+        recording=np.zeros(len(t), int),
+        Ts=(0.005,),
+        intensity={"hub": 1e-3, "joint": 1e-12},
+        gain_nats={"hub": 1e4, "joint": 0.0},
+        scale=0.2,
+        linear={"hub.viscous": -0.01 * speed[:, 0]},
+    )
+
+
+def map_of_friction(discovery: Discovery, kept: bool) -> LearnedTorqueResult:
+    """A step over the speed, as if it had been learned."""
+    rng = np.random.default_rng(3)
+    speed, position = rng.normal(size=4000), rng.uniform(-1, 1, 4000)
+    effect = LearnedTorque(at="hub", position=(-1.0, 1.0), speed=(-3.0, 3.0), count=(1, 12))
+    design = effect.design(position, speed)
+    own = np.stack([np.ones(4000), speed], axis=1)
+    torque = -0.03 * np.sign(speed)
+    torque -= own @ np.linalg.lstsq(own, torque, rcond=None)[0]
+    weights = np.linalg.lstsq(design, torque, rcond=None)[0]
+    return LearnedTorqueResult(
+        at="hub",
+        kept=kept,
+        effect=effect.replace(weights=tuple(weights.tolist())),
+        before=discovery.baseline,
+        after=discovery.final,
+        held_out_gain_nats=2755.0,
+        formula=Formula((Term("sign(w)", 0.0, -0.03, 3e-4, 0.98),) * kept),
+        physics=("1", "w"),
+        covariance=1e-8 * np.eye(12),
+        position=position,
+        speed=speed,
+        noise_floor={"theta": NOISE, "alpha": NOISE},
+    )
+
+
 @pytest.fixture(scope="module")
 def discovery() -> Discovery:
     return two_rounds()
@@ -175,7 +226,8 @@ def discovery() -> Discovery:
 @pytest.fixture
 def undrawn(monkeypatch) -> None:
     """Pages without figures, which take most of the time."""
-    monkeypatch.setattr("rotflex_jax.report.content.pictures", lambda discovery: {})
+    monkeypatch.setattr("rotflex_jax.report.content.pictures", lambda *given: {})
+    monkeypatch.setattr(Discovery, "latent_torque", lambda self: Photographs(photographed(), None))
 
 
 @pytest.fixture(scope="module")
@@ -331,6 +383,41 @@ def test_degrees_are_drawn_where_angles_are_read(discovery) -> None:
     assert axes[0].get_ylabel() == "held-out rms error [deg]"
     points = axes[0].lines[0].get_ydata()
     assert points[0] == pytest.approx(np.rad2deg(discovery.baseline.held_out_rmse_windows["theta"]))
+
+
+def test_the_missing_torque_is_shown_and_what_was_learned(discovery) -> None:
+    lacking = Photographs(photographed(), photographed().given_back())
+    page = render(discovery, lacking, map_of_friction(discovery, True))
+    text = read(page).text
+    assert "At the hub the baseline lacks 0.014 N m rms" in text
+    assert "At the joint the baseline lacks nothing that could be seen" in text
+    assert "τ = −0.0300 sign(w)" in text or "τ = −0.03 sign(w)" in text
+    assert "98 %" in text and "755 nat" in text
+    assert page.count("<figure>") == render(discovery).count("<figure>") + 3
+    without = read(render(discovery, lacking, map_of_friction(discovery, False))).text
+    assert "does not make unseen data likelier" in without
+    assert "The missing torque" not in read(render(discovery)).text
+
+
+def test_a_map_is_learned_only_where_something_is_unexplained(
+    discovery, undrawn, tmp_path, monkeypatch
+) -> None:
+    asked: list[str] = []
+
+    def learned_torque(self, at: str) -> LearnedTorqueResult:
+        asked.append(at)
+        return map_of_friction(self, True)
+
+    monkeypatch.setattr(Discovery, "learned_torque", learned_torque)
+    discovery.report(tmp_path / "a")
+    assert not asked and not (tmp_path / "a" / "learned_torque.json").exists()
+    dataclasses.replace(discovery, verdict="unexplained").report(tmp_path / "b")
+    discovery.report(tmp_path / "c", learned=True)
+    # Where most is left.
+    assert asked == ["hub", "hub"]
+    for folder in ("b", "c"):
+        taught = json.loads((tmp_path / folder / "learned_torque.json").read_text(encoding="utf-8"))
+        assert taught["formula"] == "-0.03 sign(w) N m"
 
 
 def test_the_folder_is_made_and_holds_page_and_json(discovery, undrawn, tmp_path) -> None:

@@ -15,7 +15,8 @@ from rotflex_jax.discover.supermodel import SuperModel, build, state_rows
 from rotflex_jax.fit.residuals import Data
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, kalman_gains, simulate
-from rotflex_jax.mechanism.assembly import Layout, driven_voltage, read_outputs
+from rotflex_jax.mechanism.assembly import Layout, driven_voltage
+from rotflex_jax.mechanism.sensors import read_outputs
 from rotflex_jax.mechanism.simulate import PredictorStep
 from rotflex_jax.precision import double_precision
 

@@ -47,6 +47,7 @@ DEFAULTS: dict[Place, dict[str, float]] = {
     ("bouc_wen", "joint"): {"level": 0.02, "width": 0.02, "beta": 0.5},
     ("second_mode", "hub"): {"inertia": 4e-4, "frequency": 18.0, "damping": 0.03},
     ("second_mode", "arm"): {"inertia": 8e-4, "frequency": 10.0, "damping": 0.03},
+    ("backlash", "hub"): {"play": 0.011},
     ("heating", "hub"): {"rate": 1.1, "time": 30.0},
     ("dead_zone", "input"): {"width": 0.2},
     ("saturation", "input"): {"limit": 1.2},
@@ -67,7 +68,6 @@ A bias of `theta` is left out: it shifts an origin that nobody knows.
 """
 
 OUTSIDE: dict[Place, dict[str, float]] = {
-    ("backlash", "hub"): {"play": 0.011},
     ("patchy_friction", "hub"): {"level": 0.04, "share": 0.8},
     ("drifting_spring", "joint"): {"drift": 0.01},
     ("shaking", "arm"): {"amplitude": 0.02, "frequency": 1.7},
@@ -76,7 +76,7 @@ OUTSIDE: dict[Place, dict[str, float]] = {
 }
 r"""Effects that the package has nothing for: an honest search says that something is missing.
 
-Play between rotor and hub; friction of level ``F (1 + r sin 3 theta)``; a stiffness that grows by 1 %
+Friction of level ``F (1 + r sin 3 theta)``; a stiffness that grows by 1 %
 per second; a torque ``A sin 2 pi f t`` that nobody measures; a cable that takes a torque over an angle
 and lets it fade while it rests, ``x' = (s - |s| x) / w - x / T``; a gear that passes on less at speed,
 ``1 - loss |s| / (|s| + s_0)`` of the motor torque.

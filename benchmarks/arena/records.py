@@ -68,6 +68,7 @@ def make_record(
     perturb: float = 0.2,
     rms: float = 1.0,
     nominal: Plant | None = None,
+    played: NDArray[np.float64] | None = None,
 ) -> dict[str, Any]:
     """A recording of a perturbed joint with hidden effects, started from rest at zero.
 
@@ -85,6 +86,7 @@ def make_record(
         perturb: largest relative error of the nominal plant.
         rms: expected root mean square of the input [V].
         nominal: plant before perturbation; the paper's joint if omitted.
+        played: voltage [V] ``(N,)`` instead of one of the `INPUTS`, with its own length and size.
 
     Returns:
         `u` [V] ``(N,)``; `y` [rad] ``(N, 2)`` as encoders report (theta, alpha); `Ts` [s]; `clean`,
@@ -112,7 +114,7 @@ def make_record(
         else:
             hidden[place] = parameters(place, size * given)
     joint, tables = perturbed(of_plant, perturb, nominal), laws(hidden)
-    u = voltage(kind, round(seconds * fs), fs, of_input, rms)
+    u = voltage(kind, round(seconds * fs), fs, of_input, rms) if played is None else np.round(played, 6)
     state = simulate(joint, tables, u, 1 / fs)
     clean = read(state[:, :2], tables.sensors)
     return {
@@ -127,7 +129,7 @@ def make_record(
                 for (effect, port), values in hidden.items()
             ],
             "plant": asdict(joint),
-            "input": kind,
+            "input": kind if played is None else "played",
             "seed": seed,
             "size": size,
             "perturb": perturb,

@@ -41,15 +41,19 @@ def renamed(place: Place, values: Mapping[str, float], K: float = Plant.K) -> di
             "cosine": a * math.sin(phase),
             "periods": values["periods"],
         }
+    if place[0] == "backlash":  # from the middle to each stop
+        return {"gap": values["play"] / 2}
     if place[0] == "joint_play":
         return {**values, "stiffness": K}
     names = _RENAMED.get(place[0], {})
     return {new: value for old, value in values.items() for new in names.get(old, (old,))}
 
 
-def visible(hidden: Iterable[Place], kind: str) -> list[Place]:
-    """The hidden effects that a textbook joint lacks and this input can show."""
-    return [p for p in hidden if p not in ABSORBED and kind not in UNSEEN.get(p, set())]
+def visible(hidden: Iterable[Place], kind: str, channels: Sequence[str] = ("theta", "alpha")) -> list[Place]:
+    """The hidden effects that a textbook joint lacks and this input and these sensors can show."""
+    missing = {"theta", "alpha"} - set(channels)
+    seen = [p for p in hidden if p not in ABSORBED and kind not in UNSEEN.get(p, set())]
+    return [p for p in seen if p[1] not in missing]
 
 
 def alike(place: Place) -> set[Place]:
@@ -70,7 +74,7 @@ def exact(answer: Iterable[Place], wanted: Sequence[Place]) -> bool:
 def scored(
     wanted: Sequence[Place],
     rounds: Sequence[Place],
-    equivalents: Sequence[Iterable[Place]],
+    equivalents: Sequence[Sequence[Place]],
     verdict: str,
 ) -> dict[str, Any]:
     """Marks of one answer.
@@ -83,7 +87,8 @@ def scored(
 
     Returns:
         `first`: the first effect is true, look-alikes allowed; `strict`: true by name; `exact`: the
-        whole set; `inside`: every true effect is found or listed; `extra`: effects that are neither
+        whole set; `inside`: every true effect is found or listed; `hits`: how many are; `set_size`: the
+        largest set that a round was reported as; `extra`: effects that are neither
         true nor look-alikes; `verdict_right`, which for an effect outside the package is that
         something remains unexplained; `outside`: whether there was one.
     """
@@ -94,6 +99,8 @@ def scored(
         "strict": bool(rounds) and rounds[0] in wanted if wanted else not rounds,
         "exact": exact(rounds, wanted),
         "inside": all(alike(p) & listed for p in wanted),
+        "hits": sum(bool(alike(p) & listed) for p in wanted),
+        "set_size": max((1 + len(group) for group in equivalents), default=0),
         "extra": [list(p) for p in rounds if p not in allowed],
     }
     outside = any(p in OUTSIDE for p in wanted)
@@ -121,9 +128,10 @@ def parameter_errors(
         K: stiffness of the plant's joint [N m/rad].
 
     Returns:
-        Full name -> true value, estimate, error [%], and whether the interval holds the truth.
+        Full name -> true value, estimate with its deviation, error [%], and whether the 95 % interval
+        holds the truth.
     """
-    table = {}
+    table = dict[str, dict[str, Any]]()
     for place, values in hidden.items():
         if place in ABSORBED:
             continue
@@ -135,6 +143,7 @@ def parameter_errors(
             table[full] = {
                 "true": true,
                 "estimate": e.value,
+                "std": e.std if math.isfinite(e.std) else None,
                 "error_percent": 100 * (e.value - true) / abs(true) if true else math.nan,
                 "covered": bool(e.ci95[0] <= true <= e.ci95[1]),
             }

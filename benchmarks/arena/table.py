@@ -10,8 +10,11 @@ from rich.table import Table
 
 
 def label(job: dict[str, Any]) -> str:
-    """What is hidden, in short."""
-    return " + ".join(f"{e}@{p}" for e, p in job["effects"]) or "nothing"
+    """What is hidden, and how the record differs from the usual one, in short."""
+    name = " + ".join(f"{e}@{p}" for e, p in job["effects"]) or "nothing"
+    size, channels = job.get("size", 1.0), job.get("channels", ["theta", "alpha"])
+    name += f" x{size:g}" if size != 1 else ""
+    return name + (f" ({channels[0]} only)" if len(channels) == 1 else "")
 
 
 def mark(ok: bool | None) -> str:

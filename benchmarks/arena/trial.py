@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,24 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.model import Model, window_starts
 
 SPLIT, WINDOW, FS = 0.7, 2.0, 500.0
+BOTH = ["theta", "alpha"]
 
 
 def recording(job: dict[str, Any]) -> tuple[rf.Recording, dict[str, Any]]:
     """The recording of a job, and its truth."""
     places = [tuple(p) for p in job["effects"]]
-    r = make_record(places, kind=job["kind"], seed=job["seed"], seconds=job["seconds"], fs=FS)
-    return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena"), r["truth"]
+    size, seconds = job.get("size", 1.0), job["seconds"]
+    r = make_record(places, kind=job["kind"], seed=job["seed"], size=size, seconds=seconds, fs=FS)
+    channels = job.get("channels", BOTH)
+    y = r["y"][:, [BOTH.index(c) for c in channels]]
+    rec = rf.Recording(u=r["u"], y=y, Ts=r["Ts"], channels=tuple(channels), source="arena")
+    return rec, r["truth"]
+
+
+def textbook(channels: Sequence[str] = BOTH) -> rf.Mechanism:
+    """The joint without any hidden effect, with the sensors that there are."""
+    joint = rf.joints.paper()
+    return dataclasses.replace(joint, outputs=tuple(o for o in joint.outputs if o[0] in channels))
 
 
 def windows_error(model: Model, test: rf.Recording) -> dict[str, float]:
@@ -39,9 +51,9 @@ def windows_error(model: Model, test: rf.Recording) -> dict[str, float]:
 
 def oracle(places: list[Place], train: rf.Recording, test: rf.Recording) -> dict[str, Any]:
     """The true structure, fitted from half the default sizes and never told the true numbers."""
-    m = rf.joints.paper()
+    m = textbook(list(train.channels))
     for place in places:
-        if place in ABSORBED:
+        if place in ABSORBED or (place[1] in BOTH and place[1] not in m.channels):
             continue
         kept = SHAPES.get(place[0], set())
         half = {n: (v if n in kept else v / 2) for n, v in DEFAULTS[place].items()}
@@ -54,7 +66,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
     """Searches one record and marks the answer; a failure is a row with its error.
 
     Args:
-        job: `effects`, `kind`, `seed`, `seconds`.
+        job: `effects`, `kind`, `seed`, `seconds`; `size` if not 1, `channels` if not both.
         tell: called with lines of progress.
 
     Returns:
@@ -70,10 +82,11 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
     try:
         rec, truth = recording(job)
         hidden = {(e["effect"], e["port"]): e["parameters"] for e in truth["effects"]}
-        wanted = visible(hidden, job["kind"])
+        wanted = visible(hidden, job["kind"], job.get("channels", BOTH))
         train, test = rec.split(SPLIT)
         wall, cpu = time.perf_counter(), time.process_time()
-        result = rf.discover(rf.joints.paper(), train, test, window_seconds=WINDOW, progress=say)
+        joint = textbook(list(rec.channels))
+        result = rf.discover(joint, train, test, window_seconds=WINDOW, progress=say)
         row["wall_s"] = time.perf_counter() - wall
         row["cpu_s"] = time.process_time() - cpu
         rounds = [(r.effect, r.port) for r in result.rounds]

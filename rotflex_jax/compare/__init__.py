@@ -1,7 +1,11 @@
 """Every method on the same recording: same split, same first samples, free runs only."""
 
+from rotflex_jax.compare.adaptive_series import AdaptiveSeries
 from rotflex_jax.compare.arx import ARX
+from rotflex_jax.compare.batch_series import RIDGES, BatchSeries
+from rotflex_jax.compare.learned import LearnedTorqueMethod
 from rotflex_jax.compare.method import METHODS, Fitted, Method, register
+from rotflex_jax.compare.output_error import LinearStateSpace
 from rotflex_jax.compare.physics import (
     Discovered,
     GreyBox,
@@ -10,6 +14,8 @@ from rotflex_jax.compare.physics import (
     Textbook,
 )
 from rotflex_jax.compare.side_by_side import compare
+from rotflex_jax.compare.sindy import SINDy
+from rotflex_jax.compare.subspace import Subspace
 from rotflex_jax.compare.table import Comparison, Row
 
 # The order in which they run; one more method is one more line.
@@ -18,19 +24,88 @@ register(LinearPart())
 register(GreyBox())
 register(GreyBoxPredictor())
 register(Discovered())
+register(LearnedTorqueMethod())
 register(ARX())
+register(Subspace())
+register(LinearStateSpace())
+register(BatchSeries("fir_ls", "a finite impulse response, by least squares", order=1, count=40))
+register(BatchSeries("volterra_ls", "a Volterra series on delays, order 2, by least squares"))
+register(
+    BatchSeries(
+        "volterra3_ridge",
+        "a Volterra series on delays, order 3, by ridge",
+        order=3,
+        count=6,
+        penalties=RIDGES,
+    )
+)
+register(BatchSeries("laguerre_ls", "Laguerre functions, by least squares", "laguerre", 1, 8))
+register(
+    BatchSeries("laguerre_ridge", "a Laguerre-Volterra series, order 2, by ridge", "laguerre", 2, 7, RIDGES)
+)
+register(
+    BatchSeries("laguerre3_ridge", "a Laguerre-Volterra series, order 3, by ridge", "laguerre", 3, 5, RIDGES)
+)
+register(BatchSeries("kautz_ridge", "a Kautz-Volterra series, order 2, by ridge", "kautz", 2, 6, RIDGES))
+register(
+    BatchSeries(
+        "pole_ridge",
+        "a Volterra series on the poles of a linear model, order 2, by ridge",
+        "poles",
+        2,
+        6,
+        RIDGES,
+    )
+)
+register(AdaptiveSeries("volterra_lms", "a Volterra series, order 2, by LMS, step sizes from a grid"))
+register(
+    AdaptiveSeries(
+        "volterra_lms_gradient", "a Volterra series, order 2, by LMS, step sizes by gradient", gradient=True
+    )
+)
+register(AdaptiveSeries("volterra_nlms", "a Volterra series, order 2, by NLMS", "nlms"))
+register(AdaptiveSeries("volterra_rls", "a Volterra series, order 2, by RLS", "rls"))
+register(AdaptiveSeries("volterra_kalman", "a Volterra series, order 2, by a Kalman filter", "kalman"))
+register(
+    AdaptiveSeries(
+        "laguerre3_rls",
+        "a Laguerre-Volterra series, order 3, by RLS",
+        "rls",
+        bank="laguerre",
+        order=3,
+        count=5,
+    )
+)
+register(SINDy())
+register(SINDy("sindy_ensemble", "a sparse law of motion, median of an ensemble", "ensemble"))
+register(SINDy("sindy_weak", "a sparse law of motion, weak form", "weak"))
+
+QUICK = tuple(
+    name
+    for name in METHODS
+    if name not in ("discovered", "learned_torque", "sindy_ensemble", "volterra_lms_gradient")
+)
+"""Names of the methods without a long search."""
 
 __all__ = [
     "ARX",
+    "AdaptiveSeries",
+    "BatchSeries",
     "Comparison",
     "Discovered",
     "Fitted",
     "GreyBox",
     "GreyBoxPredictor",
+    "LearnedTorqueMethod",
     "LinearPart",
+    "LinearStateSpace",
     "METHODS",
     "Method",
+    "QUICK",
+    "RIDGES",
     "Row",
+    "SINDy",
+    "Subspace",
     "Textbook",
     "compare",
     "register",

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rotflex_jax.compare.held_in import free_run_cost, one_period, parted
 from rotflex_jax.compare.method import Fitted, Progress
 from rotflex_jax.errors import InputError
 from rotflex_jax.model import Model
@@ -31,6 +32,14 @@ class Difference:
     def order(self) -> int:
         """How many samples it looks back."""
         return self.B.shape[1]
+
+    def predict(self, recording: Recording) -> np.ndarray:
+        """One step ahead (N, C); the first samples, which it needs to begin, as measured."""
+        n, y = self.order, recording.y.astype(float)
+        lags = lambda x: np.lib.stride_tricks.sliding_window_view(x, n, axis=0)[:-1]  # noqa: E731
+        past = np.swapaxes(lags(y), 1, 2).reshape(len(y) - n, -1)
+        ahead = past @ self.A.reshape(len(self.B), -1).T + lags(recording.u.astype(float)) @ self.B.T
+        return np.concatenate([y[:n], ahead])
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Free run (N, C): the first `n_init` samples as measured, from there on its own outputs.
@@ -78,13 +87,13 @@ class ARX:
 
     name: str = "arx"
     title: str = "a linear difference equation, by least squares"
+    family: str = "linear"
     orders: tuple[int, ...] = (2, 4, 8, 16, 32, 64)
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Takes no notice of the model."""
-        parts = [recording.split(self.share) for recording in train]
-        first, last = [a for a, _ in parts], [b for _, b in parts]
+        first, last = parted(train, self.share)
         longest = min(r.n_init for r in (*first, *last))
         orders = [n for n in self.orders if n <= longest]
         if not orders:
@@ -92,17 +101,13 @@ class ARX:
                 f"The lowest order is {min(self.orders)}, but a model may look at only {longest} "
                 "samples of the recordings; give them a larger n_init."
             )
-        if len({r.Ts for r in train}) > 1:
-            raise InputError(
-                "The recordings have different sampling periods, but a difference equation has "
-                "one; decimate them to the same."
-            )
+        one_period(train, "a difference equation")
         costs = []
         for n in orders:
-            costs.append(_free_run_cost(least_squares(first, n), last))
+            costs.append(free_run_cost(least_squares(first, n), last))
             say(f"order {n}: log error {costs[-1]:.2f}")
         found = least_squares(train, orders[int(np.argmin(costs))])
-        return Fitted(found, found.A.size + found.B.size, f"order {found.order}")
+        return Fitted(found, found.A.size + found.B.size, f"order {found.order}", found.predict)
 
 
 def least_squares(recordings: Sequence[Recording], order: int) -> Difference:
@@ -126,11 +131,3 @@ def least_squares(recordings: Sequence[Recording], order: int) -> Difference:
     W = (np.linalg.lstsq(X / size, Y, rcond=None)[0] / size[:, None]).T
     A, B = W[:, : order * C].reshape(C, order, C), W[:, order * C :]
     return Difference(A, B, recordings[0].Ts)
-
-
-def _free_run_cost(equation: Difference, recordings: Sequence[Recording]) -> float:
-    """Mean over the channels of the log of the error; infinite where a run diverges."""
-    with np.errstate(all="ignore"):
-        e = [(r.y - equation.simulate(r))[r.n_init :] for r in recordings]
-        cost = float(np.mean(np.log(np.sqrt(np.mean(np.concatenate(e) ** 2, axis=0)))))
-    return np.inf if np.isnan(cost) else cost

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -43,6 +43,13 @@ def free_runs(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[np
             )
         runs.append(y_hat)
     return tuple(runs)
+
+
+def one_step(
+    predict: Callable[[Recording], np.ndarray], recordings: Sequence[Recording]
+) -> tuple[np.ndarray, ...]:
+    """Predictions (N, C) one step ahead; they see every sample before the one predicted."""
+    return tuple(np.asarray(predict(recording), float) for recording in recordings)
 
 
 def seconds_of(simulator: Simulator, recordings: Sequence[Recording]) -> float:

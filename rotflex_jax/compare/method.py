@@ -30,11 +30,14 @@ class Fitted:
         simulator: Simulates other recordings; a `Model`, or an object of the method's own.
         parameters: How many numbers were fitted.
         note: What a reader of the table must know, as a phrase; "" for nothing.
+        predict: Outputs (N, C) one step ahead, each from the input and the outputs before it; None
+            for a method that has no predictor.
     """
 
     simulator: Simulator
     parameters: int
     note: str = ""
+    predict: Callable[[Recording], np.ndarray] | None = None
 
 
 @runtime_checkable

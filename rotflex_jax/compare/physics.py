@@ -1,7 +1,9 @@
 """Methods that start from the user's physics: as given, fitted, without and with more effects."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
 
 from rotflex_jax.compare.method import Fitted, Progress
 from rotflex_jax.discover import discover
@@ -9,7 +11,7 @@ from rotflex_jax.discover.refit import HORIZON
 from rotflex_jax.effects.kinds import Linear
 from rotflex_jax.fit import fit
 from rotflex_jax.fit.greybox import everywhere, torque_scale
-from rotflex_jax.fit.residuals import stack
+from rotflex_jax.fit.residuals import sensor_noise, stack
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
@@ -20,10 +22,11 @@ class Textbook:
 
     name: str = "textbook"
     title: str = "the mechanism with its given numbers"
+    family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Takes no notice of the recordings."""
-        return Fitted(model, parameters=0)
+        return Fitted(model, parameters=0, predict=predictor(model, train))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +35,7 @@ class LinearPart:
 
     name: str = "linear"
     title: str = "the linear effects of the mechanism alone, fitted"
+    family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Leaves out every effect that is not linear, then fits as the grey box."""
@@ -41,7 +45,7 @@ class LinearPart:
             mechanism = mechanism.without(e.name, e.at)
         left_out = ", ".join(f"{e.name} at {e.at}" for e in nonlinear)
         note = f"without {left_out}" if nonlinear else "the mechanism is linear as it is"
-        return _fitted(Model(mechanism, model.solver), train, say, note=note)
+        return fitted_physics(Model(mechanism, model.solver), train, say, note=note)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,10 +54,11 @@ class GreyBox:
 
     name: str = "grey_box"
     title: str = "the mechanism, fitted to free runs"
+    family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Fits the error that is compared."""
-        return _fitted(model, train, say)
+        return fitted_physics(model, train, say)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,13 +75,12 @@ class GreyBoxPredictor:
 
     name: str = "grey_box_predictor"
     title: str = "the mechanism, fitted to predictions that admit unknown torques"
+    family: str = "physics"
     share: float = HORIZON
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Fits innovations instead of free runs."""
-        torque = torque_scale(model.mechanism, stack(train, model))
-        intensity = self.share * torque**2 * train[0].Ts
-        return _fitted(model, train, say, everywhere(model.mechanism, intensity))
+        return fitted_physics(model, train, say, _unknown_torques(model, train, self.share))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +96,7 @@ class Discovered:
 
     name: str = "discovered"
     title: str = "the mechanism with the effects that discovery adds, fitted to free runs"
+    family: str = "physics"
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
@@ -100,10 +105,10 @@ class Discovered:
         result = discover(model, [a for a, _ in parts], [b for _, b in parts], progress=say)
         found = ", ".join(f"{r.effect} at {r.port}" for r in result.rounds)
         note = f"added {found}" if found else f"added nothing ({result.verdict.replace('_', ' ')})"
-        return _fitted(result.model, train, say, note=note)
+        return fitted_physics(result.model, train, say, note=note)
 
 
-def _fitted(
+def fitted_physics(
     model: Model,
     train: Sequence[Recording],
     say: Progress,
@@ -115,4 +120,17 @@ def _fitted(
     if found.status.startswith("diverged"):
         raise RuntimeError(found.status)
     stopped = "" if found.status == "converged" else f"fit {found.status}"
-    return Fitted(found.model, len(found.free_names), "; ".join(filter(None, (note, stopped))))
+    said = "; ".join(filter(None, (note, stopped)))
+    return Fitted(found.model, len(found.free_names), said, predictor(found.model, train))
+
+
+def _unknown_torques(model: Model, train: Sequence[Recording], share: float) -> dict[str, float]:
+    """Intensity of white torques along every coordinate, as a share of what the motor can do."""
+    torque = torque_scale(model.mechanism, stack(train, model))
+    return everywhere(model.mechanism, share * torque**2 * train[0].Ts)
+
+
+def predictor(model: Model, train: Sequence[Recording]) -> Callable[[Recording], np.ndarray]:
+    """One step ahead by the steady Kalman filter that admits unknown torques."""
+    torques, noise = _unknown_torques(model, train, HORIZON), sensor_noise(train, model)
+    return lambda recording: model.predict(recording, torques, noise)

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from rotflex_jax import joints
-from rotflex_jax.compare.judged import errors, free_runs, left_the_range, seconds_of, windows
+from rotflex_jax.compare.horizon import against_horizon
+from rotflex_jax.compare.judged import errors, free_runs, left_the_range, one_step, seconds_of, windows
 from rotflex_jax.compare.method import Method, Progress, chosen
 from rotflex_jax.compare.table import Comparison, Row
 from rotflex_jax.errors import InputError
@@ -32,11 +33,14 @@ def compare(
 
     All learn from the same part and are judged on the same other part, of which they see the input
     and the first `n_init` samples of the outputs: the rest is taken away before they simulate. A
-    method that fails or diverges is a row that says so.
+    method that fails or diverges is a row that says so. The error of predictions one step ahead is
+    told where a method has a predictor, and never used to rank: the last sample alone predicts the
+    next one well.
 
     Args:
         recordings: One or several.
-        methods: Names of registered methods, or objects that are methods; all registered if None.
+        methods: Names of registered methods, or objects that are methods; all registered if None,
+            `rotflex_jax.compare.QUICK` are those without a long search.
         mechanism: Physics of the methods that start from it; `joints.paper()` if None.
         test: Recordings to judge on; without them, the end of each recording.
         fraction: Share of each recording to learn from, where `test` is not given [-]; 0.7 if None.
@@ -81,7 +85,7 @@ def _row(
     seconds: float,
     say: Progress,
 ) -> Row:
-    row = Row(method.name, method.title)
+    row = Row(method.name, method.title, family=getattr(method, "family", "other"))
     began = time.perf_counter()
     # Whatever goes wrong in one method must not cost the others their rows.
     try:
@@ -96,6 +100,7 @@ def _row(
         runs = free_runs(fitted.simulator, test)
         pieces = [piece for r in test for piece in windows(r, seconds)]
         short = errors(pieces, free_runs(fitted.simulator, pieces))
+        ahead = {} if fitted.predict is None else errors(test, one_step(fitted.predict, test))["rmse"]
         reason = left_the_range(runs, test, _reach((*train, *test)))
         return dataclasses.replace(
             row,
@@ -103,6 +108,8 @@ def _row(
             reason=reason,
             **errors(test, runs),
             rmse_windows=short["rmse"],
+            rmse_one_step=ahead,
+            horizon=against_horizon(fitted.simulator, test, seconds),
             simulate_seconds=seconds_of(fitted.simulator, test),
             simulated=runs,
         )

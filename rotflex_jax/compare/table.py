@@ -2,13 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rotflex_jax.compare.horizon import Horizon
 from rotflex_jax.compare.method import Simulator
-from rotflex_jax.errors import InputError
+from rotflex_jax.compare.printed import aligned, cells
+from rotflex_jax.errors import InputError, optional
 from rotflex_jax.recording import Recording
 
 Errors = dict[str, float]
@@ -21,6 +23,7 @@ class Row:
     Attributes:
         method: Its name.
         title: What it is.
+        family: Kind of method: `physics`, `linear`, `series`, `adaptive`, `sindy` or `other`.
         status: `ok`, `diverged` or `failed`.
         reason: Why it failed or diverged; "" where it did not.
         note: What else to know: its order, what it left out or added.
@@ -29,6 +32,8 @@ class Row:
         fit_percent: 100 (1 - nrmse) [%].
         worst: Largest error of that free run [unit].
         rmse_windows: Root mean square error of free runs that start anew every few seconds [unit].
+        rmse_one_step: Root mean square error one step ahead [unit]; empty without a predictor.
+        horizon: Error of free runs by how far they have gone; None where the method failed.
         parameters: How many numbers were fitted; None where the method failed.
         fit_seconds: Time to learn [s], with the compilation of code that no earlier method needed.
         simulate_seconds: Time of the free runs over the held-out data, compiled before [s].
@@ -38,6 +43,7 @@ class Row:
 
     method: str
     title: str
+    family: str = "other"
     status: str = "ok"
     reason: str = ""
     note: str = ""
@@ -46,6 +52,8 @@ class Row:
     fit_percent: Errors = dataclasses.field(default_factory=dict)
     worst: Errors = dataclasses.field(default_factory=dict)
     rmse_windows: Errors = dataclasses.field(default_factory=dict)
+    rmse_one_step: Errors = dataclasses.field(default_factory=dict)
+    horizon: Horizon | None = None
     parameters: int | None = None
     fit_seconds: float | None = None
     simulate_seconds: float | None = None
@@ -64,6 +72,7 @@ class Row:
         return {
             "method": self.method,
             "title": self.title,
+            "family": self.family,
             "status": self.status,
             "reason": self.reason,
             "note": self.note,
@@ -72,6 +81,14 @@ class Row:
             "held_out_nrmse": _plain(self.nrmse),
             "held_out_fit_percent": _plain(self.fit_percent),
             "held_out_worst": _plain(self.worst),
+            "held_out_rmse_one_step": _plain(self.rmse_one_step),
+            "horizon": None
+            if self.horizon is None
+            else {
+                "seconds": list(self.horizon.seconds),
+                "runs": self.horizon.runs,
+                **{c: [v if math.isfinite(v) else None for v in e] for c, e in self.horizon.rmse.items()},
+            },
             "parameters": self.parameters,
             "fit_seconds": self.fit_seconds,
             "simulate_seconds": self.simulate_seconds,
@@ -125,64 +142,80 @@ class Comparison:
             "elapsed_s": self.elapsed_s,
         }
 
-    def cells(self) -> list[list[str]]:
-        """The table in words: headings, the methods that came through, the sensor noise."""
-        units = dict(zip(self.test[0].channels, self.test[0].units, strict=True))
-        head = ["method"]
-        for what in (f"{self.window_seconds:g} s rms", "rms", "worst"):
-            head += [f"{c} {what} [{_readable(0.0, unit)[1]}]" for c, unit in units.items()]
-        head += [f"{c} fit [%]" for c in units]
-        head += ["fitted", "fit [s]", "simulate [s]"]
-        body = []
+    @property
+    def best_of_each_family(self) -> tuple[Row, ...]:
+        """The best method of each family that came through, best first."""
+        first: dict[str, Row] = {}
         for row in self.rows:
             if row.status == "ok":
-                lengths = [
-                    _digits(_readable(errors[c], unit)[0])
-                    for errors in (row.rmse_windows, row.rmse, row.worst)
-                    for c, unit in units.items()
-                ]
-                shares = [f"{row.fit_percent[c]:.2f}" for c in units]
-                times = [_digits(row.fit_seconds), _digits(row.simulate_seconds)]
-                body.append([row.method, *lengths, *shares, str(row.parameters), *times])
-        floor = [_digits(_readable(self.noise_floor[c], unit)[0]) for c, unit in units.items()]
-        noise = ["sensor noise", *floor, *floor]
-        return [head, *body, noise + [""] * (len(head) - len(noise))]
+                first.setdefault(row.family, row)
+        return tuple(first.values())
+
+    def to_markdown(self) -> str:
+        """The table in Markdown, then a line for each method that has something to say."""
+        head, *body = self.cells()
+        align = ["---", *["---:"] * (len(head) - 1)]
+        lines = ["| " + " | ".join(cells) + " |" for cells in (head, align, *body)]
+        return "\n".join([*lines, "", *(f"- {line}" for line in self.remarks())]) + "\n"
+
+    def to_frame(self) -> Any:
+        """The numbers as a pandas DataFrame, one row per method, in the units of the recordings.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        pandas = optional("pandas", "A table as a DataFrame")
+        records = []
+        for row in self.rows:
+            errors = {
+                "rmse": row.rmse,
+                "nrmse": row.nrmse,
+                "fit_percent": row.fit_percent,
+                "worst": row.worst,
+                "rmse_windows": row.rmse_windows,
+                "rmse_one_step": row.rmse_one_step,
+            }
+            plain = ("family", "status", "parameters", "fit_seconds", "simulate_seconds", "reason", "note")
+            records.append(
+                {"method": row.method}
+                | {f"{name}_{c}": e for name, by in errors.items() for c, e in by.items()}
+                | {name: getattr(row, name) for name in plain}
+            )
+        return pandas.DataFrame(records).set_index("method")
+
+    def plot(self) -> Any:
+        """Measured and simulated outputs of the best method of each family, as a matplotlib Figure."""
+        from rotflex_jax.report.comparison_figures import overlays  # matplotlib only where it draws
+
+        return overlays(self)
+
+    def report(self, folder: str | Path) -> Path:
+        """Write `comparison.html` (self-contained) and `comparison.json` into a folder, which is created.
+
+        Returns:
+            Path of the HTML page.
+        """
+        from rotflex_jax.report.comparison import write
+
+        return write(self, Path(folder))
+
+    def cells(self) -> list[list[str]]:
+        """The table in words: headings, the methods that came through, the sensor noise."""
+        return cells(self)
 
     def __str__(self) -> str:
         """The table, then a line for each method that has something to say."""
-        lines = _aligned(self.cells())
+        return "\n".join([*aligned(self.cells()), *self.remarks()])
+
+    def remarks(self) -> list[str]:
+        """What there is to say about each method: why it failed, what it chose."""
+        lines = []
         for row in self.rows:
             said = "; ".join(filter(None, (row.reason, row.note)))
             state = "" if row.status == "ok" else f"{row.status}: "
             if said or state:
                 lines.append(f"{row.method}: {state}{said}")
-        return "\n".join(lines)
-
-
-def _aligned(cells: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a plain table; headings in two lines, so that it stays narrow."""
-    halves = [[h.rpartition(" ")[0] for h in cells[0]], [h.rpartition(" ")[2] for h in cells[0]]]
-    halves[0][0], halves[1][0] = "", cells[0][0]
-    rows = [*halves, *cells[1:]]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            [
-                row[0].ljust(widths[0]),
-                *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
-            ]
-        ).rstrip()
-        for row in rows
-    ]
-
-
-def _readable(value: float, unit: str) -> tuple[float, str]:
-    """Degrees where a person reads an angle."""
-    return (math.degrees(value), "deg") if unit == "rad" else (value, unit)
-
-
-def _digits(value: float | None) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
+        return lines
 
 
 def _described(recording: Recording) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
+from rotflex_jax.data.by_hand import BY_HAND
 from rotflex_jax.data.io import load
 from rotflex_jax.data.registry import DATASETS, Dataset, PublicFile
 from rotflex_jax.errors import InputError, optional
@@ -41,8 +42,11 @@ def fetch(name: str, folder: str | os.PathLike[str] | None = None) -> list[Path]
         Paths of the files, in the order of the data set.
 
     Raises:
-        InputError: no such data set, a file missing in the folder, no network, or another hash.
+        InputError: no such data set, one that is fetched by hand, a file missing in the folder, no
+            network, or another hash.
     """
+    if name in BY_HAND:
+        raise InputError(f"The data set {name!r} is not downloaded here; {BY_HAND[name].advice}.")
     if name not in DATASETS:
         raise InputError(f"There is no data set {name!r}; choose one of {', '.join(DATASETS)}.")
     local = folder if folder is not None else os.environ.get(FOLDER_VARIABLE)

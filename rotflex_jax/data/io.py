@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rotflex_jax.data.files import read_table
+from rotflex_jax.data.foreign import from_foreign, is_foreign
 from rotflex_jax.data.table import Table
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
@@ -30,24 +31,27 @@ def load(
     Ts: float | None = None,
     time: str | None = None,
     accept: str | Sequence[str] = (),
+    units: Mapping[str, str] | None = None,
 ) -> Recording:
     """Reads a recording, and refuses what is wrong with it; nothing is repaired.
 
     Text (.csv, .tsv, .txt; any delimiter), MATLAB (.mat of any version), NumPy (.npz), Parquet, or
     a pandas DataFrame. Columns `t,voltage,theta,alpha` in seconds, volts and radians unless other
     names are given. In .mat and .npz, a matrix `log` gives the columns `log[0]`, `log[1]`, and a
-    structure `log` with a field `u` the column `log.u`.
+    structure `log` with a field `u` the column `log.u`. An object that has `u`, `y` and `sampling_time`,
+    such as `nonlinear_benchmarks` gives, is taken as it is, with the channels named in `outputs`.
 
     Not for unevenly sampled data: resample them first.
 
     Args:
-        source: path or DataFrame.
+        source: path, DataFrame, or an object with `u` and `y`.
         input: column of the motor voltage [V].
         outputs: columns of theta, then of alpha [rad]; or a mapping of channel name to column.
         degrees: whether the outputs are in degrees.
         Ts: sampling period [s], where no column has the time.
         time: column of the time [s].
         accept: faults to accept by name, such as `saturated`; see `Recording`.
+        units: channel to unit, where it is not rad.
 
     Returns:
         The recording.
@@ -62,6 +66,9 @@ def load(
     Recording(100 samples, 2 s at 50 Hz, voltage [V] to theta [rad], DataFrame)
     """
     accepted = acceptable(accept)
+    if is_foreign(source):
+        names = list(outputs) if isinstance(outputs, Mapping) else outputs
+        return from_foreign(source, names, units, Ts, accepted)
     table = read_table(source, huge="huge" in accepted)
     u_name = "voltage" if input is None else input
     chosen = _outputs(outputs)
@@ -88,6 +95,7 @@ def load(
             y=np.deg2rad(together) if degrees else together,
             Ts=period,
             channels=tuple(y),
+            units=tuple((units or {}).get(channel, "rad") for channel in y),
             source=table.label,
             start=start,
             accept=accepted,

@@ -3,11 +3,11 @@
 import numpy as np
 
 from rotflex_jax.discover.decide import WINDOWS_BETTER
+from rotflex_jax.discover.grow import without
 from rotflex_jax.discover.heldout import Away, Trial, held_out
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.moves import without
 from rotflex_jax.discover.refit import Judge, refit
-from rotflex_jax.discover.supermodel import CALIBRATIONS, Place
+from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.effects import CATALOG
 
 
@@ -20,7 +20,7 @@ def settle(
         The final model; the effects of the machine, in order; calibrations that belong to the training
         recordings alone; and a note where calibrations were left out altogether.
     """
-    asked = [p for p in order if p in CALIBRATIONS]
+    asked = [p for p in order if p in judge.bench.supermodel.calibrations]
     trial = held_out(away, final)
     order, own = _carried_over(away, trial, order)
     bare = _without(judge, away, trial, order)
@@ -40,7 +40,7 @@ def _carried_over(away: Away, final: Trial, order: list[Place]) -> tuple[list[Pl
     A calibration is one of the machine if its trained value makes the held-out free runs clearly better.
     """
     kept, own = list(order), []
-    for place in [p for p in order if p in CALIBRATIONS]:
+    for place in [p for p in order if p in away.judge.bench.supermodel.calibrations]:
         with_it = away.short_runs(final.trained, kept)
         less = away.short_runs(final.trained, [p for p in kept if p != place])
         if float(np.mean(np.log(with_it / less))) > -WINDOWS_BETTER:
@@ -56,7 +56,7 @@ def _without(judge: Judge, away: Away, final: Trial, order: list[Place]) -> Hypo
     such offsets are then further off than those fitted as if there were none.
     """
     bare = final.hypothesis
-    asked = set(bare.places) & set(CALIBRATIONS)
+    asked = set(bare.places) & set(judge.bench.supermodel.calibrations)
     if not asked:
         return None
     for place in asked:

@@ -4,9 +4,11 @@ Two candidates whose held-out log-likelihoods differ by less than their scatter 
 are reported together; a richer effect must beat the simpler one that it contains beyond doubt.
 """
 
+import dataclasses
+
 import numpy as np
 
-from rotflex_jax.discover.heldout import Trial, in_blocks
+from rotflex_jax.discover.heldout import Away, Trial, held_out, in_blocks
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.residuals import Data
 
@@ -16,8 +18,9 @@ HELD_OUT_NATS, HELD_OUT_Z, TRAIN_NATS, TRAIN_Z = 5.0, 1.5, 8.0, 2.0
 # Mean log error of free runs over short windows: near the sensor noise it may rise by no more than the
 # first, elsewhere it must fall by the second.
 WINDOWS_WORSE, WINDOWS_BETTER = 0.02, 0.01
-# Two effects are told apart by this many deviations of their paired block differences.
-SEPARATE_Z = 2.0
+# Two effects are told apart by this many deviations of their paired block differences, or by free runs
+# over short windows whose errors differ by more than this (mean log ratio).
+SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
 
 
 def lead(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
@@ -71,7 +74,11 @@ def admissible(trial: Trial, base: Trial, data: Data, noise: np.ndarray) -> bool
 def choose(
     trials: list[Trial], base: Trial, data: Data, noise: np.ndarray
 ) -> tuple[Trial | None, list[Trial]]:
-    """The best admissible trial and those that cannot be told from it; arguments as in `admissible`."""
+    """The best admissible trial and those that cannot be told from it; arguments as in `admissible`.
+
+    A rival need not pass every test that the winner passed: where the effect is small, which of the two
+    passes is chance. That it gains something, and that nothing tells it from the winner, is enough.
+    """
     able = [t for t in trials if admissible(t, base, data, noise)]
     if not able:
         return None, []
@@ -79,12 +86,33 @@ def choose(
     simpler = [t for t in able if _contained(t, winner) and not _clearly(winner, t, base)]
     if simpler:
         winner = max(simpler, key=lambda t: t.held_out)
-    rivals = [t for t in able if t is not winner and not _contained(winner, t) and not _contained(t, winner)]
-    return winner, [t for t in rivals if not told_apart(winner, t, data)]
+    rivals = [
+        t for t in trials if t is not winner and not _contained(winner, t) and not _contained(t, winner)
+    ]
+    gains = [t for t in rivals if t.held_out > base.held_out and _trained_lead(t, base, data)[0] > 0]
+    return winner, [t for t in gains if not told_apart(winner, t, data)]
+
+
+def on_equal_terms(away: Away, trials: list[Trial]) -> list[Trial]:
+    """Trials of which a simpler law may begin in the held-out first states of a richer one that does better.
+
+    The search for these states may end in different places, which is not what laws should be told by.
+    """
+    out = []
+    for t in trials:
+        richer = [r for r in trials if _contained(t, r) and r.held_out > t.held_out]
+        if richer:
+            best = max(richer, key=lambda r: r.held_out)
+            again = held_out(away, t.hypothesis, best)
+            t = max(t, dataclasses.replace(again, place=t.place, numbers=t.numbers), key=lambda x: x.held_out)
+        out.append(t)
+    return out
 
 
 def told_apart(winner: Trial, rival: Trial, data: Data) -> bool:
-    """Whether all recordings together, block by block, prefer the winner beyond doubt."""
+    """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
+    if _change(rival, winner) > WINDOWS_APART:
+        return True
     a, b = (np.concatenate([t.blocks, in_blocks(t.hypothesis.densities, data)]) for t in (winner, rival))
     return lead(a, b)[1] >= SEPARATE_Z
 

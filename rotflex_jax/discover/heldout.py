@@ -15,6 +15,8 @@ from rotflex_jax.recording import Recording
 
 # Log-likelihoods are compared block by block, so that their scatter tells what is chance.
 BLOCK_SECONDS = 0.5
+# Log-likelihood per block [nat] of a model that diverges: finite, so that it can be compared.
+DIVERGED = -1e9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,26 +94,38 @@ class Away:
         return np.sqrt(total / max(count, 1))
 
 
-def held_out(away: Away, h: Hypothesis) -> Trial:
+def held_out(away: Away, h: Hypothesis, near: Trial | None = None) -> Trial:
     """Log-likelihood of held-out recordings under a trained hypothesis, in blocks.
 
-    Physics, process noise and whitener are the trained ones. What belongs to one recording alone (first
-    state, calibrations) is fitted to it, by Gauss-Newton with secant slopes.
+    Physics and process noise are the trained ones. What belongs to one recording alone (first state,
+    calibrations) is fitted to it, by Gauss-Newton with secant slopes. So is the size of the innovations:
+    where no model is complete, the size in training says how well a model could bend, and a richer one
+    would be punished elsewhere for having bent further, however much nearer it comes there.
 
     Args:
         away: The held-out recordings.
         h: Trained hypothesis.
+        near: Another trial, whose first states may be the better ones to begin with: where a sensor leaves
+            something open, a rough guess ends elsewhere.
     """
     bench, R = away.judge.bench, len(away.first)
     own = np.tile(h.own.mean(axis=0), (R, 1))
     now = dataclasses.replace(h, x0=seat(bench, h.places, away.first), own=own)
     now = away.judge.with_process_noise(now, h.process_noise)
-    e = bench.innovations([now.lane(bench)])[0]
+    begun = [now]
+    if near is not None:
+        begun.append(dataclasses.replace(now, x0=near.adapted.seated(bench, h.places)))
+    tried = bench.innovations([b.lane(bench) for b in begun])
+    best = int(np.argmin(_costs(h, tried, bench.data.seen)))
+    now, e = begun[best], tried[best]
+    if not np.all(np.isfinite(e)):
+        lost = np.full_like(in_blocks(bench.data.seen, bench.data), DIVERGED)
+        return Trial(h, lost, now, np.full(e.shape[-1], np.inf))
     for _ in range(10):
         gained, now, e = _settle(bench, now, e)
         if gained < 0.05:
             break
-    blocks = in_blocks(h.whitener.log_densities(e, bench.data.seen), bench.data)
+    blocks = in_blocks(away.judge.judged(now, e).densities, bench.data)
     return Trial(h, blocks, now, away.short_runs(now, h.places))
 
 
@@ -123,6 +137,8 @@ def _settle(bench: Bench, h: Hypothesis, e: np.ndarray) -> tuple[float, Hypothes
     """
     seen, reach, local = bench.data.seen, 1e-6, len(h.local)
     nudged = bench.innovations([v.lane(bench) for v in _nudged(h, reach)])
+    if not np.all(np.isfinite(nudged)):
+        return 0.0, h, e
     w = h.whitener(e, seen)
     slopes = (h.whitener(nudged, seen) - w[None]) / reach
     steps = []
@@ -137,11 +153,16 @@ def _settle(bench: Bench, h: Hypothesis, e: np.ndarray) -> tuple[float, Hypothes
         for k in lengths
     ]
     tried = bench.innovations([m.lane(bench) for m in moved])
-    costs = np.nan_to_num(0.5 * np.sum(h.whitener(tried, seen) ** 2, axis=(1, 2, 3)), nan=np.inf)
+    costs = _costs(h, tried, seen)
     best, before = int(np.argmin(costs)), 0.5 * float(np.sum(w**2))
     if not costs[best] < before:
         return 0.0, h, e
     return before - float(costs[best]), moved[best], tried[best]
+
+
+def _costs(h: Hypothesis, innovations: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Half the squared size of each row of innovations (L, R, N, C); infinite where a run diverges."""
+    return np.nan_to_num(0.5 * np.sum(h.whitener(innovations, seen) ** 2, axis=(1, 2, 3)), nan=np.inf)
 
 
 def _nudged(h: Hypothesis, reach: float) -> list[Hypothesis]:

@@ -96,7 +96,7 @@ def views(
     position = np.asarray(savgol_filter(recording.channel(bending), 2 * half + 1, 2))
     place = "the deflection" if _subject(bending, mechanism) == "the joint" else bending
     found = (
-        _sides("speed", speed, unit, error, _turning(what)),
+        _sides("speed", speed, unit, error, _turning(what, unit)),
         _sides(
             "deflection",
             position,
@@ -137,14 +137,15 @@ def as_read(value: float, unit: str) -> tuple[float, str]:
     return value, unit
 
 
-def _turning(what: str) -> dict[str, str]:
+def _turning(what: str, unit: str) -> dict[str, str]:
+    verb = "turns" if unit.startswith("rad") else "moves"
     return {
-        "inside": f"while {what} turns slower than {{}}",
-        "outside": f"while {what} turns faster than {{}}",
-        "above": f"while {what} turns forwards faster than {{}}",
-        "below": f"while {what} turns backwards faster than {{}}",
-        "positive": f"while {what} turns forwards",
-        "negative": f"while {what} turns backwards",
+        "inside": f"while {what} {verb} slower than {{}}",
+        "outside": f"while {what} {verb} faster than {{}}",
+        "above": f"while {what} {verb} forwards faster than {{}}",
+        "below": f"while {what} {verb} backwards faster than {{}}",
+        "positive": f"while {what} {verb} forwards",
+        "negative": f"while {what} {verb} backwards",
     }
 
 

@@ -5,18 +5,21 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 
 from rotflex_jax.discover.calibrations import own_notes, settle
-from rotflex_jax.discover.decide import choose, describe, samples_of
+from rotflex_jax.discover.decide import choose, describe, on_equal_terms, samples_of
+from rotflex_jax.discover.fine import refined
+from rotflex_jax.discover.grow import is_physical, richer
 from rotflex_jax.discover.heldout import Away, held_out
 from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.locate import locate
+from rotflex_jax.discover.merge import merged
 from rotflex_jax.discover.moves import (
     begin,
     eliminate,
-    is_physical,
     ladder,
     remaining_rivals,
     with_each,
 )
+from rotflex_jax.discover.proposal import with_proposal
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Discovery, Ranked, Round
 from rotflex_jax.discover.room import make_room
@@ -25,12 +28,12 @@ from rotflex_jax.discover.score import Score, promising, scores
 from rotflex_jax.discover.stages import Scribe
 from rotflex_jax.discover.supermodel import Place, build
 from rotflex_jax.discover.verdict import judge_end
-from rotflex_jax.effects import CATALOG, candidates as first_family
 from rotflex_jax.effects.kinds import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import everywhere, torque_scale
 from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
 from rotflex_jax.mechanism import Exponential, Mechanism
+from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
@@ -62,7 +65,8 @@ def discover(
         train: Recordings to fit.
         test: Recordings that no fit sees; at most their own first state and offsets are adapted when
             likelihoods are compared, and only the first `n_init` samples for the errors reported.
-        candidates: (effect class, port) pairs; the catalogue's first family if None.
+        candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
+            answer to those of the flexible joint (`mechanism.roles`).
         rounds: Most effects to add.
         window_seconds: Length of the windows of the short held-out runs [s].
         progress: Called with a line of text at each stage.
@@ -82,7 +86,7 @@ def discover(
         raise InputError("All parameters are trusted, but discovery fits the model; release one.")
     data = stack(trained, model)
     torque = torque_scale(model.mechanism, data)
-    wanted = list(first_family() if candidates is None else candidates)
+    wanted = list(search_places(model.mechanism) if candidates is None else candidates)
     supermodel = build(model.mechanism, wanted, scales(model, trained, torque))
     noise = sensor_noise((*trained, *unseen), model)
     ports = tuple(everywhere(model.mechanism, 1.0))
@@ -111,15 +115,17 @@ def discover(
         listed = scores(judge, base.hypothesis)
         ranking = ranking or listed
         chosen = promising(listed, REFITTED)
+        chosen += [s for s in richer(judge, base.hypothesis) if s.place not in {c.place for c in chosen}]
         if not chosen:
             break
         say("refitting " + ", ".join(f"{s.place[0]} at {s.place[1]}" for s in chosen))
         grown = with_each(judge, base.hypothesis, chosen)
         trials = [
-            dataclasses.replace(held_out(away, h), place=s.place, numbers=len(s.start))
+            dataclasses.replace(held_out(away, h, base), place=s.place, numbers=len(s.start))
             for h, s in zip(grown, chosen, strict=True)
             if is_physical(judge, h, s.place)
         ]
+        trials = on_equal_terms(away, trials)
         for t in trials:
             say("  " + describe(t, base, data))
         winner, rivals = choose(trials, base, data, noise)
@@ -138,9 +144,15 @@ def discover(
     order = [p for p, _ in taken if p in final.places]
     order += sorted(set(final.places) - set(order), key=lambda p: -worth[p])
     final, order, own, left_out = settle(judge, away, final, order)
-    kept = remaining_rivals(judge, away, final, equivalents, [p for p in order if p in dict(taken)])
+    came = dict(taken)
+    kept = remaining_rivals(judge, away, final, equivalents, [p for p in order if p in came])
+    if one := merged(judge, away, final, order):
+        final, left_out, came = one.final, (*left_out, one.note), {**came, one.law: came[one.simpler]}
+        order = [one.law if p == one.simpler else p for p in order if p not in one.gone[1:]]
+        kept[one.law] = [*kept.get(one.simpler, []), *(one.gone if one.alike else ())]
+    final = refined(judge, final)
     say("simulating the held-out recordings")
-    trials = [held_out(away, h) for h in ladder(judge, final, order, own, passed)]
+    trials = [held_out(away, h, base) for h in ladder(judge, final, order, own, passed)]
     scribe = Scribe(judge, away, model.solver)
     stages = [scribe.stage(t, order[:k]) for k, t in enumerate(trials)]
     steps = [
@@ -150,10 +162,10 @@ def discover(
             equivalent=tuple(kept.get(place, [])),
             parameters=scribe.own_estimates(stage, place),
             stage=stage,
-            score=dict(taken)[place] if place in dict(taken) else worth[place],
+            score=came.get(place, worth.get(place, 0.0)),
             held_out_gain_nats=stage.log_likelihood - before.log_likelihood,
-            sentence=stages[-1].model.mechanism.effect(*place).sentence(),
-            equation=CATALOG[place[0]].equation,
+            sentence=stages[-1].model.mechanism.sentence(stages[-1].model.mechanism.effect(*place)),
+            equation=stages[-1].model.mechanism.effect(*place).equation,
         )
         for place, before, stage in zip(order, stages, stages[1:], strict=False)
     ]
@@ -161,7 +173,7 @@ def discover(
     residual = model.measured(longest) - stages[0].model.simulate_windows(longest, window_seconds)
     floor = dict(zip(model.mechanism.channels, noise.tolist(), strict=True))
     verdict, sentence = judge_end(steps, stages[-1], floor, ranking, unseen)
-    return Discovery(
+    found = Discovery(
         verdict=verdict,
         sentence=sentence,
         train=trained,
@@ -181,3 +193,4 @@ def discover(
         elapsed_s=time.perf_counter() - began,
         notes=(*own_notes(judge, away, trials[-1], own), *left_out),
     )
+    return with_proposal(found)

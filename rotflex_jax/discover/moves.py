@@ -6,14 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from rotflex_jax.discover.decide import TRAIN_NATS, TRAIN_Z, lead, told_apart
+from rotflex_jax.discover.grow import grown, in_place_of, with_effect, without
 from rotflex_jax.discover.heldout import Away, held_out, in_blocks
 from rotflex_jax.discover.hypothesis import Hypothesis, seat
 from rotflex_jax.discover.refit import Judge, levenberg_marquardt, refit
 from rotflex_jax.discover.score import Score
-from rotflex_jax.discover.supermodel import CALIBRATIONS, Place, SuperModel
-from rotflex_jax.discover.whiten import Whitener, log_likelihood
+from rotflex_jax.discover.supermodel import Place, SuperModel
+from rotflex_jax.discover.whiten import Whitener
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.kinds import Memory
 from rotflex_jax.fit.residuals import first_states
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Transform
@@ -50,31 +50,43 @@ def begin(judge: Judge, s: SuperModel, model: Model, trained: Sequence[Recording
 
 # Shares of the amplitude that the score test asks for at which a refit may start.
 SHARES = (1.0, 0.4, 0.1, 0.02)
+# A refit that gains less than this share of what the score test promised is stuck.
+STUCK = 0.5
 
 
 def with_each(judge: Judge, base: Hypothesis, promising: list[Score]) -> list[Hypothesis]:
-    """The base with each candidate added and refitted, never likelier without than with it.
+    """The base with each candidate added and refitted.
 
     First order overshoots where an effect is strongly nonlinear, so a refit starts at the likeliest of
-    several shares of the amplitude; one that still ends below the base starts again from next to nothing.
-    A law with memory takes the place of the simpler one that it contains: two of them in parallel would
-    be a third law.
+    several shares of the amplitude, and at the shape that a few steps take farthest. One that ends far
+    below what the score test promised starts again from next to nothing of every shape. A law with memory
+    takes the place of the simpler one that it contains: two of them in parallel would be a third law.
     """
     shapes = [
         (i, dataclasses.replace(s, start=x)) for i, s in enumerate(promising) for x in (s.start, *s.others)
     ]
-    starts = [[_grown(judge, base, s, share) for share in SHARES] for _, s in shapes]
+    starts = [[grown(judge, base, s, share) for share in SHARES] for _, s in shapes]
     likely = likelihoods(judge, [h for row in starts for h in row]).reshape(len(starts), -1)
     likeliest = [row[int(np.argmax(ll))] for row, ll in zip(starts, likely, strict=True)]
-    chosen, last = _best_shapes(judge, [i for i, _ in shapes], likeliest), {}
-    for (i, _), row in zip(shapes, starts, strict=True):
-        last.setdefault(i, row[-1])
-    refitted = refit(judge, chosen)
-    worse = [i for i, h in enumerate(refitted) if h.log_likelihood < base.log_likelihood]
-    if worse:
-        again = refit(judge, [last[i] for i in worse])
-        for i, h in zip(worse, again, strict=True):
-            refitted[i] = h if h.log_likelihood > base.log_likelihood else last[i]
+    refitted = refit(judge, _best_shapes(judge, [i for i, _ in shapes], likeliest))
+    gains = [h.log_likelihood - base.log_likelihood for h in refitted]
+    stuck = {i for i, gain in enumerate(gains) if gain < STUCK * max(promising[i].gain, 0.0)}
+    again = [(i, row[-1]) for (i, _), row in zip(shapes, starts, strict=True) if i in stuck]
+    fitted = refit(judge, [h for _, h in again]) if again else []
+    for (i, _), h in zip(again, fitted, strict=True):
+        refitted[i] = max(refitted[i], h, key=lambda x: x.log_likelihood)
+    # A law that contains another one is never worse: where a refit says so, it starts again from there.
+    below = [
+        (i, in_place_of(judge, refitted[j], [t.place], s, SHARES[-1]))
+        for i, s in enumerate(promising)
+        for j, t in enumerate(promising)
+        if s.place[1] == t.place[1]
+        and t.place[0] in CATALOG[s.place[0]].contains
+        and refitted[i].log_likelihood < refitted[j].log_likelihood
+    ]
+    fitted = refit(judge, [h for _, h in below]) if below else []
+    for (i, _), h in zip(below, fitted, strict=True):
+        refitted[i] = max(refitted[i], h, key=lambda x: x.log_likelihood)
     return refitted
 
 
@@ -96,72 +108,7 @@ def _best_shapes(judge: Judge, of: list[int], starts: list[Hypothesis]) -> list[
 def likelihoods(judge: Judge, hypotheses: list[Hypothesis]) -> np.ndarray:
     """Log-likelihoods of hypotheses as they are [nat], whitened anew; minus infinity where a run diverges."""
     es = judge.bench.innovations([h.lane(judge.bench) for h in hypotheses])
-    seen = judge.bench.data.seen
-    return np.array([log_likelihood(e, seen, judge.noise) if np.all(np.isfinite(e)) else -np.inf for e in es])
-
-
-def _grown(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesis:
-    """The hypothesis with one more effect, or with it in the place of simpler ones that it contains."""
-    s, (name, port) = judge.bench.supermodel, score.place
-    simpler = [(c, port) for c in CATALOG[name].contains if (c, port) in h.places]
-    if not simpler or not issubclass(CATALOG[name], Memory):
-        return _with(judge, h, score, share)
-    values, known = h.values(judge.bench).mean(axis=0), {}
-    for place in simpler:
-        names = [s.mechanism.parameter_names[i].rpartition(".")[2] for i in s.parameter_indices(place)]
-        known |= dict(zip(names, values[s.parameter_indices(place)], strict=True))
-        h = without(judge, h, place)
-    start = score.start.copy()
-    for k, i in enumerate(s.candidates[score.place].parameters):
-        parameter = s.mechanism.parameter_names[i].rpartition(".")[2]
-        if parameter in known:
-            # What the simpler law has already keeps its size; the share is for the rest.
-            amplitude = s.candidates[score.place].amplitudes[k]
-            start[k] = known[parameter] / (share if amplitude else 1.0)
-    return _with(judge, h, dataclasses.replace(score, start=start), share)
-
-
-def _with(judge: Judge, h: Hypothesis, score: Score, share: float) -> Hypothesis:
-    """The hypothesis with one more effect, at a share of the amplitude that the score test points to."""
-    s = judge.bench.supermodel
-    c = s.candidates[score.place]
-    specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
-    size = np.abs(np.array(c.probes[0])).max(axis=0)
-    start = np.where(c.amplitudes, share * score.start, score.start)
-    for k, spec in enumerate(specs):
-        # A bound at zero is the end of a logarithm: begin a little inside.
-        if np.isfinite(spec.lower):
-            start[k] = max(start[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
-    z = h.z.copy()
-    z[list(c.parameters)] = Transform.of(specs).unconstrain(start)
-    places = (*h.places, score.place)
-    return dataclasses.replace(
-        h, places=places, free=(*h.free, *c.parameters), z=z, x0=h.seated(judge.bench, places)
-    )
-
-
-def is_physical(judge: Judge, h: Hypothesis, place: Place) -> bool:
-    """Whether the effect's numbers lie in their physical range."""
-    s = judge.bench.supermodel
-    values = h.values(judge.bench).mean(axis=0)
-    specs = s.mechanism.parameter_specifications
-    return all(specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(place))
-
-
-def without(judge: Judge, h: Hypothesis, place: Place) -> Hypothesis:
-    """The hypothesis less one effect, its other numbers as they are."""
-    s = judge.bench.supermodel
-    gone = set(s.parameter_indices(place))
-    kept = [k for k, i in enumerate(h.local) if i not in gone]
-    places = tuple(p for p in h.places if p != place)
-    return dataclasses.replace(
-        h,
-        places=places,
-        x0=h.seated(judge.bench, places),
-        free=tuple(i for i in h.free if i not in gone),
-        local=tuple(h.local[k] for k in kept),
-        own=h.own[:, kept],
-    )
+    return np.array([judge.likelihood(e) for e in es])
 
 
 def eliminate(
@@ -179,10 +126,10 @@ def eliminate(
     while on_trial := [p for p in h.places if p not in added[-1:]]:
         rivals = refit(judge, [without(judge, h, p) for p in on_trial], turns=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(on_trial, rivals, strict=True)}
-        each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in CALIBRATIONS else 1) for p in worth}
+        each = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in s.calibrations else 1) for p in worth}
         surplus = {p: worth[p] - TRAIN_NATS - 0.5 * each[p] * np.log(samples) for p in worth}
         for p, r in zip(on_trial, rivals, strict=True):
-            if p in CALIBRATIONS:
+            if p in s.calibrations:
                 continue
             # What a few moments of the recording want, the recording does not.
             if lead(*(in_blocks(x.densities, judge.bench.data) for x in (h, r)))[1] < TRAIN_Z:
@@ -215,7 +162,7 @@ def remaining_rivals(
     for p, r in pairs:
         c = s.candidates[r]
         start = Score(r, 0.0, 0.0, np.array(c.probes[0]).max(axis=0), True, 1.0, 1.0)
-        swapped.append(_with(judge, without(judge, final, p), start, 0.4))
+        swapped.append(with_effect(judge, without(judge, final, p), start, 0.4))
     best = held_out(away, final)
     trials = [held_out(away, h) for h in refit(judge, swapped)]
     same = {pr for pr, t in zip(pairs, trials, strict=True) if not told_apart(best, t, judge.bench.data)}
@@ -234,10 +181,10 @@ def ladder(
     A rung that the search has been on, calibrations apart, starts from there. Calibrations that belong
     to recordings (`own`) are on every rung.
     """
-    below = []
+    below, calibrations = [], set(judge.bench.supermodel.calibrations)
     for k in range(len(order)):
         wanted = {*order[:k], *own}
-        known = [h for h in passed if wanted - set(CALIBRATIONS) == set(h.places) - set(CALIBRATIONS)]
+        known = [h for h in passed if wanted - calibrations == set(h.places) - calibrations]
         h = known[0] if known and wanted <= set(known[0].places) else final
         for place in set(h.places) - wanted:
             h = without(judge, h, place)

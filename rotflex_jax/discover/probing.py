@@ -52,17 +52,21 @@ def probe(bench: Bench, now: Lane, lanes: list[Lane], directions: list[Direction
         bench: Where hypotheses run.
         now: The hypothesis as it is.
         lanes: The hypothesis with absent candidates put in, at zero amplitude or with a closed gate.
-        directions: Along these candidates, for each lane.
+        directions: Along these candidates, for each lane; none of them sudden.
     """
-    s, structure = bench.supermodel, bench.supermodel.mechanism.structure
-    part = s.part(now.gates)
+    s = bench.supermodel
+    part, whole = s.part(now.gates), s.probed(now.gates)
+    structure = whole.mechanism.structure
     with double_precision():
-        present = jnp.array(part.states)
+        present = jnp.array([whole.states.index(i) for i in part.states])
         A = _run_slopes(part.mechanism.structure, bench.solver, cut(now, part), bench.on_device())
 
     def run(i: int) -> np.ndarray:
+        d = directions[i]
+        along = Directions(d.values[..., whole.parameters], d.x0, d.gates[:, whole.effects])
         with double_precision():
-            J = _probed(structure, bench.solver, lanes[i], present, A, directions[i], bench.on_device())
+            lane = cut(lanes[i], whole)
+            J = _probed(structure, bench.solver, lane, present, A, along, bench.on_device())
             return np.asarray(J)
 
     return np.stack(bench.each(run, list(range(len(lanes))), lambda _: ("probes", len(present))))

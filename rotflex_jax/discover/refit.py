@@ -70,6 +70,13 @@ class Judge:
         full[:, :, s.baseline_states] = K
         return list(full)
 
+    def likelihood(self, e: np.ndarray) -> float:
+        """Log-likelihood of innovations (R, N, C) under the whitener that they give [nat].
+
+        Minus infinity where a run diverges.
+        """
+        return log_likelihood(e, self.bench.data.seen, self.noise) if np.all(np.isfinite(e)) else -np.inf
+
     def judged(self, h: Hypothesis, e: np.ndarray) -> Hypothesis:
         """The hypothesis with the whitener and likelihood that its innovations (R, N, C) give."""
         seen = self.bench.data.seen
@@ -96,7 +103,7 @@ def normal_equations(h: Hypothesis, w: np.ndarray, W: np.ndarray) -> tuple[np.nd
     return H, g
 
 
-def _moved(h: Hypothesis, step: np.ndarray) -> Hypothesis:
+def moved(h: Hypothesis, step: np.ndarray) -> Hypothesis:
     """The hypothesis after a step in its coordinates."""
     shared, local = len(h.free), len(h.local)
     z = h.z.copy()
@@ -127,7 +134,7 @@ def levenberg_marquardt(judge: Judge, hypotheses: list[Hypothesis], steps: int =
             waiting[i] = (*normal_equations(h, w, W), 0.5 * float(np.sum(w**2)))
         still = []
         for _ in range(5):  # shorter and shorter steps until the cost falls
-            trials = {i: _moved(now[i], _step(H, g, damping[i])) for i, (H, g, _) in waiting.items()}
+            trials = {i: moved(now[i], _step(H, g, damping[i])) for i, (H, g, _) in waiting.items()}
             if not trials:
                 break
             order = list(trials)
@@ -187,12 +194,10 @@ def choose_process_noise(judge: Judge, h: Hypothesis, wide: bool = False) -> Hyp
 
 
 def _likeliest(judge: Judge, h: Hypothesis, trials: list[dict[str, float]]) -> Hypothesis:
-    seen = judge.bench.data.seen
     gains = judge.gains(h, trials)
     lane = h.lane(judge.bench)
     es = judge.bench.innovations([lane._replace(K=K) for K in gains])
-    scores = [log_likelihood(e, seen, judge.noise, 0) if np.all(np.isfinite(e)) else -np.inf for e in es]
-    best = int(np.argmax(scores))
+    best = int(np.argmax([judge.likelihood(e) for e in es]))
     return judge.judged(dataclasses.replace(h, K=gains[best], process_noise=trials[best]), es[best])
 
 

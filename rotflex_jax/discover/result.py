@@ -1,168 +1,25 @@
-"""What discovery returns: stages, rounds, ranking, places of failure, and a verdict."""
+"""What discovery returns: stages, rounds, ranking, places of failure, a verdict, what to do next."""
 
 import dataclasses
-import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from rotflex_jax.discover.findings import Ranked, Round, Stage, Where, plain
+from rotflex_jax.experiment import Experiment
 from rotflex_jax.model import Model
-from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 
+if TYPE_CHECKING:
+    from rotflex_jax.discover.learned_result import LearnedTorqueResult
+    from rotflex_jax.discover.photographs import Photographs
+
+# Name of the file beside a report that holds the input to play next.
+NEXT = "next_experiment.csv"
+
+__all__ = ["NEXT", "VERDICTS", "Discovery", "Ranked", "Round", "Stage", "Where"]
+
 VERDICTS = ("found", "nothing_missing", "ambiguous", "unexplained", "not_excited")
-
-
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """One model of the loop, fitted and scored on recordings it never saw.
-
-    Attributes:
-        model: Fitted model.
-        estimates: Parameters with intervals; calibrations (offset, bias) among them.
-        held_out_rmse: Channel -> error of one free run over the held-out recordings.
-        held_out_rmse_windows: Channel -> error of free runs that start anew every `window_seconds`.
-        simulated: Free run over each held-out recording (N, C).
-        windowed: The same, started anew every `window_seconds`.
-        window_seconds: [s].
-        process_noise: Port -> intensity of the process torque that the data ask for [(N m)^2 s]; small
-            where the model is right.
-        process_noise_nats: Log-likelihood that the process torque gains; near zero where the model is right.
-        log_likelihood: Of the held-out recordings [nat].
-    """
-
-    model: Model
-    estimates: tuple[Estimate, ...]
-    held_out_rmse: dict[str, float]
-    held_out_rmse_windows: dict[str, float]
-    simulated: tuple[np.ndarray, ...]
-    windowed: tuple[np.ndarray, ...]
-    window_seconds: float
-    process_noise: dict[str, float]
-    process_noise_nats: float
-    log_likelihood: float
-
-    def errors(self) -> dict[str, Any]:
-        """The two held-out errors as plain JSON."""
-        return {
-            "held_out_rmse": _plain(self.held_out_rmse),
-            "held_out_rmse_windows": {
-                "seconds": self.window_seconds,
-                **_plain(self.held_out_rmse_windows),
-            },
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class Round:
-    """One turn of the loop: an effect that was added.
-
-    Attributes:
-        effect: Name of the effect.
-        port: Where it acts.
-        equivalent: Other (effect, port) that these recordings cannot tell from it.
-        parameters: Its own estimates, by short name.
-        stage: The model with it, refitted and scored.
-        score: Penalised score that put it forward [nat].
-        held_out_gain_nats: Gain in held-out log-likelihood [nat].
-        sentence: What was found, in words.
-        equation: Its law.
-    """
-
-    effect: str
-    port: str
-    equivalent: tuple[tuple[str, str], ...]
-    parameters: dict[str, Estimate]
-    stage: Stage
-    score: float
-    held_out_gain_nats: float
-    sentence: str
-    equation: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
-        return {
-            "effect": self.effect,
-            "port": self.port,
-            "equivalent": [{"effect": e, "port": p} for e, p in self.equivalent],
-            "parameters": {n: e.to_dict() for n, e in self.parameters.items()},
-            **self.stage.errors(),
-            "evidence": {
-                "score": _number(self.score),
-                "held_out_gain_nats": _number(self.held_out_gain_nats),
-            },
-            "sentence": self.sentence,
-            "equation": self.equation,
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class Ranked:
-    """One candidate as the score test of the baseline saw it.
-
-    Attributes:
-        effect: Name of the effect.
-        port: Where it would act.
-        score: Penalised score [nat]; negative where the data speak against it.
-        excited: False where this recording could not have shown an effect of a plausible size.
-        unconfounded: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
-        smallest: Factor of a plausible size that would just have been seen.
-    """
-
-    effect: str
-    port: str
-    score: float
-    excited: bool
-    unconfounded: float
-    smallest: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
-        return {
-            "effect": self.effect,
-            "port": self.port,
-            "score": _number(self.score),
-            "excited": self.excited,
-            "unconfounded": _number(self.unconfounded),
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class Where:
-    """One statement of where the model fails.
-
-    Attributes:
-        statement: A plain sentence.
-        share: Share of the squared error that it speaks of.
-        p_value: Chance of such a share if the error were spread evenly.
-        kind: time, frequency, speed, deflection or reversal.
-        channel: Whose error.
-        edges: Bin edges [unit].
-        profile: Share of the squared error in each bin.
-        expected: Share of the samples (for frequency: of the noise) in each bin.
-        unit: Of the edges.
-    """
-
-    statement: str
-    share: float
-    p_value: float
-    kind: str
-    channel: str
-    edges: np.ndarray
-    profile: np.ndarray
-    expected: np.ndarray
-    unit: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
-        return {
-            "statement": self.statement,
-            "share": _number(self.share),
-            "p_value": _number(self.p_value),
-            "kind": self.kind,
-            "channel": self.channel,
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,6 +37,8 @@ class Discovery:
         where: Where the baseline fails.
         noise_floor: Channel -> deviation of the sensor noise.
         elapsed_s: Time taken [s].
+        notes: Remarks for a reader.
+        proposal: Where two effects remain: the standard input that tells them apart best.
     """
 
     verdict: str
@@ -193,6 +52,7 @@ class Discovery:
     noise_floor: dict[str, float]
     elapsed_s: float
     notes: tuple[str, ...] = ()
+    proposal: Experiment | None = None
 
     @property
     def model(self) -> Model:
@@ -216,31 +76,74 @@ class Discovery:
             "verdict": self.verdict,
             "sentence": self.sentence,
             "baseline": self.baseline.errors(),
-            "noise_floor": _plain(self.noise_floor),
+            "noise_floor": plain(self.noise_floor),
             "rounds": [r.to_dict() for r in self.rounds],
             "ranking": [r.to_dict() for r in self.ranking],
             "where": [w.to_dict() for w in self.where],
-            "next_experiment": None,
+            "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,
             "notes": list(self.notes),
             "elapsed_s": self.elapsed_s,
         }
 
-    def report(self, folder: str | Path) -> Path:
-        """Write `report.html` (self-contained) and `result.json` into a folder; returns the HTML path."""
+    def latent_torque(self, progress: Callable[[str], None] | None = None) -> "Photographs":
+        """Torques that the baseline and the final model lack, on a fitted and a held-out recording."""
+        from rotflex_jax.discover.photographs import photographs  # which knows of this module
+
+        longest = [max(group, key=lambda r: r.N) for group in (self.train, self.test)]
+        return photographs(self.baseline, self.final if self.rounds else None, longest, progress)
+
+    def learned_torque(
+        self, at: str = "hub", progress: Callable[[str], None] | None = None
+    ) -> "LearnedTorqueResult":
+        """A smooth map of position and speed learned on top of the final model, for what is unexplained.
+
+        Args:
+            at: Port of the torque.
+            progress: Called with a line of text at each stage.
+        """
+        from rotflex_jax.discover.learned import learn_torque  # which knows of this module
+
+        seconds = self.baseline.window_seconds
+        return learn_torque(self.model, self.train, self.test, at, window_seconds=seconds, progress=progress)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the final model as JSON, with its estimates; `Model.load` reads the model."""
+        from rotflex_jax.export.files import Saved, save
+
+        seen = self.train[0]
+        return save(Saved(self.model, self.final.estimates, Ts=seen.Ts, n_init=seen.n_init), path)
+
+    def next_experiment(self, **changes: Any) -> Experiment | None:
+        """Design the input that tells the first effect found from its equal; None where it has none.
+
+        The model, its noise and the machine's limits are those of the recordings: no more voltage, slew or
+        deflection than they hold.
+
+        Args:
+            changes: Other arguments of `rotflex_jax.next_experiment`, its `limits` for instance.
+        """
+        from rotflex_jax.discover.proposal import proposed  # it needs this module
+
+        return proposed(self, **changes)
+
+    def report(self, folder: str | Path, *, learned: bool | None = None) -> Path:
+        """Write `report.html` (self-contained) and `result.json` into a folder; returns the HTML path.
+
+        Where the verdict is ambiguous, the input to play next lies beside them as a file.
+
+        Args:
+            folder: Where to write.
+            learned: Whether to learn a torque for what is left, which takes about as long as a round; where
+                the verdict is `unexplained` if None.
+        """
         from rotflex_jax.report import write_report  # the layer above, on request
 
-        return write_report(self, Path(folder))
+        page = write_report(self, Path(folder), learned=learned)
+        if self.proposal is not None:
+            self.proposal.save_csv(Path(folder) / NEXT)
+        return page
 
     def __str__(self) -> str:
         lines = [self.sentence]
         lines += [f"  {i}. {r.sentence}" for i, r in enumerate(self.rounds, 1)]
         return "\n".join(lines)
-
-
-def _number(value: float) -> float | None:
-    """A float that JSON can carry."""
-    return float(value) if math.isfinite(value) else None
-
-
-def _plain(values: dict[str, float]) -> dict[str, float | None]:
-    return {k: _number(v) for k, v in values.items()}

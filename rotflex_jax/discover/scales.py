@@ -36,6 +36,20 @@ def motion(
     return out
 
 
+def _known_motion(model: Model, recording: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Motion of every port: as measured, or where no sensor tells it, as the model has it."""
+    measured = motion(model.mechanism, model.measured(recording).astype(float), recording.Ts)
+    silent = {port: v for port, v in model.mechanism.port_vectors.items() if port not in measured}
+    if not silent:
+        return measured
+    n = len(model.mechanism.coordinates)
+    states = model.simulate_states(recording)
+    if not np.all(np.isfinite(states)):
+        return measured
+    q, dq = states[:, :n], states[:, n : 2 * n]
+    return measured | {port: (q @ np.array(v), dq @ np.array(v)) for port, v in silent.items()}
+
+
 def at_port(mechanism: Mechanism, port: str) -> tuple[float, float]:
     """Stiffness of the linear springs at a port [N m/rad], and the inertia that a torque there meets."""
     springs = [e for e in mechanism.effects if isinstance(e, Linear) and e.at == port]
@@ -55,7 +69,7 @@ def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict
     voltage = max(float(np.max(np.abs(r.u))) for r in recordings)
     mechanism = model.mechanism
     out = {}
-    found = [motion(mechanism, model.measured(r).astype(float), r.Ts) for r in recordings]
+    found = [_known_motion(model, r) for r in recordings]
     for port in mechanism.port_vectors:
         known = [m[port] for m in found if port in m]
         speed = max((float(np.sqrt(np.mean(s**2))) for _, s in known), default=1.0)

@@ -12,9 +12,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Linear, Memory, Scale, Sensing
+from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Gear, Linear, Memory, Scale, Sensing
+from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import effects_of
+from rotflex_jax.mechanism.roles import calibrations as places_of_calibrations
 
 Place = tuple[str, str]  # (effect name, port)
 
@@ -30,6 +32,7 @@ class Candidate:
         probes: Alternatives (shapes), each a list of parameter vectors tried together.
         amplitudes: For each parameter, whether it is an amplitude.
         one_sided: Whether a negative amplitude would not be physical.
+        sudden: Whether a small amplitude does nothing yet: what it does is learnt from runs at its sizes.
     """
 
     place: Place
@@ -38,11 +41,7 @@ class Candidate:
     probes: tuple[tuple[tuple[float, ...], ...], ...]
     amplitudes: tuple[bool, ...]
     one_sided: bool
-
-
-# What every recording may need to be read rightly, whatever the physics: fitted from the start, each
-# recording has its own, and reported as found where it matters.
-CALIBRATIONS: tuple[Place, ...] = (("voltage_offset", "input"), ("sensor_bias", "alpha"))
+    sudden: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +70,7 @@ class SuperModel:
         mechanism: With calibrations and candidates.
         calibrations: Places of the calibrations that were added.
         candidates: By place.
-        parts: Parts formed so far, by the costly candidates in them.
+        parts: Parts formed so far, by the effects left out.
     """
 
     baseline: Mechanism
@@ -97,12 +96,20 @@ class SuperModel:
     def part(self, gates: np.ndarray) -> Part:
         """The super-model without the costly candidates whose gate (..., E) is zero."""
         on = frozenset(i for i in self.costly if np.any(gates[..., i] != 0))
-        if on not in self.parts:
-            self.parts[on] = self._part(on)
-        return self.parts[on]
+        return self._without(self.costly - on)
 
-    def _part(self, on: frozenset[int]) -> Part:
-        kept = [i for i in range(len(self.mechanism.effects)) if i not in self.costly or i in on]
+    def probed(self, gates: np.ndarray) -> Part:
+        """The super-model without the sudden candidates whose gate (E,) is zero."""
+        sudden = [c.effect for c in self.candidates.values() if c.sudden]
+        return self._without(frozenset(i for i in sudden if gates[i] == 0))
+
+    def _without(self, left_out: frozenset[int]) -> Part:
+        if left_out not in self.parts:
+            self.parts[left_out] = self._part(left_out)
+        return self.parts[left_out]
+
+    def _part(self, left_out: frozenset[int]) -> Part:
+        kept = [i for i in range(len(self.mechanism.effects)) if i not in left_out]
         effects = tuple(self.mechanism.effects[i] for i in kept)
         mechanism = dataclasses.replace(self.mechanism, effects=effects)
         names = {n: k for k, n in enumerate(self.mechanism.parameter_names)}
@@ -154,10 +161,10 @@ class SuperModel:
 def state_rows(mechanism: Mechanism) -> dict[int, tuple[int, ...]]:
     """Effects with states of their own -> places of these in the state."""
     rows, at = {}, 2 * len(mechanism.coordinates)
-    # The state holds those of linear effects first, then memories.
-    for kind in (Linear, Memory):
+    # The state holds those of linear effects first, then those of a gear, then memories.
+    for kind in (Linear, Gear, Memory):
         for i, e in effects_of(mechanism, kind):
-            count = e.order if isinstance(e, Linear) else 1
+            count = 1 if isinstance(e, Memory) else e.order
             if count:
                 rows[i] = tuple(range(at, at + count))
                 at += count
@@ -177,13 +184,19 @@ def build(
     present = {(e.name, e.at) for e in baseline.effects}
     mechanism = baseline
     calibrations, candidates = [], {}
-    for place in CALIBRATIONS:
+    # Fitted from the start, each recording has its own, and reported as found where it matters.
+    for place in places_of_calibrations(baseline):
         cls = CATALOG[place[0]]
         if place not in present and _has(baseline, cls, place[1]):
             mechanism = mechanism + cls(at=place[1])
             calibrations.append(place)
     for cls, port in wanted:
         place = (cls.name, port)
+        if cls.name not in CATALOG:
+            raise InputError(
+                f"{cls.__name__} is to be tried, but is not in the catalogue of effects; put @register above "
+                "it."
+            )
         if place in present or place in calibrations or not _has(baseline, cls, port):
             continue
         names = tuple(cls.declared())
@@ -201,6 +214,7 @@ def build(
             probes,
             tuple(n in cls.amplitudes for n in names),
             all(max(s.lower, s.physical[0]) >= 0 for n, s in cls.declared().items() if n in cls.amplitudes),
+            sudden=issubclass(cls, Gear),
         )
     return SuperModel(baseline, mechanism, tuple(calibrations), candidates)
 
@@ -210,4 +224,7 @@ def _has(mechanism: Mechanism, cls: type[Effect], port: str) -> bool:
         return port == "input"
     if issubclass(cls, Memory) and cls.driven_by == "motor" and not mechanism.has_motor(port):
         return False
+    if issubclass(cls, Gear):
+        known = not any(isinstance(e, Gear) for e in mechanism.effects)
+        return known and mechanism.has_motor(port) and mechanism.has_inertia(port)
     return port in (mechanism.channels if issubclass(cls, Sensing) else mechanism.port_vectors)

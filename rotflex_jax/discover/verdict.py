@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from rotflex_jax.discover.result import Round, Stage
 from rotflex_jax.discover.score import Score
 from rotflex_jax.recording import Recording
@@ -9,6 +11,11 @@ from rotflex_jax.recording import Recording
 # The model explains the record if short held-out runs come this near to the sensor noise and process
 # torques gain no more than this per measured number [nat].
 NEAR_FLOOR, NATS_PER_NUMBER = 1.5, 0.07
+
+
+def near_floor(windows: np.ndarray, noise: np.ndarray) -> bool:
+    """Whether short held-out runs come as near to the sensor noise as those of a right model do."""
+    return bool(np.all(windows < NEAR_FLOOR * noise))
 
 
 def judge_end(
@@ -29,11 +36,10 @@ def judge_end(
     """
     ratios = {c: final.held_out_rmse_windows[c] / floor[c] for c in floor}
     numbers = sum(r.N for r in test) * len(floor)
-    explained = all(r < NEAR_FLOOR for r in ratios.values()) and (
-        final.process_noise_nats < NATS_PER_NUMBER * numbers
-    )
+    near = near_floor(np.array([final.held_out_rmse_windows[c] for c in floor]), np.array([*floor.values()]))
+    explained = near and final.process_noise_nats < NATS_PER_NUMBER * numbers
     seconds = final.window_seconds
-    left = ", ".join(f"{c} {r:.2f}" for c, r in ratios.items())
+    left = ", ".join(f"{c} {_times(r)}" for c, r in ratios.items())
     reached = f"the held-out error over {seconds:g} s is {left} times the sensor noise"
     names = " and ".join(f"{r.effect.replace('_', ' ')} at the {r.port}" for r in rounds)
     visible = [s for s in ranking if s.excited]
@@ -55,3 +61,8 @@ def judge_end(
         )
     hidden = f"; {unseen} of {len(ranking)} candidates could not have shown" if unseen else ""
     return "nothing_missing", f"Nothing is missing: {reached}{hidden}."
+
+
+def _times(ratio: float) -> str:
+    """A ratio in two decimals, or where those mean nothing, in three digits."""
+    return f"{ratio:.2f}" if ratio < 100 else f"{ratio:.3g}"

@@ -4,11 +4,13 @@ To add one, derive a frozen dataclass from a kind (`kinds.py`), decorate it with
 import it here.
 """
 
+from rotflex_jax.effects.backlash import Backlash
 from rotflex_jax.effects.bouc_wen import BoucWen
-from rotflex_jax.effects.catalogue import CATALOG, candidates, register
+from rotflex_jax.effects.catalogue import CATALOG, register
 from rotflex_jax.effects.cogging import Cogging
 from rotflex_jax.effects.coulomb import Coulomb, CoulombAsymmetric
 from rotflex_jax.effects.cubic_spring import CubicSpring
+from rotflex_jax.effects.current_drive import CurrentDrive
 from rotflex_jax.effects.dahl import Dahl
 from rotflex_jax.effects.dead_zone import DeadZone
 from rotflex_jax.effects.delay import Delay
@@ -22,6 +24,7 @@ from rotflex_jax.effects.kinds import (
     DryFriction,
     Effect,
     Force,
+    Gear,
     Linear,
     Memory,
     Probe,
@@ -30,6 +33,7 @@ from rotflex_jax.effects.kinds import (
     Stamp,
 )
 from rotflex_jax.effects.lag import Lag
+from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.effects.lugre import LuGre
 from rotflex_jax.effects.motor import Motor
 from rotflex_jax.effects.quadratic_drag import QuadraticDrag
@@ -43,6 +47,8 @@ from rotflex_jax.effects.sensor_gain import SensorGain
 from rotflex_jax.effects.spring import Spring
 from rotflex_jax.effects.stribeck import Stribeck
 from rotflex_jax.effects.viscous import Viscous
+from rotflex_jax.effects.viscous_asymmetric import ViscousAsymmetric
+from rotflex_jax.effects.voltage_drift import VoltageDrift
 from rotflex_jax.effects.voltage_offset import VoltageOffset
 
 __all__ = [
@@ -52,6 +58,7 @@ __all__ = [
     "Force",
     "DryFriction",
     "Memory",
+    "Gear",
     "Actuation",
     "Sensing",
     "Stamp",
@@ -61,12 +68,12 @@ __all__ = [
     # catalogue
     "CATALOG",
     "register",
-    "candidates",
     # linear
     "Inertia",
     "Spring",
     "Viscous",
     "Motor",
+    "CurrentDrive",
     "SecondMode",
     # dry friction
     "Coulomb",
@@ -74,11 +81,15 @@ __all__ = [
     "Stribeck",
     # force
     "QuadraticDrag",
+    "ViscousAsymmetric",
     "CubicSpring",
     "QuadraticSpring",
     "Gravity",
     "Cogging",
     "JointPlay",
+    "LearnedTorque",
+    # gear
+    "Backlash",
     # with memory
     "Dahl",
     "LuGre",
@@ -88,6 +99,7 @@ __all__ = [
     "DeadZone",
     "Saturation",
     "VoltageOffset",
+    "VoltageDrift",
     "Delay",
     "Lag",
     # sensing

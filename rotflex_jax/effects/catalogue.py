@@ -31,13 +31,3 @@ def register(effect: EffectClass) -> EffectClass:
         )
     CATALOG[effect.name] = effect
     return effect
-
-
-def candidates() -> list[tuple[type[Effect], str]]:
-    """Every (class, port) that a search tries when it is not told otherwise.
-
-    Returns:
-        Pairs in alphabetical order of the effects; which ports an effect is tried at is its
-        class attribute `searched`.
-    """
-    return [(CATALOG[name], port) for name in sorted(CATALOG) for port in CATALOG[name].searched]

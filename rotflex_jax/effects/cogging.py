@@ -38,6 +38,7 @@ class Cogging(Force):
     amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")
     contains: ClassVar[tuple[str, ...]] = ("gravity",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm")
+    turning: ClassVar[bool] = True
 
     sine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the sine")
     cosine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the cosine")

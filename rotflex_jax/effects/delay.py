@@ -18,15 +18,17 @@ class Delay(Actuation):
 
         v(t) = u(t - time)
 
-    Exact in the mean over each sample, also where the delay is no multiple of the sampling period.
-    Before the recording the command counts as its first value. Not to be told from a first-order
-    lag by slow inputs.
+    Exact in the mean and in the first moment, also where the delay is no multiple of the sampling
+    period: what is held over the samples moves a mass as far as what jumps inside them. Before the
+    recording the command counts as its first value. Not to be told from a first-order lag by slow
+    inputs.
 
     Args:
         at: Always `input`.
         time: Delay [s].
 
-    Source: L. Ljung, System Identification, 2nd ed., 1999, section 4.2 (`nk`).
+    Source: L. Ljung, System Identification, 2nd ed., 1999, section 4.2 (`nk`); Laakso and others,
+    Splitting the unit delay, 1996, equation 42 (Lagrange interpolation) with N = 2.
     """
 
     name: ClassVar[str] = "delay"
@@ -38,14 +40,17 @@ class Delay(Actuation):
     time: float = parameter(0.004, unit="s", lower=0.0, meaning="delay")
 
     def drive(self, voltage: jax.Array, Ts: Scalar) -> jax.Array:
-        """Voltage [V] that is left, its mean over each sample."""
+        """Voltage [V] to hold over each sample."""
         # A delay of n + f samples: the older of two neighbouring commands fills the share f of a sample.
         late = self.time / Ts
         whole = jnp.floor(late)
         part = late - whole
         newer = jnp.arange(voltage.shape[0]) - whole.astype(int)
         command = lambda k: voltage[jnp.maximum(k, 0)]  # noqa: E731
-        return part * command(newer - 1) + (1 - part) * command(newer)
+        mean = part * command(newer - 1) + (1 - part) * command(newer)
+        # The older one comes first, which a mean forgets: a pulse and its opposite one sample later.
+        late_half = part * (1 - part) / 2
+        return mean - late_half * (command(newer) - 2 * command(newer - 1) + command(newer - 2))
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:

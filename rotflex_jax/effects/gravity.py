@@ -36,6 +36,7 @@ class Gravity(Force):
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm")
     amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm")
+    turning: ClassVar[bool] = True
 
     sine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the sine")
     cosine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the cosine")

@@ -1,4 +1,4 @@
-"""The six kinds of effect. A new effect is a frozen dataclass that derives from one of them.
+"""The seven kinds of effect. A new effect is a frozen dataclass that derives from one of them.
 
 Sign: a law returns the torque that acts *on* the port in its positive direction, except a friction
 `limit`, which is the (non-negative) level of the torque that opposes sliding.
@@ -8,14 +8,14 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, Self
 
 import jax
 
+from rotflex_jax.effects.stamp import Scalar, Stamp
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import Specification, specifications
 
-Scalar = jax.Array | float
 Probe = Mapping[str, float]
 Drive = Literal["voltage", "motor"]
 
@@ -59,6 +59,7 @@ class Effect:
     contains: ClassVar[tuple[str, ...]] = ()
     # Ports a search tries it at when not told otherwise; none for what a model has from the start.
     searched: ClassVar[tuple[str, ...]] = ()
+    turning: ClassVar[bool] = False  # a law of an angle: no meaning where a port moves along a line
 
     at: str
 
@@ -140,24 +141,6 @@ class Effect:
         return next(label for base, label in KIND_LABELS.items() if issubclass(cls, base))
 
 
-class Stamp(NamedTuple):
-    """What a linear effect writes into the equations of motion at its port `p`.
-
-    `M += inertia p p'`, `D += damping p p'`, `K += stiffness p p'`, torque `drive voltage` at `p`.
-    A linear effect with states `z` of its own adds `z' = own z + from_speed p.dq + from_voltage v`
-    (lists of length m, `own` m by m) and the torque `torque . z` at `p`.
-    """
-
-    inertia: Scalar = 0.0
-    damping: Scalar = 0.0
-    stiffness: Scalar = 0.0
-    drive: Scalar = 0.0
-    own: tuple[tuple[Scalar, ...], ...] = ()
-    from_speed: tuple[Scalar, ...] = ()
-    from_voltage: tuple[Scalar, ...] = ()
-    torque: tuple[Scalar, ...] = ()
-
-
 class Linear(Effect):
     """Enters the linear part, which the step integrates exactly."""
 
@@ -182,6 +165,20 @@ class Force(Effect):
         raise NotImplementedError
 
 
+class Gear(Effect):
+    """A gear that lets the motor's rotor turn on its own between two stops, where port and rotor are one."""
+
+    order: ClassVar[int] = 2  # angle and speed of the rotor against the port
+
+    def stops(self) -> Scalar:
+        """Angle [rad] >= 0 from the middle to each stop; none at zero."""
+        raise NotImplementedError
+
+    def rotor(self) -> Scalar:
+        """The rotor's part of the inertia that is entered at the port, above 0 and below 1."""
+        raise NotImplementedError
+
+
 class DryFriction(Effect):
     """Set-valued friction: any torque within the level holds the port, sliding meets the level."""
 
@@ -200,8 +197,7 @@ class Memory(Effect):
     search sees the torque's slope along them there, `z` as it is.
     """
 
-    # What the last argument of its laws is: the motor's voltage [V], or the torque [N m] that the
-    # linear motors at its port give.
+    # The last argument of its laws: the motor's voltage [V], or the torque [N m] of the motors at its port.
     driven_by: ClassVar[Drive] = "voltage"
 
     def initial(self) -> float:
@@ -235,6 +231,9 @@ class Actuation(Effect):
 class Sensing(Effect):
     """Output to output: what the sensor of one channel makes of the true value."""
 
+    # True for an error that shows only against another sensor.
+    relative: ClassVar[bool] = False
+
     def measure(self, value: Scalar) -> Scalar:
         """Reading [unit of the channel] for a true value."""
         raise NotImplementedError
@@ -244,6 +243,7 @@ KIND_LABELS: dict[type, str] = {
     Linear: "linear",
     Force: "force",
     DryFriction: "dry friction",
+    Gear: "gear",
     Memory: "with memory",
     Actuation: "actuation",
     Sensing: "sensing",

@@ -18,9 +18,9 @@ class Lag(Actuation):
 
         time dv/dt = u - v
 
-    Exact in the mean over each sample. The recording's first command counts as having been there
-    for ever. Not to be told from a pure delay by slow inputs: both turn the phase, only the lag
-    takes amplitude.
+    Exact in the mean and in the first moment over each sample. The recording's first command counts
+    as having been there for ever. Not to be told from a pure delay by slow inputs: both turn the
+    phase, only the lag takes amplitude.
 
     Args:
         at: Always `input`.
@@ -38,14 +38,19 @@ class Lag(Actuation):
     time: float = parameter(0.006, unit="s", lower=1e-7, meaning="time constant")
 
     def drive(self, voltage: jax.Array, Ts: Scalar) -> jax.Array:
-        """Voltage [V] that is left, its mean over each sample."""
-        fade = jnp.exp(-Ts / self.time)
-        behind = -self.time / Ts * jnp.expm1(-Ts / self.time)  # mean of exp(-t / time) over a sample
+        """Voltage [V] to hold over each sample."""
+        slow = self.time / Ts
+        fade = jnp.exp(-1 / slow)
+        behind = -slow * jnp.expm1(-1 / slow)  # mean of exp(-t / time) over a sample
+        # Its first moment about the middle of the sample.
+        early = slow * (behind - fade) - behind / 2
 
-        def sample(v: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return u + fade * (v - u), u + behind * (v - u)
+        def sample(v: jax.Array, u: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+            return u + fade * (v - u), (u + behind * (v - u), early * (v - u))
 
-        return jax.lax.scan(sample, voltage[0], voltage)[1]
+        mean, moment = jax.lax.scan(sample, voltage[0], voltage)[1]
+        # A mean forgets when in the sample it came: a pulse and its opposite one sample later.
+        return mean - jnp.diff(moment, prepend=0.0)
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:

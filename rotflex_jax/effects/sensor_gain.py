@@ -31,6 +31,7 @@ class SensorGain(Sensing):
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("error",)
     searched: ClassVar[tuple[str, ...]] = ("alpha",)
+    relative: ClassVar[bool] = True
 
     # The bound keeps the gain positive: a sensor that reads nothing is not out of calibration.
     error: float = parameter(0.0, unit="", typical=0.05, lower=-0.9, meaning="relative error of the gain")

@@ -3,12 +3,12 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax.fit.covariance import sandwich
+from rotflex_jax.fit.fitted import Fit
 from rotflex_jax.fit.residuals import Coordinates, Data
-from rotflex_jax.model import Fit, Model
+from rotflex_jax.model import Model
 from rotflex_jax.parameters import Estimate
 
 
@@ -32,31 +32,37 @@ def report(
     residual = np.asarray(e).reshape(R * N, C)[seen]
     slopes = -np.asarray(J).reshape(R * N, C, len(index))[seen]
     segments = np.repeat(np.arange(R), N)[seen]
-    values = np.asarray(coordinates.split(jnp.asarray(flat))[0])
-    fitted = m.with_values(values.mean(axis=0))
+    each = range(coordinates.owning)
+    z = np.tile(flat[: coordinates.parameters], (len(each), 1))
+    for i in coordinates.local:
+        z[:, i] = [flat[coordinates.local_index(r, i)] for r in each]
+    values, stretch = coordinates.transform.physical(z)
     covariance = sandwich(slopes, residual, segments)
+    row_of = {int(k): row for row, k in enumerate(index)}
     estimates, free, places = [], [], []
-    dp = coordinates.transform.physical(flat[: coordinates.parameters])[1]
+    local: dict[str, tuple[Estimate, ...]] = {}
     for i, (name, spec) in enumerate(zip(m.parameter_names, m.parameter_specifications, strict=True)):
         value = float(values[:, i].mean())
         if name in m.trusted:
             nan = float("nan")
             estimates.append(Estimate(name, value, nan, (nan, nan), spec.unit, free=False))
             continue
-        own = [coordinates.local_index(r, i) for r in range(R)] if i in coordinates.local else [i]
-        rows = [int(np.flatnonzero(index == k)[0]) for k in own]
-        weights = np.array([dp[i] for _ in own]) / len(own)
+        owned = i in coordinates.local
+        rows = [row_of[coordinates.local_index(r, i)] for r in each] if owned else [row_of[i]]
+        weights = stretch[: len(rows), i] / len(rows)
         std = float(np.sqrt(weights @ covariance[np.ix_(rows, rows)] @ weights))
         estimates.append(Estimate.of(name, value, std, spec))
+        if owned:
+            stds = np.abs(stretch[:, i]) * np.sqrt(np.diag(covariance)[rows])
+            pairs = zip(values[:, i].tolist(), stds.tolist(), strict=True)
+            local[name] = tuple(Estimate.of(name, own, deviation, spec) for own, deviation in pairs)
         free.append(name)
-        places.append((rows[0], dp[i]))
-    rows = [r for r, _ in places]
-    D = np.array([d for _, d in places])
-    natural = covariance[np.ix_(rows, rows)] * np.outer(D, D)
+        places.append((rows, weights))
+    natural = np.array([[a @ covariance[np.ix_(i, k)] @ b for k, b in places] for i, a in places])
     deviation = np.sqrt(np.mean(residual**2, axis=0)) * scale
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
     return Fit(
-        model=dataclasses.replace(model, mechanism=fitted),
+        model=dataclasses.replace(model, mechanism=m.with_values(values.mean(axis=0))),
         cost=cost,
         status=status,
         parameters=tuple(estimates),
@@ -65,7 +71,8 @@ def report(
         free_names=tuple(free),
         steps=steps,
         history=tuple(history),
-        weakest=_weakest(slopes[:, :, rows], free),
+        weakest=_weakest(np.stack([slopes[:, :, rows].sum(axis=2) for rows, _ in places], axis=2), free),
+        local=local,
     )
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import optimistix as optx
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.estimates import report
+from rotflex_jax.fit.fitted import Fit
 from rotflex_jax.fit.residuals import (
     Coordinates,
     Data,
@@ -22,7 +23,7 @@ from rotflex_jax.fit.residuals import (
 )
 from rotflex_jax.mechanism import Mechanism, Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import equations
-from rotflex_jax.model import Fit, Model
+from rotflex_jax.model import Model, window_starts
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 
@@ -68,6 +69,8 @@ def fit(
     *,
     process_noise: Mapping[str, float] | None = None,
     local: Sequence[str] = (),
+    first: Literal["fitted", "measured"] = "fitted",
+    window_seconds: float | None = None,
     max_steps: int = 60,
     progress: Progress | None = None,
     throw: bool = False,
@@ -87,12 +90,17 @@ def fit(
         recordings: One or several; parameters are common, first states are each recording's own.
         process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for a free run.
         local: Full names of parameters that each recording has for itself, an offset for instance.
+        first: Whether first states are fitted, or held at what the first `n_init` samples tell: where
+            nothing pulls the machine back, a free first position hides a drift of the model.
+        window_seconds: Begin anew every so often [s], each time with a first state of its own and with
+            memories at rest: the numbers with which free runs of that length are best.
         max_steps: Most iterations of each stage.
         progress: Called with a line of text now and then.
         throw: Raise instead of reporting a failure in `status`.
 
     Returns:
-        Fit, whose model has the fitted numbers (of a local parameter: the mean over recordings).
+        Fit, whose model has the fitted numbers, of a local parameter the mean over recordings;
+        `local` has each recording's own and `model_of` the model with them.
 
     Raises:
         InputError: Nothing to fit, or a local name that is not a free parameter.
@@ -111,7 +119,8 @@ def fit(
     if not m.free_names:
         raise InputError("All parameters are trusted, but a fit needs a free one; release one.")
     indices = tuple(names.index(n) for n in local)
-    coordinates = Coordinates(m.structure, indices, len(listed))
+    listed, windows_of = _windows(listed, window_seconds)
+    coordinates = Coordinates(m.structure, indices, len(listed), windows_of)
     data = stack(listed, model)
     say = progress or (lambda _: None)
     noise = sensor_noise(listed, model)
@@ -123,8 +132,8 @@ def fit(
     free = [names.index(n) for n in m.free_names]
     index = np.array(
         [i for i in free if i not in indices]
-        + [coordinates.local_index(r, i) for r in range(len(listed)) for i in indices]
-        + [i for r in range(len(listed)) for i in coordinates.state_index(r)]
+        + [coordinates.local_index(r, i) for r in range(coordinates.owning) for i in indices]
+        + [i for r in range(len(listed)) for i in coordinates.state_index(r) if first == "fitted"]
     )
     history, steps, status, scale = [], 0, "converged", noise
     with double_precision():
@@ -134,6 +143,11 @@ def fit(
             last = number == len(stages) - 1
             for _ in range(3 if last else 1):
                 now = m.with_values(np.asarray(coordinates.split(jnp.asarray(flat))[0]).mean(axis=0))
+                if first == "measured":
+                    there = dataclasses.replace(model, mechanism=now)
+                    for r, recording in enumerate(listed):
+                        start = there._start(recording)
+                        flat[coordinates.state_index(r)] = start[: coordinates.states]
                 K = np.stack([kalman_gains(now, [stage or {}], noise, float(Ts))[0] for Ts in data.Ts])
                 gates = jnp.ones(len(m.effects), jnp.float64)
                 args = jax.tree.map(jnp.asarray, (flat, index, gates, data, K, scale))
@@ -150,6 +164,22 @@ def fit(
         if throw and status != "converged":
             raise RuntimeError(f"The fit did not converge: {status}.")
         return report(model, coordinates, flat, index, data, scale, e, J, status, steps, history)
+
+
+def _windows(recordings: list[Recording], seconds: float | None) -> tuple[list[Recording], tuple[int, ...]]:
+    """The recordings cut into windows, and of which recording each is; whole where no length is given."""
+    if seconds is None:
+        return recordings, ()
+    if not seconds > 0:
+        raise InputError(
+            f"Argument `window_seconds` is {seconds}, but windows need a positive length; give for "
+            "instance 2.0, or None for whole recordings."
+        )
+    cut = []
+    for number, r in enumerate(recordings):
+        starts = window_starts(r, seconds)[0].tolist()
+        cut += [(r.slice(i, j), number) for i, j in zip(starts, [*starts[1:], r.N], strict=True)]
+    return [part for part, _ in cut], tuple(number for _, number in cut)
 
 
 def everywhere(m: Mechanism, intensity: float) -> dict[str, float]:
@@ -187,14 +217,14 @@ def _levenberg_marquardt(
         return flat, cost, 0, "diverged: the model error at the start is not finite"
     used, status = 0, f"stopped after {max_steps} steps"
     while used < max_steps:
-        count = min(6, max_steps - used)
+        count = min(16, max_steps - used)
         new, new_cost, steps, result = _some_steps(problem, moved, args, count)
         used += int(steps)
         gain = cost - float(new_cost)
         if gain > 0:
             moved, cost = new, float(new_cost)
         say(f"fit: {used} steps, cost {cost:.1f}")
-        if not gain > NATS and count == 6:
+        if not gain > NATS and count == 16:
             bad = result not in (optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
             status = str(result) if bad else "converged"
             break

@@ -51,12 +51,24 @@ class Coordinates:
     Attributes:
         structure: Mechanism without numbers.
         local: Indices of parameters that each recording has for itself.
-        recordings: How many recordings.
+        recordings: How many recordings, or windows of them, each with a first state.
+        windows_of: Which recording each window is of; empty where none is cut.
     """
 
     structure: Mechanism
     local: tuple[int, ...]
     recordings: int
+    windows_of: tuple[int, ...] = ()
+
+    @property
+    def owners(self) -> tuple[int, ...]:
+        """For each first state, the recording whose local parameters it goes with."""
+        return self.windows_of or tuple(range(self.recordings))
+
+    @property
+    def owning(self) -> int:
+        """How many recordings have local parameters."""
+        return max(self.owners) + 1
 
     @property
     def parameters(self) -> int:
@@ -71,7 +83,7 @@ class Coordinates:
     @property
     def size(self) -> int:
         """Length of the flat vector."""
-        return self.parameters + self.recordings * (len(self.local) + self.states)
+        return self.parameters + self.owning * len(self.local) + self.recordings * self.states
 
     def local_index(self, recording: int, parameter: int) -> int:
         """Place of a recording's own value of a parameter."""
@@ -79,7 +91,7 @@ class Coordinates:
 
     def state_index(self, recording: int) -> np.ndarray:
         """Places of a recording's first state."""
-        start = self.parameters + self.recordings * len(self.local) + recording * self.states
+        start = self.parameters + self.owning * len(self.local) + recording * self.states
         return np.arange(start, start + self.states)
 
     @property
@@ -89,18 +101,18 @@ class Coordinates:
 
     def split(self, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Physical parameter values (R, P) and first states (R, 2 n)."""
-        P, L, R = self.parameters, len(self.local), self.recordings
+        P, L, R, each = self.parameters, len(self.local), self.recordings, self.owning
         z = jnp.broadcast_to(flat[:P], (R, P))
-        own = flat[P : P + R * L].reshape(R, L)
+        own = flat[P : P + each * L].reshape(each, L)
         if L:
-            z = z.at[:, np.array(self.local)].set(own)
+            z = z.at[:, np.array(self.local)].set(own[np.array(self.owners)])
         constrain = jax.vmap(self.transform.constrain)
-        return constrain(z), flat[P + R * L :].reshape(R, self.states)
+        return constrain(z), flat[P + each * L :].reshape(R, self.states)
 
     def flatten(self, values: np.ndarray, x0: np.ndarray) -> np.ndarray:
         """The flat vector for physical values (P,), the same in every recording, and first states."""
         z = self.transform.unconstrain(values)
-        own = np.tile(z[list(self.local)], self.recordings)
+        own = np.tile(z[list(self.local)], self.owning)
         return np.concatenate([z, own, np.asarray(x0, float).ravel()])
 
 
@@ -140,13 +152,19 @@ def first_states(model: Model, recordings: Sequence[Recording]) -> np.ndarray:
 
 
 def sensor_noise(recordings: Sequence[Recording], model: Model) -> np.ndarray:
-    """Standard deviation of the sensor noise per channel (C,), from residuals of local cubics.
+    """Standard deviation of the sensor noise per channel (C,), from residuals of local polynomials.
 
-    A cubic through 11 neighbouring samples follows the motion; what it leaves is noise. Never less
-    than the rounding to steps of `resolution` leaves, step / sqrt(12).
+    A cubic through 11 neighbouring samples follows the motion; what it leaves is noise. Where a period
+    of the motion is but a few samples long, only a higher degree follows it: the least of several counts.
+    Never less than the rounding to steps of `resolution` leaves, step / sqrt(12).
     """
-    half, degree = 5, 3
-    t = np.arange(-half, half + 1)
+    return np.min([_left_by(degree, recordings, model) for degree in (3, 5, 7, 9)], axis=0)
+
+
+def _left_by(degree: int, recordings: Sequence[Recording], model: Model) -> np.ndarray:
+    """Deviation that local polynomials of a degree leave, if all of it were white noise."""
+    half = 5
+    t = np.arange(-half, half + 1) / half
     V = np.vander(t, degree + 1)
     leftover = np.eye(len(t)) - V @ np.linalg.pinv(V)
     row = leftover[half]

@@ -1,5 +1,7 @@
-"""Ready-made mechanisms: the paper's joint, the maker's with its springs, a single inertia."""
+"""Ready-made mechanisms: joints of the paper and the maker, a single inertia, public machines."""
 
+from rotflex_jax.joints.emps import emps
+from rotflex_jax.joints.rotary_arm import rotary_arm
 from rotflex_jax.joints.rotary_flexible import (
     arm_inertia,
     flexible_joint,
@@ -8,6 +10,7 @@ from rotflex_jax.joints.rotary_flexible import (
     quanser_2002,
     quanser_2010,
 )
+from rotflex_jax.joints.silverbox import silverbox
 from rotflex_jax.joints.single_inertia import single_inertia
 from rotflex_jax.joints.springs import SPRINGS, SpringType, spring_settings, spring_stiffness
 
@@ -17,6 +20,9 @@ __all__ = [
     "quanser_2010",
     "flexible_joint",
     "single_inertia",
+    "emps",
+    "silverbox",
+    "rotary_arm",
     "arm_inertia",
     "hub_inertia",
     "spring_stiffness",

@@ -10,9 +10,10 @@ import numpy as np
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels
 from rotflex_jax.kernels.subject import Modelled, lags_of, subject
-from rotflex_jax.mechanism.assembly import driven_voltage, read_outputs, rest_state
+from rotflex_jax.mechanism.assembly import driven_voltage, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import states
+from rotflex_jax.mechanism.sensors import read_outputs
 from rotflex_jax.mechanism.simulate import FreeStep, Solver, free_run
 from rotflex_jax.precision import double_precision
 

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from rotflex_jax.effects.kinds import Actuation
-from rotflex_jax.mechanism.assembly import driven_voltage, effects_of, read_outputs
+from rotflex_jax.mechanism.assembly import driven_voltage, effects_of
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import chunks, joined, states
+from rotflex_jax.mechanism.sensors import read_outputs
 from rotflex_jax.mechanism.simulate import FreeStep, Solver
 
 

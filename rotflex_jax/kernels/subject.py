@@ -58,6 +58,11 @@ def subject(model: Mechanism | Modelled, channel: str) -> Subject:
             f"Kernels of {channel!r} were asked for, but the mechanism has the outputs "
             f"{', '.join(mechanism.channels)}; choose one of these."
         )
+    if getattr(solver, "between", "held") != "held":
+        raise InputError(
+            "Kernels were asked of a model whose voltage is smooth between its samples, but each sample then "
+            'acts before its time; take a solver with between="held".'
+        )
     gates = np.ones(len(mechanism.effects)) if given is None else np.array(given, float)
     return Subject(mechanism, solver, gates, mechanism.channels.index(channel))
 

@@ -5,7 +5,7 @@ Everything here is formed once per set of parameters, outside the scan, and is d
 
 import dataclasses
 import functools
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +17,13 @@ from rotflex_jax.effects.kinds import (
     DryFriction,
     Effect,
     Force,
+    Gear,
     Linear,
     Memory,
     Scalar,
-    Sensing,
     Stamp,
 )
+from rotflex_jax.mechanism.exponential import integrals
 from rotflex_jax.mechanism.mechanism import Mechanism
 
 Kind = TypeVar("Kind", bound=Effect)
@@ -32,13 +33,15 @@ Kind = TypeVar("Kind", bound=Effect)
 class Layout:
     """Where things sit, known from the structure alone.
 
-    The state is `x = [q, dq, linear states, memory states]`; the first `linear` entries take part in
-    the matrix exponential. Of the ports that carry torques, the first `contacts` have dry friction.
+    The state is `x = [q, dq, linear states, rotor's angle and speed, memory states]`; the first `linear`
+    entries take part in the matrix exponential. `rotor` is where the two of the rotor stand, if a gear has
+    play. Of the ports that carry torques, the first `contacts` have dry friction.
     """
 
     n: int
     linear: int
     size: int
+    rotor: int
     torque_ports: tuple[str, ...]
     port_matrix: tuple[tuple[float, ...], ...]
     contacts: int
@@ -49,7 +52,8 @@ class Layout:
     def of(cls, structure: Mechanism) -> "Layout":
         """Layout of a structure."""
         n = len(structure.coordinates)
-        states = sum(e.order for e in structure.effects if isinstance(e, Linear))
+        rotor = 2 * n + sum(e.order for e in structure.effects if isinstance(e, Linear))
+        linear = rotor + sum(e.order for e in structure.effects if isinstance(e, Gear))
         memory = sum(isinstance(e, Memory) for e in structure.effects)
         rough = [e for e in structure.effects if isinstance(e, (Force, Memory, DryFriction))]
         used = {e.at for e in rough}
@@ -63,8 +67,9 @@ class Layout:
             rows.append(vector + zeros if what == "position" else zeros + vector)
         return cls(
             n=n,
-            linear=2 * n + states,
-            size=2 * n + states + memory,
+            linear=linear,
+            size=linear + memory,
+            rotor=rotor,
             torque_ports=names,
             port_matrix=tuple(structure.port_vectors[p] for p in names),
             contacts=len(dry),
@@ -86,28 +91,44 @@ class Equations(NamedTuple):
     inverse_mass: jax.Array
 
 
+class Acting(NamedTuple):
+    """What a linear effect writes, the direction of its port, and its gate."""
+
+    stamp: Stamp
+    port: np.ndarray
+    gate: Scalar
+
+
 def equations(mechanism: Mechanism, gates: jax.Array) -> Equations:
-    """Equations of motion of the linear effects, each multiplied by its gate.
+    """Equations of motion of the linear effects, each multiplied by its gate; a rotor's states rest.
 
     Args:
         mechanism: Numbers may be traced.
         gates: One factor per effect; one where it is on, zero where it is off.
     """
     layout = Layout.of(mechanism.structure)
-    n, size, dtype = layout.n, layout.linear, gates.dtype
+    acting = [
+        Acting(e.stamp(), np.array(mechanism.port_vectors[e.at]), gates[i])
+        for i, e in effects_of(mechanism, Linear)
+    ]
+    P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), layout.n)
+    return assembled(acting, P, layout.linear, gates.dtype)
+
+
+def assembled(acting: list[Acting], P: np.ndarray, size: int, dtype: jnp.dtype) -> Equations:
+    """Equations of motion of `size` states; torques act at the ports P (ports, n)."""
+    n = P.shape[1]
     M, D, K = (jnp.zeros((n, n), dtype) for _ in range(3))
     drive = jnp.zeros(n, dtype)
-    extra: list[tuple[Stamp, np.ndarray, jax.Array]] = []
-    for i, effect in effects_of(mechanism, Linear):
-        p = np.array(mechanism.port_vectors[effect.at])
+    extra: list[Acting] = []
+    for stamp, p, gate in acting:
         outer = jnp.asarray(np.outer(p, p), dtype)
-        stamp, gate = effect.stamp(), gates[i]
         M = M + gate * stamp.inertia * outer
         D = D + gate * stamp.damping * outer
         K = K + gate * stamp.stiffness * outer
         drive = drive + gate * stamp.drive * jnp.asarray(p, dtype)
-        if effect.order:
-            extra.append((stamp, p, gate))
+        if stamp.own:
+            extra.append(Acting(stamp, p, gate))
     Minv = jnp.linalg.inv(M)
     A = jnp.zeros((size, size), dtype).at[:n, n : 2 * n].set(jnp.eye(n, dtype=dtype))
     A = A.at[n : 2 * n, :n].set(-Minv @ K).at[n : 2 * n, n : 2 * n].set(-Minv @ D)
@@ -123,7 +144,6 @@ def equations(mechanism: Mechanism, gates: jax.Array) -> Equations:
         A = A.at[n : 2 * n, at : at + m].set(gate * (Minv @ vector)[:, None] * torque[None, :])
         B = B.at[at : at + m].set(jnp.stack([_scalar(c, dtype) for c in stamp.from_voltage]))
         at += m
-    P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), n)
     ports = jnp.zeros((size, len(P)), dtype).at[n : 2 * n].set(Minv @ jnp.asarray(P.T, dtype))
     return Equations(A, B, ports, Minv)
 
@@ -138,7 +158,8 @@ class Constants(NamedTuple):
     With `phi_k` the exponential-integrator functions of `A h`: `E = exp(A h)`, `input = h phi_1 B`,
     `hold = h phi_1 b_p` (answer to a constant port torque), `ramp = h phi_2 b_p`, `rise = h phi_3 b_p`;
     `half_*` the same for `h / 2`. `stop[i, j]` is the speed that a unit torque at port j, held for one
-    step, gives port i; `mobility` the same for a unit impulse; `push` its coordinates.
+    step, gives port i; `mobility` the same for a unit impulse; `push` what that does to the coordinates,
+    one row per linear state. `apart` is what a gear with play needs besides (`gear`).
     """
 
     values: jax.Array
@@ -155,49 +176,28 @@ class Constants(NamedTuple):
     stop: jax.Array
     mobility: jax.Array
     push: jax.Array
-
-
-def exponential_less_one(M: jax.Array) -> jax.Array:
-    """`exp(M) - 1` by scaling, a Taylor polynomial of degree 8, and squaring `X -> 2 X + X X`.
-
-    Squaring the difference from one keeps the digits of a small step that squaring `exp` would round
-    away. A fixed number of halvings (2^-14, good to a norm of a few thousand) has no branch, so it
-    compiles fast and differentiates plainly.
-    """
-    halvings, degree = 14, 8
-    small = M / 2.0**halvings
-    X = small / degree
-    for k in range(degree - 1, 0, -1):
-        X = (small + small @ X) / k
-    return jax.lax.fori_loop(0, halvings, lambda _, X: 2 * X + X @ X, X)
-
-
-def _phi(A: jax.Array, V: jax.Array, h: jax.Array, orders: int) -> list[jax.Array]:
-    """`exp(A h)` and `h phi_k(A h) V`, k = 1..orders, from one augmented matrix exponential."""
-    size, m = V.shape
-    total = size + orders * m
-    big = jnp.zeros((total, total), A.dtype).at[:size, :size].set(A * h)
-    big = big.at[:size, size : size + m].set(V * h)
-    for k in range(orders - 1):
-        rows = slice(size + k * m, size + (k + 1) * m)
-        columns = slice(size + (k + 1) * m, size + (k + 2) * m)
-        big = big.at[rows, columns].set(jnp.eye(m, dtype=A.dtype))
-    expo = exponential_less_one(big)
-    return [expo[:size, :size] + jnp.eye(size, dtype=A.dtype)] + [
-        expo[:size, size + k * m : size + (k + 1) * m] for k in range(orders)
-    ]
+    apart: Any = None
 
 
 def constants(mechanism: Mechanism, values: jax.Array, gates: jax.Array, h: jax.Array) -> Constants:
     """Constants of a step of length `h` [s] for traced parameter values."""
     layout = Layout.of(mechanism.structure)
-    eq = equations(mechanism.with_values(values), gates)
+    return from_equations(equations(mechanism.with_values(values), gates), layout, values, gates, h)
+
+
+def from_equations(
+    eq: Equations, layout: Layout, values: jax.Array, gates: jax.Array, h: jax.Array
+) -> Constants:
+    """Constants of a step of length `h` [s] for equations whose states are in the order of the layout."""
     n = layout.n
     V = jnp.concatenate([eq.B[:, None], eq.ports], axis=1)
-    E, one, two, three = _phi(eq.A, V, h, 3)
-    half_E, half = _phi(eq.A, V, h / 2, 1)
+    E, one, two, three = integrals(eq.A, V, h, 3)
+    half_E, half = integrals(eq.A, V, h / 2, 1)
     P = jnp.asarray(np.array(layout.port_matrix).reshape(len(layout.torque_ports), n), E.dtype)
-    push = eq.inverse_mass @ P.T
+    # An impulse at a port moves the coordinates as the torque accelerates them.
+    push = jnp.zeros_like(eq.ports).at[:n].set(eq.ports[n : 2 * n])
+    if layout.linear > layout.rotor:
+        push = push.at[layout.rotor].set(eq.ports[layout.rotor + 1])
     return Constants(
         values=values,
         gates=gates,
@@ -211,7 +211,7 @@ def constants(mechanism: Mechanism, values: jax.Array, gates: jax.Array, h: jax.
         half_input=half[:, 0],
         half_hold=half[:, 1:],
         stop=P @ one[n : 2 * n, 1:],
-        mobility=P @ push,
+        mobility=P @ push[:n],
         push=push,
     )
 
@@ -222,19 +222,6 @@ def driven_voltage(mechanism: Mechanism, gates: jax.Array, u: jax.Array, Ts: Sca
     for i, effect in sorted(effects_of(mechanism, Actuation), key=lambda pair: pair[1].stage):
         v = v + gates[i] * (effect.drive(v, Ts) - v)
     return v
-
-
-def read_outputs(mechanism: Mechanism, gates: jax.Array, x: jax.Array) -> jax.Array:
-    """Sensor readings (C, ...) of states (n, ...)."""
-    layout = Layout.of(mechanism.structure)
-    C = jnp.asarray(np.array(layout.output_rows), x.dtype)
-    C = C.reshape(C.shape + (1,) * (x.ndim - 1))
-    y = jnp.sum(C * x[None, : 2 * layout.n], axis=1)
-    for i, effect in effects_of(mechanism, Sensing):
-        c = mechanism.channels.index(effect.at)
-        read = y[c] + gates[i] * (effect.measure(y[c]) - y[c])
-        y = jnp.concatenate([y[:c], read[None], y[c + 1 :]])
-    return y
 
 
 def rest_state(structure: Mechanism, dtype: DTypeLike) -> np.ndarray:

@@ -123,7 +123,8 @@ def contacts(
     eye = wide(jnp.eye(k, dtype=stop.dtype))
     full = jnp.concatenate([jnp.broadcast_to(wide(stop), (k, *v0.shape)), free[:, None]], axis=1)
     slack = 1 + 1e3 * jnp.finfo(v0.dtype).eps
-    held = at_rest(v0, free, own, up, down)
+    # One without a level holds nothing.
+    held = at_rest(v0, free, own, up, down) & (up + down > 0)
     f = jnp.zeros_like(v0)
     for last in (*[False] * (k if passes is None else passes - 1), True):
         rows, needed = [full[i] for i in range(k)], []

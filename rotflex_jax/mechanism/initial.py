@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
@@ -13,17 +14,34 @@ from rotflex_jax.precision import double_precision
 
 
 def rough_state(structure: Mechanism, y: np.ndarray, Ts: float) -> np.ndarray:
-    """Positions and speeds from a straight line through the samples; zero where nothing is measured."""
+    """Positions and speeds from a straight line through the samples.
+
+    What the sensors leave open is taken from the springs, which are relaxed, and is zero where there is
+    none. Speeds come from the slopes of positions before they come from sensors of speed, whose sign a
+    rectifier may hide.
+    """
     layout = Layout.of(structure)
     t = np.arange(len(y)) * Ts
     slope, start = np.polyfit(t, y, 1) if len(y) > 1 else (0 * y[0], y[0])
     rows = np.array(layout.output_rows)
     n, is_position = layout.n, np.any(np.array(layout.output_rows)[:, : layout.n] != 0, axis=1)
-    q = np.linalg.pinv(rows[is_position, :n]) @ start[is_position]
-    dq = np.linalg.pinv(rows[is_position, :n]) @ slope[is_position]
-    if not is_position.all():
-        dq = np.linalg.pinv(rows[~is_position, n:]) @ start[~is_position]
+    C, V = rows[is_position, :n], rows[~is_position, n:]
+    ports = {e.at for e in structure.effects if e.name == "spring"}
+    springs = np.array([structure.port_vectors[p] for p in sorted(ports)]).reshape(-1, n)
+    relaxed = np.zeros(len(springs))
+    q = _stepwise([(C, start[is_position]), (springs, relaxed)], n)
+    dq = _stepwise([(C, slope[is_position]), (springs, relaxed), (V, start[~is_position])], n)
     return np.concatenate([q, dq])
+
+
+def _stepwise(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> np.ndarray:
+    """The smallest `x` with `A x = b` for the first pair, then for the next as far as that leaves it open."""
+    x, free = np.zeros(n), np.eye(n)
+    for A, b in rows:
+        left = A @ free
+        x = x + free @ np.linalg.pinv(left) @ (b - A @ x)
+        free = free @ scipy.linalg.null_space(left)
+    return x
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

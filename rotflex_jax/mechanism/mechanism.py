@@ -7,8 +7,11 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from rotflex_jax.effects.kinds import Actuation, Effect, Linear, Memory, Sensing
+from rotflex_jax.effects.kinds import Effect, Linear
 from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import given
+from rotflex_jax.mechanism.consistent import check
+from rotflex_jax.mechanism.units import TURNING, Units
 from rotflex_jax.parameters import Specification, specifications
 
 Pairs = tuple[tuple[str, Any], ...]
@@ -37,6 +40,7 @@ class Mechanism:
         effects: Physical effects; inertias, springs, dampers and the motor among them.
         outputs: Channel -> port (its position) or (port, "speed").
         trusted: Full names `port.effect.parameter` of constants that fits hold.
+        units: How its ports move: turning, unless told otherwise.
 
     Raises:
         InputError: A port, output or trusted name that does not exist, or two equal effects at a port.
@@ -50,52 +54,16 @@ class Mechanism:
     effects: tuple[Effect, ...] = ()
     outputs: Any = ()
     trusted: Any = frozenset()
+    units: Units = TURNING
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - frozen class
-        ports = dict(self.ports)
-        put("coordinates", tuple(self.coordinates))
-        put("ports", tuple((k, tuple(float(c) for c in v)) for k, v in ports.items()))
-        put("effects", tuple(self.effects))
-        outputs = {k: v if isinstance(v, tuple) else (v, "position") for k, v in dict(self.outputs).items()}
-        put("outputs", tuple(outputs.items()))
-        put("trusted", frozenset(self.trusted))
-        self._check()
-
-    def _check(self) -> None:
-        ports, channels = self.port_vectors, self.channels
-        for name, vector in ports.items():
-            if len(vector) != len(self.coordinates):
-                raise InputError(
-                    f"Port {name!r} was given {len(vector)} entries, but the mechanism has the "
-                    f"{len(self.coordinates)} coordinates {self.coordinates}; give one entry for each."
-                )
-        for channel, (port, what) in self.outputs:
-            if port not in ports or what not in ("position", "speed"):
-                raise InputError(
-                    f"Output {channel!r} was given as {(port, what)}, but it needs one of the ports "
-                    f"{tuple(ports)} with 'position' or 'speed'; correct the output."
-                )
-        seen: set[tuple[str, str]] = set()
-        for effect in self.effects:
-            places = ("input",) if isinstance(effect, Actuation) else tuple(ports)
-            places = channels if isinstance(effect, Sensing) else places
-            if effect.at not in places:
-                raise InputError(
-                    f"{type(effect).__name__} was put at {effect.at!r}, but this mechanism has "
-                    f"{', '.join(map(repr, places))} for it; choose one of them."
-                )
-            if (effect.at, effect.name) in seen:
-                raise InputError(
-                    f"Two effects named {effect.name!r} were put at {effect.at!r}, but one is needed; "
-                    f"add up their parameters."
-                )
-            seen.add((effect.at, effect.name))
-            if isinstance(effect, Memory) and effect.driven_by == "motor" and not self.has_motor(effect.at):
-                raise InputError(
-                    f"{type(effect).__name__} was put at {effect.at!r}, but no motor drives that port; put "
-                    f"it at the port of a motor, or add a Motor there first."
-                )
+        put("coordinates", given.names(self.coordinates, "coordinates"))
+        put("ports", given.ports(self.ports))
+        put("effects", given.effects(self.effects))
+        put("outputs", given.outputs(self.outputs))
+        put("trusted", frozenset(given.names(self.trusted, "trusted parameters")))
+        check(self)
         for name in sorted(self.trusted):
             self._must_exist(name)
 
@@ -153,6 +121,10 @@ class Mechanism:
         """Whether a linear motor drives the port."""
         return any(isinstance(e, Linear) and e.motor and e.at == port for e in self.effects)
 
+    def has_inertia(self, port: str) -> bool:
+        """Whether an inertia is entered at the port."""
+        return any((e.name, e.at) == ("inertia", port) for e in self.effects)
+
     # -- parameters --------------------------------------------------------------------------------
 
     @property
@@ -162,8 +134,17 @@ class Mechanism:
 
     @property
     def parameter_specifications(self) -> tuple[Specification, ...]:
-        """Declared unit, bounds and size of each parameter, in the order of `values`."""
-        return tuple(s for e in self.effects for s in specifications(e).values())
+        """Unit, bounds and size of each parameter, in the order of `values`."""
+        u = self.units
+        return tuple(
+            dataclasses.replace(s, unit=u.unit(s.unit), typical=s.typical * u.size(s.unit))
+            for e in self.effects
+            for s in specifications(e).values()
+        )
+
+    def sentence(self, effect: Effect) -> str:
+        """What an effect is, in words with numbers, in the units of this mechanism."""
+        return self.units.sentence(effect.sentence())
 
     @property
     def values(self) -> np.ndarray:
@@ -223,6 +204,7 @@ class Mechanism:
             ("effects", tuple(effects)),
             ("outputs", structure.outputs),
             ("trusted", trusted),
+            ("units", structure.units),
         ):
             object.__setattr__(rebuilt, field, value)
         return rebuilt
@@ -234,5 +216,5 @@ class Mechanism:
                 full = f"{e.at}.{e.name}.{name}"
                 held = "  (trusted)" if full in self.trusted else ""
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
-                lines.append(f"  {full} = {number} {specifications(e)[name].unit}{held}")
+                lines.append(f"  {full} = {number} {self.units.unit(specifications(e)[name].unit)}{held}")
         return "\n".join(lines)

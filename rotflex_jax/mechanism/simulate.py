@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rotflex_jax.mechanism.assembly import driven_voltage, read_outputs, rest_state
+from rotflex_jax.mechanism.assembly import driven_voltage, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import states
+from rotflex_jax.mechanism.sensors import read_outputs, read_with_sign
 from rotflex_jax.mechanism.smooth import SmoothRK4
 from rotflex_jax.mechanism.step import Exponential
 from rotflex_jax.mechanism.torques import apply
@@ -42,7 +43,8 @@ class PredictorStep:
         v, y, seen = w
         c, K = constants
         mechanism = self.structure.with_values(c.values)
-        e = (y - read_outputs(mechanism, c.gates, x)) * seen[None]
+        read, way = read_with_sign(mechanism, c.gates, x)
+        e = (y - read) * way * seen[None]
         return self.solver.advance(self.structure, x + apply(K, e), v, c)
 
 
@@ -68,7 +70,8 @@ def free_run(
     """
     mechanism = structure.with_values(values)
     c = solver.prepare(structure, values, gates, Ts)
-    X = states(FreeStep(structure, solver), x0, driven_voltage(mechanism, gates, u, Ts), c)
+    v = solver.inputs(driven_voltage(mechanism, gates, u, Ts))
+    X = states(FreeStep(structure, solver), x0, v, c)
     return X, read_outputs(mechanism, gates, X.T).T
 
 
@@ -100,7 +103,7 @@ def predictor_run(
     """
     mechanism = structure.with_values(values)
     c = solver.prepare(structure, values, gates, Ts)
-    v = driven_voltage(mechanism, gates, u, Ts)
+    v = solver.inputs(driven_voltage(mechanism, gates, u, Ts))
     X = states(PredictorStep(structure, solver), x0, (v, y, seen), (c, K))
     return X, read_outputs(mechanism, gates, X.T).T
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rotflex_jax.effects.kinds import DryFriction
+from rotflex_jax.effects.kinds import DryFriction, Gear
+from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Equations, Layout, effects_of, equations
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.step import along
@@ -40,10 +41,16 @@ class SmoothRK4:
     width: float = 0.02
     substeps: int = 20
 
+    def inputs(self, v: jax.Array) -> jax.Array:
+        """What `advance` takes at each sample, for a sequence of voltages (N,)."""
+        return v
+
     def prepare(
         self, structure: Mechanism, values: jax.Array, gates: jax.Array, Ts: jax.Array
     ) -> SmoothConstants:
         """Constants for `advance`."""
+        if effects_of(structure, Gear):
+            raise InputError("SmoothRK4 was given a gear with play, but it has no teeth; use Exponential.")
         eq = equations(structure.with_values(values), gates)
         return SmoothConstants(values, gates, Ts / self.substeps, eq)
 

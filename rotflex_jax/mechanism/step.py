@@ -13,7 +13,9 @@ import jax.numpy as jnp
 
 from rotflex_jax.effects.kinds import DryFriction, Force, Memory
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of
+from rotflex_jax.mechanism.between import Between, smoothed
 from rotflex_jax.mechanism.friction import contacts, solve_masked, within
+from rotflex_jax.mechanism.gear import apart, geared_step
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.torques import apply, port_motion, remember, torques
 
@@ -31,15 +33,24 @@ class Exponential:
         order: 2 or 4, the order of the rule for smooth torques.
         substeps: Steps per sample; compare with a larger number to see the error.
         passes: Passes over coupled friction contacts, as in `friction.contacts`; None settles any case.
+        between: What the voltage does between its samples: "held", or "smooth" as behind a low-pass filter,
+            which wants four substeps or so.
     """
 
     order: int = 2
     substeps: int = 1
     passes: int | None = None
+    between: Between = "held"
+
+    def inputs(self, v: jax.Array) -> jax.Array:
+        """What `advance` takes at each sample, for a sequence of voltages (N,)."""
+        return v if self.between == "held" else smoothed(v, self.substeps)
 
     def prepare(self, structure: Mechanism, values: jax.Array, gates: jax.Array, Ts: jax.Array) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
-        return constants(structure, values, gates, Ts / self.substeps)
+        h = Ts / self.substeps
+        c = constants(structure, values, gates, h)
+        return c._replace(apart=apart(structure, values, gates, h))
 
     def advance(self, structure: Mechanism, x: jax.Array, v: jax.Array, c: Constants) -> jax.Array:
         """State one sample later, for one state or for many side by side.
@@ -47,22 +58,37 @@ class Exponential:
         Args:
             structure: The mechanism without numbers.
             x: State (n, ...).
-            v: Voltage held over the sample (...) [V].
+            v: Voltage held over the sample (...) [V], or over each substep (substeps, ...); from `inputs`.
             c: From `prepare`.
         """
         mechanism = structure.with_values(c.values)
         if self.substeps == 1:
-            return _advance(mechanism, x, v, c, self)
-        body = lambda _, state: _advance(mechanism, state, v, c, self)  # noqa: E731
+            return _step(mechanism, x, v if self.between == "held" else v[0], c, self)
+        at = lambda k: v if self.between == "held" else v[k]  # noqa: E731
+        body = lambda k, state: _step(mechanism, state, at(k), c, self)  # noqa: E731
         return jax.lax.fori_loop(0, self.substeps, body, x)
 
 
+def _step(mechanism: Mechanism, x: jax.Array, v: jax.Array, c: Constants, solver: Exponential) -> jax.Array:
+    if c.apart is None:
+        return _advance(mechanism, x, v, c, solver)
+    moved = lambda x, c, extra: _advance(mechanism, x, v, c, solver, extra)  # noqa: E731
+    return geared_step(mechanism, x, c, moved)
+
+
 def _advance(
-    mechanism: Mechanism, x: jax.Array, v: jax.Array, c: Constants, solver: Exponential
+    mechanism: Mechanism,
+    x: jax.Array,
+    v: jax.Array,
+    c: Constants,
+    solver: Exponential,
+    extra: jax.Array | None = None,
 ) -> jax.Array:
+    """The step under one set of equations; `extra` comes to the linear states from elsewhere."""
     layout = Layout.of(mechanism.structure)
     L, z = x[: layout.linear], x[layout.linear :]
     start = apply(c.E, L) + along(c.input, v)
+    start = start if extra is None else start + extra
     if not layout.torque_ports:
         return start
     smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
@@ -129,7 +155,7 @@ def _brake_guess(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constant
 def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants, passes: int | None) -> jax.Array:
     """The state at the end of the step with dry friction, positions matched to the stop inside it."""
     layout = Layout.of(mechanism.structure)
-    k, n = layout.contacts, layout.n
+    k = layout.contacts
     if not k:
         return end
     q0, v0 = (m[:k] for m in port_motion(layout, x))
@@ -147,6 +173,9 @@ def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants, pas
     late = c.h / 2 * (found.t * v0 + (1 - found.t) * v1 - v0 - v1)
     curved = c.h / 2 * (v0 + v1) - (q1 - q0)
     shift = late + (1 - found.t) * found.holds * curved
-    impulse = solve_masked(c.mobility[:k, :k], found.crossed, shift, jnp.zeros_like(shift))
-    moved = apply(c.push[:, :k], impulse)
-    return jnp.concatenate([end[:n] + moved, end[n:]])
+    # A contact that is off has nothing to correct; what it would do if it came in, it would do alone.
+    own = jnp.stack([c.mobility[i, i] for i in range(k)]).reshape((k,) + (1,) * (shift.ndim - 1))
+    alone = jnp.where(found.crossed, shift / own, 0.0)
+    works = found.crossed & (levels[0] + levels[1] > 0)
+    impulse = solve_masked(c.mobility[:k, :k], works, shift, alone)
+    return end + apply(c.push[:, :k], impulse)

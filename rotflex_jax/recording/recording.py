@@ -11,7 +11,13 @@ from jaxtyping import Float
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import quality
 from rotflex_jax.recording.quality import Finding
-from rotflex_jax.recording.samples import aligned, finite, real_numbers, sampling_period
+from rotflex_jax.recording.samples import (
+    aligned,
+    finite,
+    initial_samples,
+    real_numbers,
+    sampling_period,
+)
 from rotflex_jax.recording.sensor import quantisation_step
 
 
@@ -38,6 +44,8 @@ class Recording:
         accept: faults to accept, which then are findings of severity `warning`: `short`,
             `constant_input`, `constant`, `saturated`, `units`.
         resolution: quantisation step by channel, where it is known; found from the data otherwise.
+        continues: the recording that ended as this one began, if any; a part of a recording knows what
+            came before it. What no sensor shows (a warm motor) is as that recording left it.
 
     Raises:
         InputError: the data are not what they must be, told in one sentence.
@@ -63,6 +71,7 @@ class Recording:
     start: float
     accept: tuple[str, ...]
     resolution: Mapping[str, float | None]
+    continues: "Recording | None"
 
     def __init__(
         self,
@@ -78,6 +87,7 @@ class Recording:
         start: float = 0.0,
         accept: str | Sequence[str] = (),
         resolution: Mapping[str, float | None] | None = None,
+        continues: "Recording | None" = None,
     ) -> None:
         u, y = aligned(real_numbers(u, "Argument `u`"), real_numbers(y, "Argument `y`"))
         Ts = sampling_period(Ts)
@@ -94,7 +104,7 @@ class Recording:
             "units": units,
             "input_name": input_name,
             "input_unit": input_unit,
-            "n_init": _initial_samples(n_init, len(u), Ts),
+            "n_init": initial_samples(n_init, len(u), Ts),
             "source": source,
             "start": float(start),
             "accept": quality.acceptable(accept),
@@ -102,6 +112,7 @@ class Recording:
                 name: known[name] if name in known else quantisation_step(x)
                 for x, name in zip(y.T, names, strict=True)
             },
+            "continues": continues,
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -153,6 +164,8 @@ class Recording:
             start=self.start + i * self.Ts,
             n_init=min(self.n_init, max(1, (j - i) // 4)),
             accept=quality.ACCEPTABLE,
+            # One sample alone is no recording, and leaves nothing behind.
+            continues=self.slice(0, i) if i > 1 else self.continues if not i else None,
         )
 
     def split(
@@ -235,14 +248,3 @@ def _labels(
 
 def _tuple(words: str | Sequence[str]) -> tuple[str, ...]:
     return (words,) if isinstance(words, str) else tuple(words)
-
-
-def _initial_samples(n_init: int | None, N: int, Ts: float) -> int:
-    if n_init is None:
-        return max(1, min(max(10, round(0.2 / Ts)), N // 4))
-    if n_init != int(n_init) or not 1 <= n_init < N:
-        raise InputError(
-            f"Argument `n_init` must be a whole number from 1 and smaller than the recording, "
-            f"but is {n_init} of {N} samples; 0.2 s are {round(0.2 / Ts)} samples."
-        )
-    return int(n_init)

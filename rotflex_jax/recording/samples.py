@@ -1,4 +1,4 @@
-"""What numbers must be before they are of use: real, finite, aligned, evenly spaced in time."""
+"""What numbers must be before they are of use: real, finite, aligned, evenly spaced, enough to begin with."""
 
 from typing import Any
 
@@ -174,3 +174,15 @@ def even_spacing(t: np.ndarray, label: str, where: str = "sample", first: int = 
     # Written times are rounded; the plain number within their error is the one that was set.
     plain = float(f"{mean:.6g}")
     return plain if abs(plain - mean) < 1e-7 * mean else mean
+
+
+def initial_samples(n_init: int | None, N: int, Ts: float) -> int:
+    """How many samples a model may look at: 0.2 s, at least ten, at most a quarter, if not given."""
+    if n_init is None:
+        return max(1, min(max(10, round(0.2 / Ts)), N // 4))
+    if n_init != int(n_init) or not 1 <= n_init < N:
+        raise InputError(
+            f"Argument `n_init` must be a whole number from 1 and smaller than the recording, "
+            f"but is {n_init} of {N} samples; 0.2 s are {round(0.2 / Ts)} samples."
+        )
+    return int(n_init)

@@ -11,12 +11,14 @@ if TYPE_CHECKING:
 __all__ = ["parameter_table", "summary_table", "write_report"]
 
 
-def write_report(discovery: "Discovery", folder: str | Path) -> Path:
+def write_report(discovery: "Discovery", folder: str | Path, *, learned: bool | None = None) -> Path:
     """Write `report.html` (self-contained) and `result.json` into a folder, which is created.
 
     Args:
         discovery: What was found.
         folder: Where to write; files of these names are replaced.
+        learned: Whether to learn a torque for what is left, `learned_torque.json` beside the page; where
+            the verdict is `unexplained` if None.
 
     Returns:
         Path of the HTML page.
@@ -26,4 +28,4 @@ def write_report(discovery: "Discovery", folder: str | Path) -> Path:
     """
     from rotflex_jax.report.html import write  # matplotlib is loaded only where it draws
 
-    return write(discovery, Path(folder))
+    return write(discovery, Path(folder), learned)

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from importlib import metadata
 from typing import Any
 
+from rotflex_jax.discover.learned_result import LearnedTorqueResult
 from rotflex_jax.discover.locate import locate
+from rotflex_jax.discover.photographs import Photographs
 from rotflex_jax.discover.result import Discovery, Ranked, Where
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
@@ -20,6 +22,7 @@ from rotflex_jax.report.tables import (
     parameter_rows,
     stage_labels,
 )
+from rotflex_jax.report.torques import told_latent, told_learned
 from rotflex_jax.report.wording import (
     AT_NOISE,
     HEADLINES,
@@ -40,7 +43,9 @@ from rotflex_jax.report.wording import (
 PACKAGES = ("rotflex_jax", "jax", "equinox", "optimistix", "numpy", "scipy", "matplotlib")
 
 
-def content(discovery: Discovery) -> dict[str, Any]:
+def content(
+    discovery: Discovery, lacking: Photographs | None = None, learned: LearnedTorqueResult | None = None
+) -> dict[str, Any]:
     """What the template fills in; plain text that the template escapes."""
     labels, colours = stage_labels(discovery), stage_colours(len(discovery.stages))
     remaining = _remaining(discovery)
@@ -63,9 +68,11 @@ def content(discovery: Discovery) -> dict[str, Any]:
                 "caption": p.caption,
                 "alt": p.description,
             }
-            for name, p in pictures(discovery).items()
+            for name, p in pictures(discovery, lacking, learned).items()
         },
         "places": _places(discovery.where),
+        "torques": told_latent(lacking) if lacking else [],
+        "learned": told_learned(discovery, learned) if learned else None,
         "remaining": _places(remaining),
         "arises": any("arises" in w.statement for w in (*discovery.where, *remaining)),
         "ranking": [_ranked(discovery, r) for r in discovery.ranking],

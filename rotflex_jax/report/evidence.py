@@ -126,7 +126,7 @@ def staircase(discovery: Discovery) -> Figure | None:
         values = [v for v in (*windows, *whole, floor) if v > 0 and math.isfinite(v)] or [1.0]
         ax.set_ylim(min(values) / 2.2, 1.8 * max(values))
         ax.set_xlim(-0.55, len(labels) - 0.55)
-        ax.set_xticks(x, [label.replace(" at ", "\nat ") for label in labels])
+        ax.set_xticks(x, [label.replace(" at ", "\nat ").replace(" of ", "\nof ") for label in labels])
         ax.tick_params(axis="x", length=0)
         for text, colour in zip(ax.get_xticklabels(), colours, strict=True):
             text.set_color(colour)

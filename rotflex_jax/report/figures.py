@@ -4,14 +4,21 @@ import dataclasses
 
 from matplotlib.figure import Figure
 
+from rotflex_jax.discover.learned_result import LearnedTorqueResult
+from rotflex_jax.discover.photographs import Photographs
 from rotflex_jax.discover.result import Discovery
 from rotflex_jax.report.evidence import parameters, ranking, staircase
 from rotflex_jax.report.failure import profiles, residual_map, worst_channel
+from rotflex_jax.report.latent import latent_maps, latent_time
+from rotflex_jax.report.learned import learned_figure
 from rotflex_jax.report.runs import LONGEST, overlay, shown, spectra
 from rotflex_jax.report.wording import AT_NOISE, noise_ratios
 
 __all__ = [
     "Picture",
+    "latent_maps",
+    "latent_time",
+    "learned_figure",
     "overlay",
     "parameters",
     "pictures",
@@ -38,8 +45,16 @@ class Picture:
     description: str
 
 
-def pictures(discovery: Discovery) -> dict[str, Picture]:
-    """Figures by name; those that have nothing to show are left out."""
+def pictures(
+    discovery: Discovery, lacking: Photographs | None = None, learned: LearnedTorqueResult | None = None
+) -> dict[str, Picture]:
+    """Figures by name; those that have nothing to show are left out.
+
+    Args:
+        discovery: What was found.
+        lacking: Latent torques of the baseline and the final model; not drawn where None.
+        learned: A learned torque; not drawn where None or not kept.
+    """
     drawn = {
         "overlay": overlay(discovery),
         "staircase": staircase(discovery),
@@ -48,12 +63,15 @@ def pictures(discovery: Discovery) -> dict[str, Picture]:
         "profiles": profiles(discovery),
         "ranking": ranking(discovery),
         "parameters": parameters(discovery),
+        "latent": lacking and latent_maps(lacking.before, lacking.after),
+        "latent_time": lacking and latent_time(lacking.before, lacking.after),
+        "learned": learned_figure(learned) if learned and learned.kept else None,
     }
-    captions = _captions(discovery)
+    captions = _captions(discovery, lacking)
     return {name: Picture(figure, *captions[name]) for name, figure in drawn.items() if figure is not None}
 
 
-def _captions(discovery: Discovery) -> dict[str, tuple[str, str]]:
+def _captions(discovery: Discovery, lacking: Photographs | None) -> dict[str, tuple[str, str]]:
     reached = [c for c, r in noise_ratios(discovery).items() if r < AT_NOISE]
     both = bool(discovery.rounds)
     s = shown(discovery)
@@ -84,6 +102,29 @@ def _captions(discovery: Discovery) -> dict[str, tuple[str, str]]:
             "the picture of a missing force, less what other parameters took over; speckles are "
             "noise" + ("; after the last round none should be left." if both else "."),
             "Maps of the held-out error and of the missing acceleration over speed and position.",
+        ),
+        "latent": (
+            "The torque that would have to be added at each port for the model to follow what was "
+            "measured (Kalman smoother). Shaded: 95 % band of the mean; grey: spread of single moments. "
+            "Damper and spring of a fitted model take over the slope of what is missing; the panels "
+            "marked + give back "
+            + (
+                "what they have more than in the final model, whose own torque (dashed) should be flat."
+                if lacking and lacking.after
+                else "the whole torque of the damper."
+            ),
+            "Mean of the unknown torque at each port over its speed and position, with bands.",
+        ),
+        "latent_time": (
+            "The same torques in time, on held-out data, and by frequency. Fast changes drown in the "
+            "noise of the sensor, so a jump looks rounded.",
+            "The unknown torque at each port over time with its band, and its spectrum.",
+        ),
+        "learned": (
+            "Left: the learned torque at each position and speed, grey where the recordings have hardly "
+            "been. Right of it: a cut along each axis with its 95 % band. What damper, spring or an "
+            "offset of the model could give is left out of map and formula alike.",
+            "Map of the learned torque over position and speed, with cuts and the formula.",
         ),
         "profiles": (
             "Bars above the black line mark where the baseline makes more than its share of error; "

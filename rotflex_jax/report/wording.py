@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 from rotflex_jax.discover.looks import as_read
 from rotflex_jax.discover.result import Discovery, Ranked
-from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects import CATALOG, Sensing
 from rotflex_jax.parameters import Estimate
 
 HEADLINES = {
@@ -22,12 +22,16 @@ AT_NOISE = 1.5
 
 
 def effect_label(effect: str, port: str) -> str:
-    """An effect and its place, short.
+    """An effect and its place, short; a sensor error is one of its channel.
 
-    >>> effect_label("cubic_spring", "joint")
-    'cubic spring at joint'
+    >>> effect_label("cubic_spring", "joint"), effect_label("sensor_bias", "alpha")
+    ('cubic spring at joint', 'sensor bias of alpha')
     """
-    return f"{effect.replace('_', ' ')} at {port}"
+    return f"{effect.replace('_', ' ')} {'of' if effect in _sensing() else 'at'} {port}"
+
+
+def _sensing() -> list[str]:
+    return [name for name, effect in CATALOG.items() if issubclass(effect, Sensing)]
 
 
 def effect_title(effect: str) -> str:
@@ -41,10 +45,14 @@ def sentence(text: str) -> str:
 
     >>> sentence("cubic_spring explains it")
     'Cubic spring explains it.'
+    >>> sentence("sensor_bias at the alpha explains it")
+    'Sensor bias of alpha explains it.'
     """
     text = text.strip()
     for name in CATALOG:
         text = re.sub(rf"\b{name}\b", name.replace("_", " "), text)
+    for name in _sensing():
+        text = text.replace(f"{name.replace('_', ' ')} at the ", f"{name.replace('_', ' ')} of ")
     if text and text[-1] not in ".!?":
         text += "."
     return together(text[:1].upper() + text[1:])
@@ -179,7 +187,8 @@ def next_steps(discovery: Discovery) -> list[str]:
         steps.append("Until then the final model simulates well, whichever of them is the cause.")
     elif discovery.verdict == "unexplained":
         steps.append(
-            "Look at the places below where the model still fails; they say what kind of effect to think of."
+            "Look at the missing torque below, and at the places where the model still fails: the shape "
+            "over speed, position and voltage says what kind of effect to think of."
         )
         steps.append(
             "Check the recording (sampling, scaling, sensor range) and the constants that are "

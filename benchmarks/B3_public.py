@@ -1,0 +1,58 @@
+"""B3: discovery on public machines by their official protocols, beside published numbers.
+
+    python benchmarks/B3_public.py
+    python benchmarks/B3_public.py --only silverbox emps --fresh
+
+EMPS and the Silverbox are judged on their official tests, the rotary arm on runs that were left out. Needs
+the recordings: `rotflex data fetch emps silverbox rotary_arm`, or a folder named by `ROTFLEX_DATA`. Cases
+that `results/B3.json` has already are kept unless `--fresh` is given. Writes `results/B3.json` and the page
+`results/B3.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+if str(HERE) not in sys.path:
+    sys.path.insert(0, str(HERE))
+
+import rotflex_jax as rf
+from public_machines import CASES
+from public_machines.page import page
+
+RESULTS = HERE / "results"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="*", choices=tuple(CASES), default=tuple(CASES))
+    parser.add_argument("--fresh", action="store_true", help="Run again what the results have already.")
+    parser.add_argument("--out", type=Path, default=RESULTS / "B3.json")
+    given = parser.parse_args()
+    rf.enable_fast_loops()
+    rf.enable_compilation_cache()
+    found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.is_file() else {}
+    for name in given.only:
+        if name in found and not given.fresh:
+            continue
+        began = time.perf_counter()
+
+        def say(text: str, name: str = name, began: float = began) -> None:
+            print(f"{name} {time.perf_counter() - began:6.1f} s  {text}", flush=True)
+
+        found[name] = CASES[name](say) | {"seconds": round(time.perf_counter() - began, 1)}
+        found = {name: found[name] for name in CASES if name in found}
+        given.out.parent.mkdir(exist_ok=True)
+        given.out.write_text(json.dumps(found, indent=1) + "\n")
+        given.out.with_suffix(".md").write_text(page(found))
+    print(page(found))
+
+
+if __name__ == "__main__":
+    main()

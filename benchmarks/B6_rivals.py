@@ -1,0 +1,200 @@
+"""Other ways to find the hidden effect, on the same records as B0, marked by the same rules.
+
+    python benchmarks/B6_rivals.py --tuning --seeds 100 --workers 2
+
+The search's own row comes from the results of B0 (run that first, with the same arguments); nothing
+is recomputed that is in the results already. The structure that a rival names is fitted by the grey
+box, so its held-out error is that of its answer and not of its arithmetic.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+import traceback
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+import B0_discovery as B0
+
+HERE = Path(__file__).resolve().parent
+NAMES = (
+    "refit + BIC",
+    "torque balance + BIC",
+    "free-run residual + BIC",
+    "SINDy",
+    "SINDy ensemble",
+    "SINDy weak",
+    "neural torque + BIC",
+)
+OURS = "rotflex_jax"
+COLUMNS = (
+    "method",
+    "right first",
+    "exact set",
+    "false alarms",
+    "outside flagged",
+    "error over oracle's",
+    "within 5 %",
+    "s",
+    "failed",
+)
+Job = dict[str, Any]
+
+
+def one(job: Job) -> dict[str, Any]:
+    """A rival on a record; imports late, after the settings of the process."""
+    import rotflex_jax as rf
+    from arena.rivals import RIVALS
+    from arena.scoring import scored, visible
+    from arena.trial import SPLIT, recording, windows_error
+    from rotflex_jax.discover.room import make_room
+    from rotflex_jax.effects import CATALOG
+
+    row: dict[str, Any] = dict(job)
+    try:
+        rec, truth = recording(job)
+        wanted = visible([(e["effect"], e["port"]) for e in truth["effects"]], job["kind"])
+        train, test = rec.split(SPLIT)
+        wall, cpu = time.perf_counter(), time.process_time()
+        answer = RIVALS[job["rival"]](train)
+        row["wall_s"], row["cpu_s"] = time.perf_counter() - wall, time.process_time() - cpu
+        verdict = "found" if answer.rounds else "nothing_missing"
+        row.update(scored(wanted, answer.rounds, [[] for _ in answer.rounds], verdict))
+        row.update(wanted=[list(p) for p in wanted], verdict=verdict, note=answer.note)
+        row["rounds"] = [{"effect": e, "port": p, "equivalent": []} for e, p in answer.rounds]
+        make_room()
+        model = rf.joints.paper()
+        for name, port in answer.rounds:
+            model = model + CATALOG[name](at=port)
+        row["windows"] = windows_error(rf.fit(model, train).model, test)
+    except Exception as problem:  # the benchmark reports it and goes on
+        row["error"] = f"{type(problem).__name__}: {problem}"
+        row["traceback"] = traceback.format_exc()
+    return row
+
+
+def rows(todo: list[Job], workers: int) -> Iterator[tuple[Job, dict[str, Any]]]:
+    """Rows as they are ready; a process that dies takes only its own rows with it."""
+    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=B0.prepare) as pool:
+        running = {pool.submit(one, job): job for job in todo}
+        for done in as_completed(running):
+            job = running[done]
+            try:
+                yield job, done.result()
+            except Exception as problem:  # a dead process is a row too
+                yield job, {**job, "error": f"{type(problem).__name__}: {problem}"}
+
+
+def key(job: Job) -> str:
+    """Name of a row in the results."""
+    return f"{job['rival']}|{B0.key(job)}"
+
+
+def marks(own: dict[str, dict[str, Any]], records: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Sums over the records of one method; `own` are its rows, `records` those of B0 with the oracle."""
+    good = {k: r for k, r in own.items() if "error" not in r}
+    seen = {k: r for k, r in good.items() if r["wanted"] and not r["outside"]}
+    null = [r for r in good.values() if not r["wanted"]]
+    outside = [r for r in good.values() if r["outside"]]
+    count = lambda rows, name: [sum(bool(r[name]) for r in rows), len(rows)]  # noqa: E731
+    ratios = [
+        math.exp(statistics.fmean(math.log(r["windows"][c] / v) for c, v in best["windows"].items()))
+        for k, r in seen.items()
+        if (best := records.get(k, {}).get("oracle")) and r.get("windows")
+    ]
+    return {
+        "first": count(seen.values(), "first"),
+        "exact": count(seen.values(), "exact"),
+        "false_alarms": count(null, "extra"),
+        "unexplained": count(outside, "verdict_right"),
+        "over_oracle_median": statistics.median(ratios) if ratios else None,
+        "near_oracle": [sum(v < 1.05 for v in ratios), len(ratios)],
+        "seconds_median": statistics.median(r["wall_s"] for r in good.values()) if good else None,
+        "failed": len(own) - len(good),
+    }
+
+
+def table(summary: dict[str, dict[str, Any]]) -> Table:
+    """One row a method."""
+    out = Table(title="B6: one hidden effect, every method", header_style="bold")
+    for name in COLUMNS:
+        out.add_column(name)
+    part = lambda pair: f"{pair[0]}/{pair[1]}"  # noqa: E731
+    number = lambda x: "-" if x is None else f"{x:.2f}"  # noqa: E731
+    for name, s in summary.items():
+        out.add_row(
+            name,
+            *(part(s[k]) for k in ("first", "exact", "false_alarms", "unexplained")),
+            number(s["over_oracle_median"]),
+            part(s["near_oracle"]),
+            number(s["seconds_median"]),
+            str(s["failed"]),
+        )
+    return out
+
+
+def main() -> int:
+    """Run what is missing, save after each row, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--tuning", action="store_true", help="tuning seeds (report seeds if not)")
+    parser.add_argument("--seeds", default="", help="as 1000,1001; the first if omitted")
+    parser.add_argument("--input", default="noise", help="kind of input")
+    parser.add_argument("--only", default="", help="part of a name, as coulomb@hub or nothing")
+    parser.add_argument("--nulls", type=int, default=10, help="records with nothing hidden")
+    parser.add_argument("--rivals", default=",".join(NAMES), help="names, with commas between")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of a record [s]")
+    a = parser.parse_args()
+    known_seeds = B0.TUNING if a.tuning else B0.REPORT
+    seeds = [int(s) for s in a.seeds.split(",") if s] or list(known_seeds[:1])
+    if set(seeds) - set(known_seeds):
+        raise SystemExit(f"--seeds was given {seeds}; choose from {known_seeds[0]} to {known_seeds[-1]}.")
+    rivals = [n for n in a.rivals.split(",") if n]
+    if set(rivals) - set(NAMES):
+        raise SystemExit(f"--rivals was given {a.rivals}; choose from {', '.join(NAMES)}.")
+    suffix = "_tuning" if a.tuning else ""
+    path = HERE / "results" / f"B6{suffix}.json"
+    records = json.loads((HERE / "results" / f"B0{suffix}.json").read_text())["records"]
+    results: dict[str, Any] = {"benchmark": "B6", "runs": [], "rows": {}}
+    if path.exists():
+        results = json.loads(path.read_text())
+    results["runs"].append({**B0.provenance(), "arguments": vars(a)})
+    whole = argparse.Namespace(pairs=0, triples=0, size="1", channels="both", only=a.only)
+    whole.nulls, whole.seconds = a.nulls, a.seconds
+    base = B0.jobs(whole, seeds, [a.input])
+    wanted = [{**job, "rival": name} for job in base for name in rivals]
+    known = results["rows"]
+    todo = [j for j in wanted if key(j) not in known or "error" in known[key(j)]]
+    console = Console(highlight=False)
+    console.print(f"{len(wanted)} rows, {len(todo)} to run")
+    began = time.perf_counter()
+    for count, (job, row) in enumerate(rows(todo, a.workers), 1):
+        known[key(job)] = row
+        B0.save(path, results)
+        left = (time.perf_counter() - began) / count * (len(todo) - count)
+        found = " + ".join(f"{r['effect']}@{r['port']}" for r in row.get("rounds", [])) or "nothing"
+        line = f"{count}/{len(todo)} {key(job)} -> {row.get('error') or found} ({left:.0f} s left)"
+        console.print(line, markup=False, soft_wrap=True)
+    names = [B0.key(job) for job in base]
+    own = {k: records[k] for k in names if k in records}
+    summary = {OURS: marks(own, records)}
+    for name in rivals:
+        summary[name] = marks({k: known[f"{name}|{k}"] for k in names if f"{name}|{k}" in known}, records)
+    results["summary"] = summary
+    B0.save(path, results)
+    console.print(table(summary))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

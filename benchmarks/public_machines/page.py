@@ -1,0 +1,76 @@
+"""Results of B3 as markdown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+TITLES = {
+    "silverbox": "Silverbox",
+    "emps": "EMPS",
+    "rigid arm": "Rotary arm, rigid: learnt from the run with gain 6",
+    "flexible arm": "Rotary arm, flexible: learnt from the first 70 % of a run",
+}
+
+
+def page(found: dict[str, Any]) -> str:
+    parts = ["# Discovery on public machines\n", "Written by `python benchmarks/B3_public.py`.\n"]
+    for name, case in found.items():
+        parts += [f"\n## {TITLES[name]}\n", *_case(case)]
+    return "\n".join(parts) + "\n"
+
+
+def _case(case: dict[str, Any]) -> list[str]:
+    took = f"{case['discovery_seconds']:.0f} s for the discovery, {case['seconds']:.0f} s in all"
+    lines = [f"`{case['verdict']}`: {case['sentence']} ({took})\n", *_errors(case)]
+    for r in case["rounds"]:
+        same = f" Or: {', '.join(f'{e} at {p}' for e, p in r['equivalent'])}." if r["equivalent"] else ""
+        lines.append(f"- {r['effect']} at {r['port']}: {r['sentence']}.{same}")
+    lines += [f"- {note}" for note in case["notes"]]
+    kinds = ("estimates", "predictor estimates")
+    last = [row for row in case["rows"] if any(k in row for k in kinds)][-1]
+    return [*lines, "", *_parameters(case, last)]
+
+
+def _errors(case: dict[str, Any]) -> list[str]:
+    """Root mean square errors of free runs, round by round, published ones below."""
+    tests = list(case["rows"][0]["free run"])
+    both = "predictor" in case["rows"][0]
+    heads = [f"{t} [{case['unit']}]" for t in tests]
+    heads += [f"{t}, numbers of the predictor" for t in tests] if both else []
+    heads += [f"windows of 2 s, {c}" for c in case["rows"][0].get("windows", {})]
+    lines = ["| model | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
+    for k, row in enumerate(case["rows"]):
+        label = row["model"] if k == 0 or row["model"].startswith("the ") else "+ " + row["model"]
+        cells = [f"{row['free run'][t]:.3g}" for t in tests]
+        cells += [f"{row['predictor'][t]:.3g}" if "predictor" in row else "" for t in tests] if both else []
+        cells += [f"{e:.3g}" for e in row.get("windows", {}).values()]
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    if "bound" in case:
+        cells = [f"{case['bound']['errors'][t]:.3g}" for t in tests]
+        lines.append("| the last, fitted to the test itself (a bound) | " + " | ".join(cells) + " | |")
+    for method, errors in case["published"].items():
+        cells = [f"{errors[t]:.3g}" if t in errors else "" for t in tests]
+        lines.append(f"| published: {method} | " + " | ".join(cells) + " |" * (1 + both))
+    return [*lines, ""]
+
+
+def _parameters(case: dict[str, Any], row: dict[str, Any]) -> list[str]:
+    columns = {"predictor": "predictor estimates", "free run": "free-run estimates"}
+    columns = {k: v for k, v in columns.items() if v in row} or {"": "estimates"}
+    heads = [f"{k} 95 %".strip() for k in columns] + (["published"] if case["constants"] else [])
+    names = list(dict.fromkeys(n for v in columns.values() for n in row[v]))
+    lines = ["| parameter | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
+    for name in names:
+        cells = [_interval(row[v].get(name)) for v in columns.values()]
+        if case["constants"]:
+            cells.append(f"{case['constants'][name][0]:.4g}" if name in case["constants"] else "")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return [*lines, ""]
+
+
+def _interval(estimate: dict[str, Any] | None) -> str:
+    if estimate is None:
+        return ""
+    ci = estimate["ci95"]
+    inside = f" ({ci[0]:.4g} to {ci[1]:.4g})" if ci else ""
+    return f"{estimate['value']:.4g}{inside} {estimate['unit']}".rstrip()

@@ -1,0 +1,40 @@
+"""A discovery as rows of a table: each model on the way, fitted and scored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import rotflex_jax as rf
+
+Say = Callable[[str], None]
+
+
+def estimates(found: Any) -> dict[str, Any]:
+    """Fitted parameters with their intervals; `found` is a stage of a discovery or a fit."""
+    listed = found.estimates if hasattr(found, "estimates") else found.parameters
+    return {e.name: e.to_dict() for e in listed if e.free}
+
+
+def labels(result: rf.Discovery) -> list[str]:
+    """What each model on the way has more than the one before."""
+    return ["the machine as it is", *(f"{r.effect} at {r.port}" for r in result.rounds)]
+
+
+def told(result: rf.Discovery) -> dict[str, Any]:
+    """What a discovery says in words."""
+    return {
+        "verdict": result.verdict,
+        "sentence": result.sentence,
+        "rounds": [
+            {
+                "effect": r.effect,
+                "port": r.port,
+                "sentence": r.sentence,
+                "equivalent": list(map(list, r.equivalent)),
+            }
+            for r in result.rounds
+        ],
+        "notes": list(result.notes),
+        "discovery_seconds": round(result.elapsed_s, 1),
+    }

@@ -1,0 +1,219 @@
+"""Volterra series learnt sample by sample: LMS and its relatives, with settings by grid or by gradient."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rotflex_jax.adaptive import LMS, NLMS, RLS, AdaptiveFilter, Kalman, grid, run, tune
+from rotflex_jax.basis import Volterra
+from rotflex_jax.compare.banks import Kind, banks
+from rotflex_jax.compare.batch_series import RIDGES, in_words
+from rotflex_jax.compare.held_in import one_period
+from rotflex_jax.compare.method import Fitted, Progress
+from rotflex_jax.compare.series_rows import Rows, choose, series
+from rotflex_jax.compare.series_run import ChannelSeries, model_of
+from rotflex_jax.model import Model
+from rotflex_jax.recording import Recording
+from rotflex_jax.recording.quality import ACCEPTABLE
+
+Rule = Literal["lms", "nlms", "rls", "kalman"]
+
+
+@dataclasses.dataclass(frozen=True)
+class AdaptiveSeries:
+    """A Volterra series whose weights are adapted by a filter, then frozen.
+
+    Bank, time scale, and output or rate are those that batch least squares chooses, so that the filter
+    alone makes the difference. A rate is learnt from changes of the output over as many samples as a
+    model may look at, since those of one sample are mostly noise. Settings are chosen on halves of the
+    recordings, each judged on the others; how often the record is gone through, by the free run over
+    its last part. Not the way to use a whole recording: least squares does, and LMS only nears it.
+
+    Source: Mathews and Sicuranza 2000, Polynomial Signal Processing; Haykin 2002.
+
+    Attributes:
+        name: Short.
+        title: In words.
+        rule: Which filter.
+        gradient: Settings by gradient through the filter instead of by a grid.
+        bank: Kind of the bank.
+        order: Of the Volterra series.
+        count: Columns of the bank.
+        passes: Most times that the record is gone through; one for filters that remember all of it.
+        share: First part of each recording, for choices.
+    """
+
+    name: str
+    title: str
+    rule: Rule = "lms"
+    gradient: bool = False
+    bank: Kind = "delays"
+    order: int = 2
+    count: int = 10
+    passes: int = 30
+    share: float = 0.7
+    family: str = "adaptive"
+
+    def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
+        """Takes no notice of the model."""
+        one_period(train, "a series")
+        candidates = [Volterra(b, self.order) for b in banks(self.bank, self.count, train)]
+        choices, found, said = [], [], []
+        for c, name in enumerate(train[0].channels):
+            choices.append(choose(candidates, train, c, self.share, RIDGES))
+            learnt, words = self._learnt(choices[-1].series, train, c)
+            found.append(learnt)
+            said.append(words)
+            say(f"{name}: {words}")
+        result = model_of(found)
+        words = f"{in_words(choices, train[0])}; {', '.join(said)}"
+        return Fitted(result, result.parameters, words, result.predict)
+
+    def _learnt(self, batch: ChannelSeries, train: Sequence[Recording], c: int) -> tuple[ChannelSeries, str]:
+        """Weights of the filter on the basis of a batch fit, and its settings in words."""
+        rows = [Rows.of(batch.basis, r, c, batch.integrates) for r in train]
+        hold = train[0].n_init if batch.integrates else 0
+        data = [_samples(x, hold) for x in rows]
+        size = np.sqrt(np.mean(np.concatenate(data) ** 2, axis=0))
+        size = np.where(size > 0, size, 1.0)
+        shaped = Shaped(batch.basis, size, hold, batch.Ts)
+        halves = [h for r in train for h in _halves(r, c, hold, size[-1], min(x.N for x in train) // 2)]
+        noise = batch.noise / size[-1]
+        settings, filter = self._settings(shaped, halves, noise)
+        cuts = [round(self.share * r.N) for r in train]
+        first = np.concatenate([d[:n] for d, n in zip(data, cuts, strict=True)]) / size
+        passes = self.passes if self.rule in ("lms", "nlms") else 1
+        path = run(
+            filter, np.tile(first[:, :-1], (passes, 1)), np.tile(first[:, -1], passes), keep_every=len(first)
+        ).path
+        costs = []
+        for w in path[1:] / size[:-1] * size[-1]:
+            e = [x.error(w, n, r.n_init) for x, n, r in zip(rows, cuts, train, strict=True)]
+            costs.append(float(np.mean(np.concatenate(e) ** 2)))
+        best = 1 + int(np.argmin(np.nan_to_num(costs, nan=np.inf, posinf=np.inf)))
+        whole = np.concatenate(data) / size
+        end = run(filter, np.tile(whole[:, :-1], (best, 1)), np.tile(whole[:, -1], best))
+        if end.diverged:
+            raise RuntimeError(f"the filter {end.status}")
+        w = end.weights / size[:-1] * size[-1]
+        times = f", {best} passes" if passes > 1 else ""
+        return series(batch.basis, w, batch.integrates, train, c, rows), settings + times
+
+    def _settings(
+        self, basis: "Shaped", halves: Sequence[Recording], noise: float
+    ) -> tuple[str, AdaptiveFilter]:
+        """Settings of the filter, chosen for what the last weights are worth on the other halves."""
+        P, rule = basis.size, self.rule
+        build = Build(rule, tuple((basis.degrees > 1).tolist()), noise)
+        axes: dict[str, Any] = {
+            "lms": {"mu": np.logspace(-3.5, -0.3, 7) / P, "mu_products": np.logspace(-3.5, -0.3, 7) / P},
+            "nlms": {"mu": np.logspace(-3.5, 0, 10)},
+            "rls": {"lam": 1 - np.array([0.0, 1e-4, 1e-3]), "delta": np.logspace(0, 6, 7)},
+            "kalman": {"q": np.logspace(-12, -4, 5), "p0": np.logspace(-2, 4, 4)},
+        }[rule]
+        if self.gradient:
+            start = [{name: float(v[i * len(v) // 3]) for name, v in axes.items()} for i in (1, 2)]
+            found = tune(build, start, basis, halves, "y", objective="final", evaluations=25)
+        else:
+            found = grid(build, axes, basis, halves, "y", objective="final")
+        return ", ".join(f"{k} {v:.2g}" for k, v in found.settings.items()), found.filter
+
+
+@dataclasses.dataclass(frozen=True)
+class Build:
+    """Makes the filter of settings by name; one object of like fields is one compilation."""
+
+    rule: str
+    products: tuple[bool, ...]
+    noise: float
+
+    def __call__(self, s: dict[str, Any]) -> AdaptiveFilter:
+        """The filter; settings may be traced."""
+        if self.rule == "lms":
+            return LMS(jnp.where(np.array(self.products), s["mu_products"], s["mu"]))
+        if self.rule == "nlms":
+            return NLMS(s["mu"], 0.01 * len(self.products))
+        if self.rule == "rls":
+            return RLS(s["lam"], s["delta"])
+        return Kalman(q=s["q"], r=max(self.noise, 1e-6) ** 2, p0=s["p0"])
+
+
+class Shaped(eqx.Module):
+    """A series' regressors of size one, or their sums over the samples that a change is taken over."""
+
+    basis: Volterra
+    scale: Any
+    hold: int = eqx.field(static=True)
+    Ts: float = eqx.field(static=True)
+
+    def __init__(self, basis: Volterra, size: np.ndarray, hold: int, Ts: float) -> None:
+        self.basis, self.scale, self.hold, self.Ts = basis, size[:-1], hold, Ts
+
+    @property
+    def size(self) -> int:
+        """Number of regressors."""
+        return self.basis.size
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the regressors."""
+        return self.basis.names
+
+    @property
+    def degrees(self) -> Int[np.ndarray, " P"]:
+        """Degree of each regressor in the input."""
+        return self.basis.degrees
+
+    def units(self, input_unit: str = "V", output_unit: str = "rad") -> tuple[str, ...]:
+        """Of the weights: all of size one."""
+        return ("1",) * self.size
+
+    def kernels(self, w: Any, length: int | None = None) -> Mapping[int, Any]:
+        """Of the weights as they are in front of the series."""
+        return self.basis.kernels(np.asarray(w) / self.scale, length)
+
+    def respond(self, u: Float[Array, " N"]) -> Float[Array, "N P"]:
+        """Regressors for a signal."""
+        phi = self.basis.respond(u)
+        if self.hold:
+            total = self.Ts * jnp.cumsum(phi, axis=0)
+            nothing = jnp.zeros((self.hold, phi.shape[1]), phi.dtype)
+            phi = total - jnp.concatenate([nothing, total[: -self.hold]])
+        return phi / jnp.asarray(self.scale)[None, :]
+
+    def regressors(self, u: Any) -> Float[np.ndarray, "N P"]:
+        """The same as an array."""
+        return np.asarray(self.respond(jnp.asarray(u)))
+
+
+def _samples(x: Rows, hold: int) -> Float[np.ndarray, "N K"]:
+    """Regressors and output, or their changes; nothing is learnt from rows that are zero."""
+    joined = np.column_stack([x.phi, x.y])
+    if hold:
+        joined[hold:] = joined[hold:] - joined[:-hold]
+    joined[: max(x.skip, hold)] = 0.0
+    return joined
+
+
+def _halves(r: Recording, c: int, hold: int, size: float, length: int) -> list[Recording]:
+    """Parts of one length, with the output or its changes as the only channel."""
+    y = r.y[:, [c]].astype(float)
+    if hold:
+        y[hold:] = y[hold:] - r.y[:-hold, [c]]
+        y[:hold] = 0.0
+    whole = dataclasses.replace(
+        r,
+        y=y / size,
+        channels=("y",),
+        units=("1",),
+        resolution={"y": None},
+        n_init=length // 3,
+        accept=ACCEPTABLE,
+    )
+    cut = lambda i: dataclasses.replace(whole.slice(i, i + length), n_init=length // 3)  # noqa: E731
+    return [cut(i) for i in range(0, r.N - length + 1, length)]

@@ -1,0 +1,188 @@
+"""Terms of a sparse law of motion, and the motion that it makes; the same code to fit and to simulate."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.precision import double_precision
+from rotflex_jax.recording import Recording
+
+
+@dataclasses.dataclass(frozen=True)
+class Terms:
+    """A library of terms in outputs, their speeds and the input.
+
+        1, u, q, v, v|v|, tanh(v / width) as a sign, the last for sums of two speeds too,
+        and with degree 3 also q^2, q^3, v^3
+
+    Where the outputs are speeds themselves (order 1) there are no terms in q.
+
+    Attributes:
+        channels: Names of the outputs.
+        order: 2 where the law gives accelerations of the outputs, 1 where it gives their rates.
+        degree: 3 for powers of outputs and speeds, 1 for none.
+        width: Speed within which the sign turns, for each output.
+    """
+
+    channels: tuple[str, ...]
+    order: int
+    degree: int
+    width: tuple[float, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the terms."""
+        speeds = [f"{c}'" for c in self.channels] if self.order == 2 else list(self.channels)
+        names = ["1", "u"]
+        if self.order == 2:
+            powers = ("", "^2", "^3") if self.degree == 3 else ("",)
+            names += [f"{c}{p}" for p in powers for c in self.channels]
+        forms = ("{}", "{0}|{0}|", "sign {}") + (("{}^3",) if self.degree == 3 else ())
+        names += [form.format(s) for form in forms for s in speeds]
+        return (*names, *(f"sign({speeds[i]} + {speeds[j]})" for i, j in self._pairs))
+
+    @property
+    def _pairs(self) -> list[tuple[int, int]]:
+        n = len(self.channels)
+        return [(i, j) for i in range(n) for j in range(i)]
+
+    def values(self, x: Any, u: Any) -> Any:
+        """Terms (..., P) for states (..., order C) and the input (...); numpy or traced."""
+        xp = jnp if isinstance(x, jax.Array) else np
+        C = len(self.channels)
+        s, width = x[..., -C:], xp.asarray(self.width)
+        columns = [xp.ones_like(u)[..., None], u[..., None]]
+        if self.order == 2:
+            q = x[..., :C]
+            columns += [q, q**2, q**3] if self.degree == 3 else [q]
+        columns += [s, s * xp.abs(s), xp.tanh(s / width)] + ([s**3] if self.degree == 3 else [])
+        columns += [
+            xp.tanh((s[..., i] + s[..., j]) / (width[i] + width[j]))[..., None] for i, j in self._pairs
+        ]
+        return xp.concatenate(columns, axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class SparseLaw:
+    """A law of motion with few terms, as a simulator.
+
+    Attributes:
+        terms: Library.
+        W: Weights of the terms (P, C).
+        Ts: Sampling period that the first state is sought at [s].
+        speeds: Samples of the past that a speed is told from, one step ahead.
+    """
+
+    terms: Terms
+    W: Float[np.ndarray, "P C"]
+    Ts: float
+    speeds: int = 15
+
+    def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """Free run; the first state is the one that follows the first `n_init` samples best."""
+        self._check(recording)
+        u, m = recording.u.astype(float), recording.n_init
+        x = self._start(u[:m], recording.y[:m].astype(float))
+        return motions(self.terms, self.W[None], x[None, None], u[None], self.Ts)[
+            0, 0, :, : len(self.terms.channels)
+        ]
+
+    def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """One step ahead, from the last sample and the slope of the last few."""
+        self._check(recording)
+        y, C, k = recording.y.astype(float), len(self.terms.channels), self.speeds
+        t = np.arange(-k + 1, 1) * self.Ts
+        slope = np.linalg.pinv(np.vander(t, 3))[1]
+        v = np.stack([np.convolve(c, slope[::-1])[: len(y)] for c in y.T], axis=1)
+        v[: k - 1] = v[k - 1]
+        x = np.concatenate([y, v], axis=1) if self.terms.order == 2 else y
+        ahead = motions(
+            self.terms, self.W[None], x[None], np.repeat(recording.u.astype(float)[:, None], 2, 1), self.Ts
+        )
+        return np.concatenate([y[:1], ahead[0, :-1, 1, :C]])
+
+    def _check(self, recording: Recording) -> None:
+        if abs(recording.Ts / self.Ts - 1) > 1e-6:
+            raise InputError(
+                f"The law was fitted at a sampling period of {self.Ts:g} s, but the recording has "
+                f"{recording.Ts:g} s; fit it to a recording of that period."
+            )
+
+    def _start(self, u: np.ndarray, y: np.ndarray) -> Float[np.ndarray, " n"]:
+        """First state by Gauss-Newton, from a parabola through the samples."""
+        m, C = y.shape
+        if m < 4:
+            return np.concatenate([y[0], np.zeros(C)]) if self.terms.order == 2 else y[0]
+        p = np.polynomial.polynomial.polyfit(np.arange(m) * self.Ts, y, 2)
+        x = np.concatenate([p[0], p[1]]) if self.terms.order == 2 else p[0]
+        size = np.maximum(
+            np.abs(x), 1e-3 * np.maximum(np.tile(np.abs(y).max(axis=0), self.terms.order), 1e-9)
+        )
+        scale = np.maximum(y.std(axis=0), 1e-9 + 1e-3 * np.abs(y).max())
+        best, least = x, np.inf
+        for _ in range(4):
+            lanes = np.concatenate([x[None], x + np.diag(1e-4 * size)])
+            runs = motions(self.terms, self.W[None], lanes[None], np.tile(u, (len(lanes), 1)), self.Ts)[
+                0, :, :, :C
+            ]
+            e = ((y - runs) / scale).reshape(len(lanes), -1)
+            cost = float(e[0] @ e[0])
+            if not cost < least:
+                break
+            best, least = x, cost
+            J = (e[1:] - e[0]).T / 1e-4
+            if not np.isfinite(J).all():
+                break
+            x = x - size * np.linalg.lstsq(J, e[0], rcond=1e-6)[0]
+        return best
+
+
+def motions(
+    terms: Terms,
+    W: Float[np.ndarray, "K P C"],
+    x0: Float[np.ndarray, "K M n"],
+    u: Float[np.ndarray, "M N"],
+    Ts: float,
+) -> Float[np.ndarray, "K M N n"]:
+    """States of K laws from M first states each, under M inputs held between samples."""
+    N = u.shape[1]
+    padded = np.zeros((len(u), max(2, 1 << (N - 1).bit_length())))
+    padded[:, :N] = u
+    with double_precision():
+        run = _motions(
+            terms.order,
+            terms.degree,
+            terms.channels,
+            np.array(terms.width),
+            *map(jnp.asarray, (W, x0, padded, float(Ts))),
+        )
+        return np.asarray(run)[:, :, :N]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _motions(
+    order: int, degree: int, channels: tuple[str, ...], width: Array, W: Array, x0: Array, u: Array, Ts: Array
+) -> Array:
+    terms, C = Terms(channels, order, degree, width), len(channels)  # pyright: ignore[reportArgumentType]
+
+    def one(W: Array, x: Array, u: Array) -> Array:
+        def rate(x: Array, u: Array) -> Array:
+            last = terms.values(x, u) @ W
+            return jnp.concatenate([x[C:], last]) if order == 2 else last
+
+        def step(x: Array, u: Array) -> tuple[Array, Array]:
+            a = rate(x, u)
+            b = rate(x + Ts / 2 * a, u)
+            c = rate(x + Ts / 2 * b, u)
+            d = rate(x + Ts * c, u)
+            return x + Ts / 6 * (a + 2 * b + 2 * c + d), x
+
+        return jax.lax.scan(step, x, u)[1]
+
+    return jax.vmap(lambda W, x: jax.vmap(lambda x, u: one(W, x, u))(x, u))(W, x0)

@@ -1,0 +1,182 @@
+"""A model as state space about an operating point, for control design."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Force, Gear, Memory
+from rotflex_jax.errors import InputError, optional
+from rotflex_jax.mechanism.assembly import Layout, effects_of, equations
+from rotflex_jax.mechanism.sensors import read_outputs
+from rotflex_jax.mechanism.states import state_names
+from rotflex_jax.mechanism.torques import flows, torques
+from rotflex_jax.model import Model
+from rotflex_jax.precision import double_precision
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearModel:
+    """`x' = A x + B u`, `y = C x + D u`, all deviations from an operating point.
+
+    Attributes:
+        A: (n, n).
+        B: (n, 1).
+        C: (channels, n).
+        D: (channels, 1); zero, since a voltage moves nothing at once.
+        Ts: Sampling period [s]; None for continuous time.
+        states: Names.
+        inputs: Names.
+        outputs: Names.
+        dropped: What the linear model is without, one sentence each.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    Ts: float | None
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    dropped: tuple[str, ...]
+
+    def discretise(self, Ts: float) -> "LinearModel":
+        """The same model from sample to sample, exact for an input held between samples."""
+        if self.Ts is not None:
+            raise InputError("The model is in discrete time already; discretise the continuous one.")
+        if not (np.isfinite(Ts) and Ts > 0):
+            raise InputError(f"Ts was given as {Ts!r}, but it is a sampling period in seconds; give one.")
+        n = len(self.A)
+        big = scipy.linalg.expm(np.block([[self.A, self.B], [np.zeros((1, n + 1))]]) * Ts)
+        return dataclasses.replace(self, A=big[:n, :n], B=big[:n, n:], Ts=float(Ts))
+
+    def to_control(self) -> Any:
+        """A `StateSpace` of the package python-control, with names.
+
+        Raises:
+            InputError: The package is not installed.
+        """
+        control = optional("control", "A state space for python-control")
+        return control.ss(
+            *(self.A, self.B, self.C, self.D),
+            *([] if self.Ts is None else [self.Ts]),
+            states=list(self.states),
+            inputs=list(self.inputs),
+            outputs=list(self.outputs),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        matrices = {name: getattr(self, name).tolist() for name in "ABCD"}
+        names = {name: list(getattr(self, name)) for name in ("states", "inputs", "outputs", "dropped")}
+        return {"kind": "state space", **matrices, "Ts": self.Ts, **names}
+
+
+def state_space(
+    model: Model,
+    Ts: float | None = None,
+    positions: Sequence[float] | None = None,
+    speeds: Sequence[float] | None = None,
+    voltage: float = 0.0,
+) -> LinearModel:
+    """The model linearised about an operating point.
+
+    Linear effects enter exactly, torque laws and memories with their slope, sensors with theirs. Memories
+    stand at the value at which they would rest at the operating point, as far as the speed lets them.
+    What has no slope is left out and named: dry friction, what happens to the voltage before the motor,
+    the play of a gear. Not for a friction that decides the motion: simulate that.
+
+    Args:
+        model: Mechanism with its numbers, or a Model.
+        Ts: Sampling period [s] of a discrete model; None for continuous time.
+        positions: Of the coordinates; zero if None.
+        speeds: Of the coordinates; zero if None.
+        voltage: At the motor [V].
+
+    Returns:
+        LinearModel.
+
+    Source: Any text on control, for instance K. J. Åström and R. M. Murray, Feedback Systems, 2nd ed.,
+    2021, section 6.4.
+    """
+    mechanism, layout = model.mechanism, Layout.of(model.mechanism.structure)
+    point = [_point(x, layout.n, what) for x, what in ((positions, "positions"), (speeds, "speeds"))]
+    start = layout.linear
+    with double_precision():
+        gates = model.numbers()[1]
+        eq = equations(mechanism, gates)
+        smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
+
+        def slope(x: jax.Array, u: jax.Array) -> jax.Array:
+            L, z = x[:start], x[start:]
+            dL = eq.A @ L + eq.B * u[0]
+            if smooth:
+                dL = dL + eq.ports @ torques(mechanism, L, z, u[0], gates)
+            return jnp.concatenate([dL, flows(mechanism, L, z, u[0], gates)]) if z.shape[0] else dL
+
+        x = np.concatenate([*point, np.zeros(start - 2 * layout.n), _rests(model, layout)])
+        u = jnp.asarray([float(voltage)])
+        x = _settled(slope, jnp.asarray(x), u, start)
+        A, B = (np.asarray(m) for m in jax.jacfwd(slope, argnums=(0, 1))(x, u))
+        C = np.asarray(jax.jacfwd(lambda s: read_outputs(mechanism, gates, s))(x))
+    names = state_names(mechanism)
+    # A gear is tight here, so its rotor has no state of its own.
+    kept = [i for i in range(layout.size) if not layout.rotor <= i < start]
+    linear = LinearModel(
+        A=A[np.ix_(kept, kept)],
+        B=B[kept],
+        C=C[:, kept],
+        D=np.zeros((len(C), 1)),
+        Ts=None,
+        states=tuple(names[i] for i in kept),
+        inputs=("voltage",),
+        outputs=mechanism.channels,
+        dropped=tuple(_dropped(model)),
+    )
+    return linear if Ts is None else linear.discretise(Ts)
+
+
+def _point(given: Sequence[float] | None, n: int, what: str) -> np.ndarray:
+    values = np.zeros(n) if given is None else np.asarray(given, dtype=float)
+    if values.shape != (n,):
+        raise InputError(
+            f"{values.size} {what} were given, but the model has {n} coordinates; give one for each."
+        )
+    return values
+
+
+def _rests(model: Model, layout: Layout) -> np.ndarray:
+    return np.array([e.initial() for _, e in effects_of(model.mechanism, Memory)], dtype=float)
+
+
+def _settled(slope: Any, x: jax.Array, u: jax.Array, start: int) -> jax.Array:
+    """The state with its memories, currents included, at rest where they have a place of rest."""
+    for k in range(start, len(x)):
+        for _ in range(20):
+            rate, gain = slope(x, u)[k], jax.jacfwd(lambda s: slope(s, u))(x)[k, k]
+            if not (jnp.isfinite(gain) and gain < 0):
+                break
+            x = x.at[k].add(-rate / gain)
+            if abs(rate / gain) <= 1e-14 * (1 + abs(x[k])):
+                break
+    return x
+
+
+def _dropped(model: Model) -> list[str]:
+    reasons: dict[type[Effect], str] = {
+        DryFriction: "has no slope at rest",
+        Actuation: "acts on the voltage before the motor, which is the input here",
+        Gear: "has no slope within the play; the gear is taken as tight",
+    }
+    gates = model.gates or (1.0,) * len(model.mechanism.effects)
+    return [
+        f"{e.title} at {e.at} {reason}"
+        for e, gate in zip(model.mechanism.effects, gates, strict=True)
+        for kind, reason in reasons.items()
+        if isinstance(e, kind) and gate
+    ]

@@ -1,0 +1,94 @@
+"""Units and words of a machine that does not turn.
+
+Effects speak of a turning port: angles in rad, torques in N m. A machine may say that its ports move
+otherwise, in metres under forces in newtons, or in volts under volts; then every unit follows by
+dimensions, and sentences speak of forces.
+"""
+
+import re
+from typing import NamedTuple
+
+_UNIT = re.compile(
+    r"kg m\^2|\(N m\)\^2|N m\b(?: s(?:\^\d)?(?![a-z]))?(?:/(?:rad|s|A|V)(?:\^\d)?)*|rad\b(?:/s(?:\^\d)?)?"
+)
+_ANGLE_TOO = re.compile(r" \([-+]?[\d.e+-]+ degrees\)")
+_WORDS = (("torque", "force"), ("turning", "moving"), ("turns", "moves"), ("turned", "moved"))
+
+
+class Units(NamedTuple):
+    """How the ports of a machine move.
+
+    Attributes:
+        motion: Unit of a port's position.
+        effort: Unit of what drives it.
+        motion_size: How large its positions are, next to the radians of a small joint.
+        effort_size: The same for what drives it, next to newton metres.
+    """
+
+    motion: str = "rad"
+    effort: str = "N m"
+    motion_size: float = 1.0
+    effort_size: float = 1.0
+
+    def unit(self, declared: str) -> str:
+        """A unit that an effect declares, as it is for this machine.
+
+        >>> Units("m", "N").unit("N m s/rad"), Units("m", "N").unit("kg m^2")
+        ('N s/m', 'kg')
+        """
+        if (self.motion, self.effort) == ("rad", "N m"):
+            return declared
+        powers = _powers(declared)
+        Q, E = powers.pop("rad", 0), powers.pop("N m", 0)
+        if (self.motion, self.effort, powers.get("s", 0), E, Q) == ("m", "N", 2, 1, -1):
+            powers, E, Q = {"kg": 1} | {k: v for k, v in powers.items() if k != "s"}, 0, 0
+        whole: dict[str, int] = {}
+        for name, power in ((self.effort, E), *powers.items(), (self.motion, Q)):
+            whole[name] = whole.get(name, 0) + power
+        return _written(whole)
+
+    def size(self, declared: str) -> float:
+        """By what a typical size that an effect declares grows for this machine."""
+        powers = _powers(declared)
+        return self.effort_size ** powers.get("N m", 0) * self.motion_size ** powers.get("rad", 0)
+
+    def sentence(self, text: str) -> str:
+        """What an effect says of itself, in the units and words of this machine.
+
+        >>> Units("m", "N").sentence("the axis meets a torque of 20 N m whichever way it turns")
+        'the axis meets a force of 20 N whichever way it moves'
+        """
+        if self.motion == "rad":
+            return text
+        text = _ANGLE_TOO.sub("", text)
+        text = _UNIT.sub(lambda found: self.unit(found.group()), text)
+        for word, instead in _WORDS:
+            text = text.replace(word, instead)
+        return text
+
+
+TURNING = Units()
+
+
+def _powers(unit: str) -> dict[str, int]:
+    """Factors of a unit and their powers; an inertia as torque per angular acceleration.
+
+    >>> _powers("N m s^2/rad^2"), _powers("kg m^2")
+    ({'N m': 1, 's': 2, 'rad': -2}, {'N m': 1, 's': 2, 'rad': -1})
+    """
+    text = unit.replace("kg m^2", "N m s^2/rad").replace("(N m)^2", "Nm^2").replace("N m", "Nm")
+    powers: dict[str, int] = {}
+    for k, part in enumerate(text.split("/")):
+        for factor in part.split():
+            name, _, power = factor.strip("()").partition("^")
+            if name != "1":
+                name = "N m" if name == "Nm" else name
+                powers[name] = powers.get(name, 0) + (1 if k == 0 else -1) * int(power or 1)
+    return powers
+
+
+def _written(powers: dict[str, int]) -> str:
+    raised = lambda name, power: name if power == 1 else f"{name}^{power}"  # noqa: E731
+    above = " ".join(raised(n, p) for n, p in powers.items() if p > 0)
+    below = "".join("/" + raised(n, -p) for n, p in powers.items() if p < 0)
+    return (above or ("1" if below else "")) + below

@@ -1,0 +1,161 @@
+"""Linear models from data: poles of known systems, pasts of series, choices within the training data."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import rotflex_jax as rf
+from rotflex_jax.basis import Volterra
+from rotflex_jax.basis.averages import Averages
+from rotflex_jax.compare import ARX, AdaptiveSeries, BatchSeries, LinearStateSpace, Subspace
+from rotflex_jax.compare.output_error import refined
+from rotflex_jax.compare.series_run import products, responses
+from rotflex_jax.compare.subspace import subspace
+from rotflex_jax.recording import Recording
+
+Ts = 0.01
+POLES = np.array([0.97 * np.exp(0.25j), 0.97 * np.exp(-0.25j), 0.9])
+
+
+def quiet(text: str) -> None:
+    del text
+
+
+def driven(seconds: float = 20.0, noise: float = 0.01, seed: int = 0, integrates: bool = False) -> Recording:
+    """Outputs of scipy's filters: a resonance with a lag, and a lag, with noise of the sensors."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.normal(size=round(seconds / Ts / 8)), 8)
+    first = scipy.signal.lfilter([0.0, 0.01, 0.02], np.poly(POLES[:2]).real, u)
+    first = scipy.signal.lfilter([0.1], [1.0, -0.9], first)
+    last = scipy.signal.lfilter([0.0, 0.1], [1.0, -0.9], u)
+    if integrates:
+        first = Ts * np.cumsum(first)
+    y = np.column_stack([first, last]) + noise * rng.normal(size=(len(u), 2)) * [first.std(), last.std()]
+    return Recording(u=u, y=y, Ts=Ts, n_init=40)
+
+
+def test_the_subspace_method_finds_the_poles_that_scipy_simulated() -> None:
+    system = subspace([driven(noise=1e-6)], 20, (3,))[3]
+    for pole in POLES:
+        assert np.min(np.abs(system.poles - pole)) < 1e-4
+    frequencies = np.linspace(0.01, 2.0, 20)
+    z = np.exp(1j * frequencies)
+    mine = [system.C @ np.linalg.solve(x * np.eye(3) - system.A, system.B[:, 0]) + system.D[:, 0] for x in z]
+    _, reference = scipy.signal.freqz([0.0, 0.1], [1.0, -0.9], frequencies)
+    np.testing.assert_allclose(np.array(mine)[:, 1], reference, atol=1e-3 * np.abs(reference).max())
+
+
+def test_a_free_run_fit_is_better_than_the_subspace_estimate_in_noise() -> None:
+    record = driven(noise=0.2)
+    begun = subspace([record], 10, (3,))[3]
+    fitted = refined(begun, [record])
+    true = driven(noise=0.0)
+    error = lambda s: np.sqrt(np.mean((s.simulate(true) - true.y)[40:] ** 2, axis=0)) / true.y.std(axis=0)  # noqa: E731
+    assert np.all(error(fitted) < 0.03)
+    assert np.all(error(fitted) < error(begun) + 1e-3)
+    for pole in POLES[::2]:
+        assert np.min(np.abs(fitted.poles - pole)) < 0.01
+
+
+@pytest.mark.parametrize("method", [Subspace(), LinearStateSpace(orders=(2, 3, 4))])
+def test_a_linear_plant_with_an_integrator_is_followed_to_the_noise(method: object) -> None:
+    train, test = driven(noise=0.002, integrates=True), driven(8.0, noise=0.0, seed=3, integrates=True)
+    fitted = method.fit(None, [train], quiet)  # type: ignore[attr-defined]
+    e = (fitted.simulator.simulate(test) - test.y)[40:]
+    assert np.all(np.sqrt(np.mean(e**2, axis=0)) < 0.05 * test.y.std(axis=0))
+    assert any(abs(p - 1) < 0.01 for p in fitted.simulator.poles)
+    ahead = fitted.predict(train)[40:] - train.y[40:]
+    assert np.all(np.sqrt(np.mean(ahead**2, axis=0)) < 0.02 * train.y.std(axis=0))
+
+
+@pytest.mark.parametrize("method", [Subspace(), LinearStateSpace(orders=(3,)), ARX(orders=(4,))])
+def test_one_step_ahead_sees_only_what_came_before(method: object) -> None:
+    record = driven(6.0)
+    fitted = method.fit(None, [record], quiet)  # type: ignore[attr-defined]
+    k = 300
+    y = record.y.copy()
+    y[k:] += 1.0
+    changed = dataclasses.replace(record, y=y)
+    before, after = fitted.predict(record), fitted.predict(changed)
+    np.testing.assert_array_equal(before[: k + 1], after[: k + 1])
+    assert not np.allclose(before[k + 1], after[k + 1])
+
+
+def test_wide_taps_are_means_of_the_delays() -> None:
+    u = np.random.default_rng(0).normal(size=50)
+    z = Averages(3, 4, first=2).outputs(u)
+    padded = np.concatenate([np.zeros(20), u])
+    for t, i in ((0, 0), (10, 1), (49, 2)):
+        last = 20 + t - 2 - 4 * i
+        assert z[t, i] == pytest.approx(padded[last - 3 : last + 1].mean())
+    assert Averages(3, 4, first=2).reach == 14
+
+
+def test_products_are_those_of_the_basis() -> None:
+    basis = Volterra(Averages(3, 2), 3)
+    u = np.random.default_rng(0).normal(size=80)
+    np.testing.assert_allclose(products(basis, responses(basis.bank, u)), basis.regressors(u), atol=1e-12)
+
+
+def volterra_plant(seed: int, integrates: bool = False, N: int = 3000, noise: float = 0.01) -> Recording:
+    """A plant that is a Volterra series of order 2 on steps of four samples, in numpy alone."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.normal(size=N // 2), 2)
+    past = np.concatenate([np.zeros(20), u])
+    tap = [np.array([past[20 + t - 4 - 4 * i : 20 + t - 4 * i].mean() for t in range(N)]) for i in range(3)]
+    y = 0.2 + tap[0] - 0.5 * tap[1] + 0.25 * tap[2] + 0.4 * tap[0] * tap[1] - 0.3 * tap[2] ** 2
+    if integrates:
+        y = Ts * np.cumsum(y)
+    return Recording(u=u, y=y + noise * y.std() * rng.normal(size=N), Ts=Ts, channels="speed", n_init=50)
+
+
+@pytest.mark.parametrize("integrates", [False, True])
+def test_a_volterra_plant_is_found_with_its_memory(integrates: bool) -> None:
+    train, test = volterra_plant(1, integrates), volterra_plant(2, integrates, noise=0.0)
+    fitted = BatchSeries("v", "v", count=3).fit(None, [train], quiet)  # type: ignore[arg-type]
+    (channel,) = fitted.simulator.channels  # type: ignore[attr-defined]
+    assert channel.integrates is integrates
+    # Widths are tried on a coarse grid; the one of the plant is among them only by luck.
+    part = test.slice(1000, 3000)
+    e = (fitted.simulator.simulate(part) - part.y)[part.n_init :]
+    assert np.sqrt(np.mean(e**2)) < (0.5 if channel.basis.bank.width != 4 else 0.05) * part.y.std()
+
+
+def test_weights_and_past_of_a_series_are_those_of_the_plant() -> None:
+    from rotflex_jax.compare.series_rows import choose
+
+    train, test = volterra_plant(1), volterra_plant(2, noise=0.0)
+    series = choose([Volterra(Averages(3, 4))], [train], 0, 0.7).series
+    truth = dict.fromkeys(series.basis.names, 0.0)
+    names = list(series.basis.names)
+    for name, w in zip(
+        (names[0], names[1], names[2], names[3], names[5], names[9]),
+        (0.2, 1, -0.5, 0.25, 0.4, -0.3),
+        strict=True,
+    ):
+        truth[name] = w
+    np.testing.assert_allclose(series.weights, list(truth.values()), atol=0.02)
+    # From the middle of a motion, the first samples tell what the input was before.
+    part = test.slice(1000, 1400)
+    run = series.simulate(part.u, part.y[: part.n_init, 0])
+    assert np.sqrt(np.mean((run - part.y[:, 0]) ** 2)) < 0.02 * part.y.std()
+
+
+@pytest.mark.parametrize("rule", ["lms", "nlms", "rls", "kalman"])
+def test_every_filter_learns_the_plant(rule: str) -> None:
+    train, test = volterra_plant(1, N=2400), volterra_plant(2, N=1000, noise=0.0)
+    method = AdaptiveSeries("a", "a", rule, count=3, passes=5)  # type: ignore[arg-type]
+    fitted = method.fit(None, [train], quiet)  # type: ignore[arg-type]
+    best = BatchSeries("v", "v", count=3).fit(None, [train], quiet)  # type: ignore[arg-type]
+    error = lambda f: float(np.sqrt(np.mean((f.simulator.simulate(test) - test.y)[50:] ** 2)))  # noqa: E731
+    assert error(fitted) < 2 * error(best) + 0.1 * test.y.std()
+
+
+def test_a_single_output_that_is_a_speed() -> None:
+    record = volterra_plant(1)
+    mechanism = rf.joints.single_inertia(channel="speed")
+    table = rf.compare(record, ["arx", "subspace", "state_space", "laguerre_ridge"], mechanism=mechanism)
+    assert {row.status for row in table.rows} == {"ok"}
+    assert all(row.rmse["speed"] < record.y.std() for row in table.rows)

@@ -1,0 +1,119 @@
+"""Sparse laws of motion: a known equation, pysindy called directly, what happens without it, and the page."""
+
+import builtins
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.signal
+
+import rotflex_jax as rf
+from rotflex_jax.compare import SINDy
+from rotflex_jax.compare.sindy import smooth
+from rotflex_jax.compare.sparse_terms import SparseLaw, Terms, motions
+from rotflex_jax.errors import InputError
+from rotflex_jax.recording import Recording
+
+Ts = 0.01
+LIMITS: dict[str, Any] = {
+    "smoothings": (("savgol", 9), ("spline", 5.0)),
+    "thresholds": (0.0, 0.03),
+    "orders": (2,),
+}
+
+
+def pendulum(seed: int = 0, seconds: float = 12.0, noise: float = 0.0) -> Recording:
+    """q'' = -9 q - 0.4 q' - 2 q^3 + 3 u, by scipy; the input is held."""
+    rng = np.random.default_rng(seed)
+    N = round(seconds / Ts)
+    u = np.repeat(rng.normal(size=N // 20), 20)
+    x, states = np.zeros(2), []
+    for level in u:
+        states.append(x)
+        law = lambda t, x, level=level: [x[1], -9 * x[0] - 0.4 * x[1] - 2 * x[0] ** 3 + 3 * level]  # noqa: E731
+        x = scipy.integrate.solve_ivp(law, (0.0, Ts), x, rtol=1e-9, atol=1e-11).y[:, -1]
+    y = np.array(states)[:, 0]
+    return Recording(u=u, y=y + noise * rng.normal(size=N), Ts=Ts, channels="q", n_init=40)
+
+
+@pytest.mark.parametrize("variant", ["plain", "ensemble", "weak"])
+def test_the_law_behind_the_data_is_found(variant: Any) -> None:
+    pytest.importorskip("pysindy")
+    train, test = pendulum(0, noise=1e-5), pendulum(1)
+    fitted = SINDy(variant=variant, degrees=(3,), bags=5, **LIMITS).fit(None, [train], lambda _: None)  # type: ignore[arg-type]
+    law: Any = fitted.simulator
+    found = dict(zip(law.terms.names, law.W[:, 0], strict=True))
+    assert found["u"] == pytest.approx(3.0, rel=0.05)
+    assert found["q"] == pytest.approx(-9.0, rel=0.05)
+    assert found["q^3"] == pytest.approx(-2.0, rel=0.25)
+    part = test.slice(300, 800)
+    e = (law.simulate(part) - part.y)[part.n_init :]
+    assert np.sqrt(np.mean(e**2)) < 0.1 * part.y.std()
+    assert fitted.parameters == np.count_nonzero(law.W)
+    assert "choices" in fitted.note
+
+
+def test_the_weights_are_those_of_pysindy_called_directly() -> None:
+    ps = pytest.importorskip("pysindy")
+    train = pendulum(0)
+    method = SINDy(smoothings=(("savgol", 9),), thresholds=(0.03,), orders=(2,), degrees=(3,))
+    fitted = method.fit(None, [train], lambda _: None)  # type: ignore[arg-type]
+    law: Any = fitted.simulator
+    y = train.y[:, 0]
+    v, a = (scipy.signal.savgol_filter(y, 9, 3, deriv=d, delta=Ts) for d in (1, 2))
+    q = scipy.signal.savgol_filter(y, 9, 3)
+    s = 0.03 * np.sqrt(np.mean(v**2))
+    u = (train.u + np.concatenate([train.u[:1], train.u[:-1]])) / 2
+    library = np.column_stack([u * 0 + 1, u, q, q**2, q**3, v, v * abs(v), np.tanh(v / s), v**3])[10:-10]
+    size, rate = np.sqrt(np.mean(library**2, axis=0)), a[10:-10]
+    out = np.sqrt(np.mean(rate**2))
+    direct = (
+        ps.STLSQ(threshold=0.03, alpha=1e-6, max_iter=30).fit(library / size, (rate / out)[:, None]).coef_[0]
+    )
+    np.testing.assert_allclose(law.W[:, 0], direct / size * out, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [("savgol", 15), ("spline", 8.0)])
+def test_smoothing_gives_speed_and_acceleration(kind: tuple[str, float]) -> None:
+    t = Ts * np.arange(600)
+    record = Recording(u=np.cos(t), y=np.sin(3 * t), Ts=Ts, channels="q")
+    q, v, a = smooth(record, kind).T[:, 40:-40]
+    np.testing.assert_allclose(q, np.sin(3 * t)[40:-40], atol=2e-3)
+    np.testing.assert_allclose(v, 3 * np.cos(3 * t)[40:-40], atol=1e-2)
+    np.testing.assert_allclose(a, -9 * np.sin(3 * t)[40:-40], atol=0.2)
+    with pytest.raises(InputError, match="savgol"):
+        smooth(record, ("wavelet", 3))
+
+
+def test_motion_is_that_of_scipy() -> None:
+    record = pendulum(2, 3.0)
+    terms = Terms(("q",), 2, 3, (1e-3,))
+    W = np.zeros((len(terms.names), 1))
+    for name, w in {"u": 3.0, "q": -9.0, "q'": -0.4, "q^3": -2.0}.items():
+        W[terms.names.index(name)] = w
+    run = motions(terms, W[None], np.zeros((1, 1, 2)), record.u[None], Ts)[0, 0]
+    np.testing.assert_allclose(run[:, 0], record.y[:, 0], atol=1e-6)
+    part = record.slice(100, 300)
+    np.testing.assert_allclose(SparseLaw(terms, W, Ts).simulate(part), part.y, atol=1e-4)
+    law, k = SparseLaw(terms, W, Ts), 120
+    y = record.y.copy()
+    y[k:] += 0.5
+    changed = dataclasses.replace(record, y=y)
+    np.testing.assert_array_equal(law.predict(record)[: k + 1], law.predict(changed)[: k + 1])
+
+
+def test_without_pysindy_the_row_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    load = builtins.__import__
+
+    def missing(name: str, *rest: Any, **named: Any) -> Any:
+        if name == "pysindy":
+            raise ImportError(name)
+        return load(name, *rest, **named)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    mechanism = rf.joints.single_inertia(channel="q")
+    row = rf.compare(pendulum(0, 2.0), ["sindy"], mechanism=mechanism)["sindy"]
+    assert row.status == "failed"
+    assert "rotflex_jax[baselines]" in row.reason

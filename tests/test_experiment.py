@@ -1,0 +1,310 @@
+"""The worth of an input against explicit least squares, SciPy, differences, and the independent simulator."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import rotflex_jax as rf
+import rotflex_jax.effects as fx
+from arena.records import make_record
+from rotflex_jax.data.excitation import multisine, noise, prbs
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment import imitation
+from rotflex_jax.experiment.ascent import improved
+from rotflex_jax.experiment.contest import Contest
+from rotflex_jax.experiment.hypotheses import hypothesis, place_of
+from rotflex_jax.experiment.imitation import imitate, truth
+from rotflex_jax.experiment.limits import Limits
+from rotflex_jax.model import Model
+from rotflex_jax.precision import double_precision
+
+Ts = 0.004
+NOISE = np.array([5.3e-4, 5.3e-4])
+DELAY, LAG = ("delay", "input"), ("lag", "input")
+V = Limits(voltage=2.0)
+
+
+def machine() -> Model:
+    """The joint of the independent simulator."""
+    return Model(rf.joints.paper(joint_damping=0.003, hub_damping=0.004))
+
+
+def pair(time: float = 0.003, Ts: float = Ts):
+    """Delay and lag of one size."""
+    a = hypothesis(machine(), fx.Delay(time=time), LAG, {}, NOISE, Ts)
+    return a, hypothesis(machine(), fx.Lag(time=time), DELAY, {}, NOISE, Ts)
+
+
+@pytest.fixture(scope="module")
+def contest():
+    return Contest(pair(), Ts, V)
+
+
+def test_nats_of_a_linear_rival_are_the_noncentrality_of_least_squares():
+    """A free inertia under a delayed voltage, explained by first state, offset and bias alone."""
+    m = rf.Mechanism(
+        coordinates=("x",),
+        ports={"hub": (1.0,)},
+        effects=(fx.Inertia(at="hub", inertia=0.5), fx.Motor(at="hub", back_emf=0.0)),
+        outputs={"x": "hub"},
+    )
+    m = m.trust(*m.parameter_names)
+    sd, N = np.array([1e-4]), 300
+    # Twice the sampling period: no interpolation between samples.
+    a = hypothesis(Model(m + fx.Delay(time=2 * Ts)), DELAY, ("sensor_bias", "x"), {}, sd, Ts)
+    a = dataclasses.replace(a, moved=())
+    b = hypothesis(Model(m), ("sensor_bias", "x"), DELAY, {}, sd, Ts)
+    u = noise(N, Ts, seed=3)
+    y = truth(a, u, Ts)
+    t = Ts * np.arange(N)
+    late = np.concatenate([[u[0]] * 2, u[:-2]])
+    gain = fx.Motor(at="hub", back_emf=0.0).stamp().drive / 0.5
+    speed = np.concatenate([[0.0], np.cumsum(gain * late * Ts)])[:-1]
+    place = np.concatenate([[0.0], np.cumsum(speed * Ts + gain * late * Ts**2 / 2)])[:-1]
+    np.testing.assert_allclose(y[:, 0], place, atol=1e-12)
+    now = np.concatenate([[0.0], np.cumsum(gain * u * Ts)])[:-1]
+    known = np.concatenate([[0.0], np.cumsum(now * Ts + gain * u * Ts**2 / 2)])[:-1]
+    columns = np.stack([np.ones(N), t, t**2 / 2], axis=1)
+    rest = (place - known) - columns @ np.linalg.lstsq(columns, place - known, rcond=None)[0]
+    expected = 0.5 * np.sum((rest / sd[0]) ** 2)
+    assert expected > 10
+    found = imitate(b, u, y, Ts)
+    assert found.nats == pytest.approx(expected, rel=1e-6)
+    assert found.converged
+
+
+def test_an_imitation_is_as_good_as_that_of_scipy(contest):
+    a, b = contest.pair
+    u = multisine(600, Ts, band=(0.5, 12.0), rms=1.0)
+    y = truth(a, u, Ts)
+    found = imitate(b, u, y, Ts)
+
+    def errors(numbers):
+        with double_precision():
+            part, fixed = imitation._parts(b)
+            x, *rest = map(jnp.asarray, (numbers, u, y, Ts))
+            return np.asarray(imitation._whitened(part, x, fixed, *rest)).ravel()
+
+    start = found.numbers + 0.02
+    best = least_squares(errors, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
+    assert found.nats == pytest.approx(best.cost, rel=5e-3)
+    assert found.converged and found.nats > 1
+
+
+def test_a_machine_imitates_itself(contest):
+    u = noise(400, Ts, seed=1)
+    a = contest.pair[0]
+    wrong = a.start.copy()
+    wrong[: len(a.moved)] += 0.05
+    assert imitate(a, u, truth(a, u, Ts), Ts, wrong).nats < 0.05
+
+
+def test_with_process_noise_an_innovation_is_worth_less():
+    """A predictor forgives slow error: the same difference weighs no more than in a free run."""
+    u = noise(600, Ts, bandwidth=10.0, seed=2)
+    free = pair()
+    y = truth(free[0], u, Ts)
+    q = {"hub": 1e-7, "joint": 1e-7}
+    b = hypothesis(machine(), fx.Lag(time=0.003), DELAY, q, NOISE, Ts)
+    assert np.abs(b.K).max() > 1e-3
+    held = imitate(b, u, y, Ts)
+    assert held.converged
+    assert held.nats < imitate(free[1], u, y, Ts).nats
+
+
+def test_slope_is_that_of_differences(contest):
+    rng = np.random.default_rng(0)
+    u = multisine(500, Ts, band=(0.5, 15.0), rms=0.8)
+    m = contest.meet(u)
+    m = contest.meet(u, m)
+    nothing = np.zeros((2, 2))
+    g = contest.slope(u, m, nothing)
+    for _ in range(3):
+        # A direction with energy at all frequencies, along which the slope does not vanish.
+        way = 0.3 * rng.standard_normal(len(u)) + g / np.abs(g).max()
+        up, down = (contest.meet(u + s * 1e-3 * way, m).smooth for s in (1, -1))
+        assert g @ way == pytest.approx((np.log(up) - np.log(down)) / 2e-3, rel=0.01)
+
+
+def test_slope_of_a_peak(contest):
+    """With a penalty the logarithm of a peak comes off, to the width of the smooth maximum."""
+    u = multisine(500, Ts, band=(0.5, 15.0), rms=0.8)
+    m = contest.meet(u)
+    penalty = np.array([[0.0, 1.0], [0.0, 0.0]])
+    g = contest.slope(u, m, np.zeros((2, 2))) - contest.slope(u, m, penalty)
+    # Along the input itself a peak of a linear machine grows in proportion.
+    assert g @ u == pytest.approx(1.0, rel=1e-6)
+
+
+def test_limits_on_voltage_and_slew_hold_exactly_and_change_nothing_needlessly():
+    limits, rng = Limits(voltage=2.0, slew=150.0), np.random.default_rng(5)
+    u = limits.playable(4 * rng.standard_normal(800), Ts)
+    assert np.max(np.abs(u)) <= 2.0
+    assert np.max(np.abs(np.diff(u, prepend=0.0, append=0.0))) <= 150.0 * Ts * (1 + 1e-9)
+    np.testing.assert_allclose(limits.playable(u, Ts), u, atol=1e-12)
+    smooth = np.sin(2 * np.pi * np.arange(800) * Ts)
+    smooth *= np.minimum(1, np.minimum(np.arange(1, 801), np.arange(800, 0, -1)) / 20)
+    np.testing.assert_allclose(limits.playable(smooth, Ts), smooth, atol=1e-12)
+    # Below a jump the largest slow signal rises after it, above it the smallest one before.
+    k, most = np.arange(200), 150.0 * Ts
+    jump = np.where(k < 100, -1.0, 1.0) * (np.minimum(k, 199 - k) >= 20)
+    below = np.where(k < 100, -1.0, np.minimum(1.0, -1.0 + most * (k - 99)))
+    above = np.where(k < 100, np.maximum(-1.0, 1.0 - most * (100 - k)), 1.0)
+    np.testing.assert_allclose(limits.playable(jump, Ts)[50:150], (below + above)[50:150] / 2, atol=1e-9)
+
+
+def test_each_sample_follows_the_two_it_is_said_to_follow():
+    limits, rng = Limits(voltage=2.0, slew=150.0), np.random.default_rng(6)
+    x = 1.5 * rng.standard_normal(300)
+    u, low, high = limits.routed(x, Ts)
+    k = rng.integers(40, 260)
+    way = np.zeros(300)
+    way[low[k]] += 0.5
+    way[high[k]] += 0.5
+    nudge = 1e-7 * rng.standard_normal(300)
+    inside = np.abs(x) < 2.0
+    moved = limits.playable(x + nudge * inside, Ts)
+    assert moved[k] - u[k] == pytest.approx(way @ (nudge * inside), abs=1e-12)
+
+
+def test_climbing_gains_within_the_limits():
+    """Where the deflection binds, a design beats the input it starts from, itself as large as allowed."""
+    c = Contest(pair(Ts=0.005), 0.005, Limits(voltage=6.0, travel=1.0, deflection=0.12))
+    start = c.within(prbs(300, 0.005, amplitude=6.0, hold=0.02))
+    begun = c.meet(c.within(np.tile(start, 2))).nats
+    u = c.within(c.limits.playable(np.tile(improved(c, start, looks=12), 2), 0.005))
+    assert c.meet(u).nats > 1.3 * begun
+    assert np.all(c.peaks(u) <= c.limits.outputs(2))
+    assert np.max(np.abs(u)) <= 6.0
+
+
+def test_the_promise_is_kept_by_the_independent_simulator():
+    """Log-likelihood of the truth less that of its rival, averaged over sensor noise."""
+    h = 0.002
+    a, b = pair(0.0021, h)
+    u = prbs(2500, h, amplitude=1.5, hold=0.02, seed=4)
+    promised = imitate(b, u, truth(a, u, h), h).nats
+    got = []
+    for seed in range(4):
+        y = make_record({DELAY: {"time": 0.0021}}, seed=seed, perturb=0.0, played=u)["y"]
+        cost = [imitate(x, u, y, h).nats for x in (a, b)]
+        got.append(cost[1] - cost[0])
+    # The margin of one record has the variance 2 T about T.
+    spread = np.sqrt(2 * promised / len(got))
+    assert promised > 40
+    assert abs(np.mean(got) - promised) < 3 * spread + 0.15 * promised
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    limits = Limits(voltage=3.0, slew=400.0, travel=1.2, deflection=0.15)
+    model = rf.joints.paper(joint_damping=0.003, hub_damping=0.004) + fx.Delay(time=0.003)
+    sd = {"theta": 5.3e-4, "alpha": 5.3e-4}
+    settings = {"limits": limits, "seconds": 2.4, "Ts": 0.005, "noise": sd, "starts": 1, "looks": 15}
+    return rf.next_experiment(model, "delay@input", "lag@input", **settings)
+
+
+def test_an_experiment_keeps_every_limit(experiment):
+    e, c = experiment, experiment.chosen
+    assert np.max(np.abs(e.u)) <= 3.0 and c.voltage == np.max(np.abs(e.u))
+    assert np.max(np.abs(np.diff(e.u, prepend=0.0))) <= 400.0 * 0.005 * (1 + 1e-9)
+    assert c.peaks["theta"] <= 0.9 * 1.2 and c.peaks["alpha"] <= 0.9 * 0.15
+    assert np.max(np.abs(e.outputs[0]), axis=0) == pytest.approx(list(c.peaks.values()), rel=0.3)
+
+
+def test_an_experiment_is_no_worse_than_a_standard_input(experiment):
+    e = experiment
+    assert e.separates == ("delay@input", "lag@input")
+    assert {"noise", "multisine", "prbs", "steps", "sweep"} <= {r.input for r in e.table}
+    assert e.chosen.nats == max(r.nats for r in e.table) >= e.standard.nats
+    assert e.evidence["nats_per_second"] == pytest.approx(e.chosen.nats / 2.4)
+    # The differences are in units of the outputs: as white noise they are worth what is promised.
+    nats = 0.5 * np.sum((e.differences / 5.3e-4) ** 2, axis=(1, 2))
+    assert nats == pytest.approx(e.chosen.each, rel=0.02)
+    assert e.to_dict()["limits"]["slew"] == 400.0
+    assert "delay@input from lag@input" in str(e)
+
+
+def test_the_file_can_be_played_and_read_back(experiment, tmp_path):
+    path = experiment.save_csv(tmp_path / "next.csv")
+    head, names, *rows = path.read_text().splitlines()
+    assert "V" in head and names == "t,voltage"
+    answer = ["theta,alpha", *(f"{a:.17g},{b:.17g}" for a, b in experiment.outputs[0])]
+    path.write_text("\n".join([head, *(f"{r},{y}" for r, y in zip([names, *rows], answer, strict=True))]))
+    back = rf.load(path)
+    np.testing.assert_array_equal(back.u, experiment.u)
+    np.testing.assert_array_equal(back.y, experiment.outputs[0])
+    assert back.Ts == pytest.approx(0.005)
+    with pytest.raises(InputError, match="folder"):
+        experiment.save_csv(tmp_path / "none" / "next.csv")
+
+
+def test_the_figure_names_units_and_both_effects(experiment):
+    figure = experiment.plot()
+    labels = [t for ax in figure.axes for t in (ax.get_xlabel(), ax.get_ylabel(), ax.get_title())]
+    assert {"voltage [V]", "frequency [Hz]", "theta [mrad]", "alpha [mrad]"} <= set(labels)
+    assert any("lag@input" in t.get_text() for legend in figure.legends for t in legend.get_texts())
+
+
+def test_new_numbers_need_no_new_program(contest):
+    u = noise(400, Ts, seed=1)
+    contest.meet(u)
+    before = imitation._with_slopes._cache_size()
+    other = Contest(pair(0.004), Ts, V)
+    other.meet(2 * u)
+    assert imitation._with_slopes._cache_size() == before
+
+
+def test_a_direction_that_nothing_shows_does_not_count():
+    """Stribeck friction holds Coulomb's: if Coulomb is true, no input tells."""
+    m = machine()
+    a = hypothesis(m, fx.Stribeck(at="hub", level=0.01, excess=0.02), ("coulomb", "hub"), {}, NOISE, Ts)
+    b = hypothesis(m, fx.Coulomb(at="hub", level=0.01), ("stribeck", "hub"), {}, NOISE, Ts)
+    c = Contest((a, b), Ts, V).settled(noise(500, Ts, seed=2))
+    assert c.counted == (True, False)
+
+
+def test_a_machine_that_drifts_out_of_its_limits_is_named():
+    m = machine() + fx.VoltageOffset(offset=0.5)
+    a, b = (
+        hypothesis(m, e, other, {}, NOISE, Ts) for e, other in ((fx.Delay(time=0.003), LAG), (LAG, DELAY))
+    )
+    c = Contest((a, b), Ts, Limits(voltage=2.0, travel=0.1))
+    with pytest.raises(InputError, match="offset"):
+        c.within(noise(600, Ts, seed=1))
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "changes", "match"),
+    [
+        ("delay@input", "delay@input", {}, "two different ones"),
+        ("dealy@input", "lag@input", {}, "not in the catalogue"),
+        ("delay", "lag@input", {}, "name and a port"),
+        (3, "lag@input", {}, "name and a port"),
+        ("delay@input", "lag@input", {"noise": None}, "sensor noise"),
+        ("delay@input", "lag@input", {"noise": {"theta": 1e-3}}, "sensor noise"),
+        ("delay@input", "lag@input", {"seconds": 0.1}, "200 samples"),
+        ("delay@input", "lag@input", {"Ts": 0.0}, "200 samples"),
+        ("coulomb@wheel", "lag@input", {}, "wheel"),
+        ("delay@input", "lag@input", {"process_noise": {"wheel": 1e-6}}, "wheel"),
+    ],
+)
+def test_bad_input_is_told_in_a_sentence(a, b, changes, match):
+    settings = {"noise": {"theta": 1e-3, "alpha": 1e-3}, "limits": V} | changes
+    with pytest.raises(InputError, match=match):
+        rf.next_experiment(machine(), a, b, **settings)
+
+
+@pytest.mark.parametrize("wrong", [{"voltage": 0.0}, {"voltage": np.inf}, {"voltage": 1.0, "slew": -1.0}])
+def test_limits_must_be_positive(wrong):
+    with pytest.raises(InputError, match="positive number"):
+        Limits(**wrong)
+    with pytest.raises(InputError, match="margin"):
+        Limits(voltage=1.0, margin=1.0)
+
+
+def test_effects_may_be_given_in_three_ways():
+    assert place_of("delay@input") == place_of(("delay", "input")) == place_of(fx.Delay(time=0.1)) == DELAY

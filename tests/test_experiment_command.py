@@ -1,0 +1,59 @@
+"""`rotflex experiment`: one sentence on bad input, and a file that can be played."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rotflex_jax as rf
+from arena.records import make_record
+from rotflex_jax.cli import main
+from rotflex_jax.data.io import save_csv
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A short recording of a machine with a delay."""
+    r = make_record({("delay", "input"): {"time": 0.006}}, seed=110, seconds=4.0, fs=200.0)
+    recording = rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"])
+    return save_csv(recording, tmp_path_factory.mktemp("run") / "run.csv")
+
+
+def called(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as left:
+        main(["experiment", *map(str, arguments)])
+    return int(left.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        (["--between", "delay@input", "delay@input", "--voltage", "5"], "twice"),
+        (["--between", "dely@input", "lag@input", "--voltage", "5"], "did you mean delay"),
+        (["--between", "coulomb", "lag@input", "--voltage", "5"], "given no port"),
+        (["--between", "delay@input", "lag@input", "--voltage", "-5"], "positive number in V"),
+        (["--between", "delay@input", "lag@input"], "--voltage"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "0.1"], "200 samples"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5", "--save", "/none/x.csv"], "does not"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5", "--save", "-"], "stdout"),
+    ],
+)
+def test_bad_input_is_one_sentence(run, changes, match, capsys):
+    assert called("--fit", run, *changes) == 2
+    told = capsys.readouterr().err.strip()
+    assert match in told and told.startswith("rotflex: ") and "\n" not in told
+
+
+@pytest.mark.slow
+def test_the_best_standard_input_is_written(run, tmp_path, capsys):
+    file, picture = tmp_path / "next.csv", tmp_path / "next.png"
+    wanted = ["--voltage", 2, "--deflection", 10, "--seconds", 4, "--rank-only", "--json", "-"]
+    files = ["--save", file, "--plot", picture]
+    assert called("--fit", run, "--between", "delay@input", "lag@input", *wanted, *files) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["separates"] == ["delay@input", "lag@input"] and told["file"] == str(file)
+    t, voltage = np.loadtxt(file, delimiter=",", skiprows=2).T
+    assert len(t) == 800 and np.max(np.abs(voltage)) <= 2.0
+    assert told["evidence"]["nats"] == max(r["nats"] for r in told["table"]) > 0
+    assert picture.stat().st_size > 10_000

@@ -1,0 +1,150 @@
+"""`rotflex export`, models saved and taken up again, and one's own machine on the command line."""
+
+import json
+import textwrap
+
+import numpy as np
+import pytest
+
+from rotflex_jax import cli, fastloops
+from rotflex_jax.effects import CATALOG, Coulomb
+from rotflex_jax.export import Saved, save, to_c
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism import simulate
+from rotflex_jax.model import Model
+
+
+@pytest.fixture(autouse=True)
+def no_global_settings(monkeypatch):
+    """What the program sets up for its own process must not leak into the other tests."""
+    monkeypatch.setattr(fastloops, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(fastloops, "enable_compilation_cache", lambda: None)
+
+
+@pytest.fixture
+def run(capsys):
+    """Run the command line in this process: exit status, stdout, stderr."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as left:
+            cli.main([str(argument) for argument in arguments])
+        return left.value.code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def saved(tmp_path):
+    model = Model(paper(hub_damping=0.01) + Coulomb("hub", level=0.0312))
+    return save(Saved(model, Ts=0.002, n_init=50), tmp_path / "model.json")
+
+
+PLANT = """
+    import dataclasses
+    from typing import ClassVar
+    import rotflex_jax as rf
+    from rotflex_jax.effects import Force, Inertia, Motor, Viscous, register
+    from rotflex_jax.parameters import parameter
+
+    wheel = rf.Mechanism(
+        coordinates=["angle"],
+        ports={"axle": (1,)},
+        effects=[Motor(at="axle", gear_ratio=20.0), Inertia(at="axle", inertia=0.01), Viscous(at="axle")],
+        outputs={"tacho": ("axle", "speed")},
+        trusted=["axle.motor.resistance"],
+    )
+
+    @register
+    @dataclasses.dataclass(frozen=True)
+    class PlantDrag(Force):
+        name: ClassVar[str] = "plant_drag"
+        title: ClassVar[str] = "drag of the plant"
+        equation: ClassVar[str] = "tau = -coefficient * speed**3"
+        amplitudes: ClassVar[tuple[str, ...]] = ("coefficient",)
+        coefficient: float = parameter(1e-6, unit="N m s^3/rad^3")
+
+        def force(self, position, speed, voltage):
+            return -self.coefficient * speed**3
+
+    number = 3
+    braked = lambda: wheel + PlantDrag(at="axle")
+    """
+
+
+@pytest.fixture
+def plant(tmp_path):
+    file = tmp_path / "my_plant.py"
+    file.write_text(textwrap.dedent(PLANT))
+    yield file
+    CATALOG.pop("plant_drag", None)
+
+
+def one_sentence(err, *words):
+    assert err.startswith("rotflex: ") and err.count("\n") == 1 and "Traceback" not in err
+    for word in words:
+        assert word in err
+
+
+def test_c_code_of_a_saved_model(run, saved, tmp_path):
+    status, out, _ = run("export", saved, "--to", "c")
+    assert status == 0 and out == to_c(Model.load(saved), 0.002)
+    target = tmp_path / "joint.h"
+    assert run("export", saved, "--to", "c", "--Ts", "0.01", "--prefix", "joint", "--out", target)[0] == 0
+    assert "joint_step(" in target.read_text() and "JOINT_TS 0.01" in target.read_text()
+
+
+def test_other_forms(run, saved):
+    assert "level = 0.0312 N m" in run("export", saved, "--to", "text")[1]
+    assert r"\mathit{level}" in run("export", saved, "--to", "latex")[1]
+    linear = json.loads(run("export", saved, "--to", "statespace", "--Ts", "0.002")[1])
+    assert linear["Ts"] == 0.002 and np.array(linear["A"]).shape == (4, 4)
+    assert linear["dropped"] == ["constant (Coulomb) friction at hub has no slope at rest"]
+
+
+def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
+    for arguments, words in (
+        ((saved, "--to", "fortran"), ("'fortran'", "c, latex, text, statespace")),
+        (("paper", "--to", "c"), ("needs a sampling period", "--Ts")),
+        ((saved, "--to", "c", "--Ts", "-1"), ("needs a sampling period",)),
+        ((tmp_path / "no.json", "--to", "text"), ("does not exist",)),
+        ((saved, "--to", "text", "--out", tmp_path / "no" / "where.txt"), ("does not", "exist")),
+    ):
+        status, out, err = run("export", *arguments)
+        assert (status, out) == (2, "")
+        one_sentence(err, *words)
+
+
+def test_a_machine_of_ones_own_from_a_file(run, plant, tmp_path):
+    """Named on the command line, its channels are read from the file by their own names."""
+    from rotflex_jax.choices import named
+
+    u = 2 * np.sin(np.arange(800) * 0.02) + 0.3
+    braked = named(f"{plant}:braked").mechanism
+    speed = simulate(braked, u, 0.005)[:, 0]
+    table = np.column_stack([0.005 * np.arange(len(u)), u, speed])
+    data = tmp_path / "run.csv"
+    np.savetxt(data, table, delimiter=",", header="t,voltage,tacho", comments="", fmt="%.17g")
+    status, out, _ = run("simulate", data, "--joint", f"{plant}:wheel", "--save-model", tmp_path / "w.json")
+    assert status == 0 and "tacho [rad/s]" in out
+    assert Model.load(tmp_path / "w.json").mechanism.ports == (("axle", (1.0,)),)
+    status, out, _ = run("simulate", data, "--model", f"{plant}:wheel", "--add", "plant_drag@axle")
+    error = float(out.split()[-1])
+    assert status == 0 and error < 1e-6 < np.std(speed)
+    save(Saved(Model(braked), Ts=0.005), tmp_path / "braked.json")
+    text = run("export", tmp_path / "braked.json", "--to", "text", "--with", plant)[1]
+    assert "tau = -coefficient * speed**3" in text
+
+
+def test_mistakes_in_naming_ones_own_machine(run, plant, saved, tmp_path):
+    (tmp_path / "broken.py").write_text("wheel = 1 / 0\n")
+    for name, words in (
+        (f"{plant}:whel", ("no mechanism called 'whel'", "it has wheel")),
+        (f"{plant}:number", ("no mechanism called 'number'",)),
+        (f"{tmp_path}/none.py:wheel", ("does not exist",)),
+        ("no_such_module:wheel", ("cannot be imported",)),
+        (f"{tmp_path}/broken.py:wheel", ("cannot be run: ZeroDivisionError",)),
+        (f"{tmp_path}/none.json", ("does not exist",)),
+    ):
+        status, out, err = run("simulate", saved, "--joint", name)
+        assert (status, out) == (2, "")
+        one_sentence(err, *words)

@@ -1,0 +1,229 @@
+"""Somebody's own machine, described in ten lines, and somebody's own effect, in fifteen.
+
+The machine: three ports, one sensor of a speed that is rectified. Its recordings come from a simulator of
+its own (`turntable.py`).
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from turntable import FOR_THE_NOTEBOOK, Truth, record, write
+
+import rotflex_jax as rf
+from rotflex_jax.discover.supermodel import build
+from rotflex_jax.effects import CATALOG, Coulomb, Force, Inertia, Motor, Rectifier, Spring, Viscous, register
+from rotflex_jax.effects.kinds import Scale
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.initial import rough_state
+from rotflex_jax.mechanism.roles import calibrations, search_places
+from rotflex_jax.model import Model
+from rotflex_jax.parameters import parameter
+
+MOTOR = ("torque_constant", "back_emf", "resistance", "gear_ratio", "efficiency")
+
+# The numbers are what a data sheet says: up to a fifth off.
+turntable = rf.Mechanism(
+    coordinates=["phi", "psi"],
+    ports={"motor": (1, 0), "belt": (-1, 1), "platter": (0, 1)},
+    effects=[
+        Motor(at="motor", torque_constant=0.03, back_emf=0.03, resistance=2.0, gear_ratio=5.0),
+        Inertia(at="motor", inertia=0.0025),
+        Viscous(at="motor"),
+        Spring(at="belt", stiffness=5.0),
+        Viscous(at="belt"),
+        Inertia(at="platter", inertia=0.005),
+        Viscous(at="platter"),
+        Rectifier(at="tacho", loss=2.0),
+    ],
+    outputs={"encoder": "motor", "tacho": ("platter", "speed")},
+    trusted=["tacho.rectifier.loss", *(f"motor.motor.{name}" for name in MOTOR)],
+)
+
+
+def recording(truth: Truth, seed: int = 1) -> rf.Recording:
+    u, y = record(seed, truth)
+    return rf.Recording(u=u, y=y, Ts=0.004, channels=("encoder", "tacho"), units=("rad", "rad/s"))
+
+
+@pytest.fixture
+def magnetic_brake():
+    """An effect of a user's own, known to the search for the length of a test."""
+
+    @register
+    @dataclasses.dataclass(frozen=True)
+    class MagneticBrake(Force):
+        name: ClassVar[str] = "magnetic_brake"
+        title: ClassVar[str] = "magnetic brake"
+        equation: ClassVar[str] = "tau = -coefficient * speed / (1 + (speed / knee)**2)"
+        amplitudes: ClassVar[tuple[str, ...]] = ("coefficient",)
+        searched: ClassVar[tuple[str, ...]] = ("hub", "arm")
+
+        coefficient: float = parameter(0.01, unit="N m s/rad", lower=0.0)
+        knee: float = parameter(5.0, unit="rad/s", lower=1e-2)
+
+        def force(self, position, speed, voltage):
+            return -self.coefficient * speed / (1 + (speed / self.knee) ** 2)
+
+        @classmethod
+        def probes(cls, scale):
+            coefficient = 0.1 * scale.torque / scale.speed
+            return [[{"coefficient": coefficient, "knee": k * scale.speed}] for k in (0.5, 1.0, 2.0)]
+
+    yield MagneticBrake
+    CATALOG.pop("magnetic_brake")
+
+
+def places_of(name: str) -> list[str]:
+    return [place for cls, place in search_places(turntable) if cls.name == name]
+
+
+def test_effects_are_searched_where_they_belong_on_a_machine_with_other_names():
+    assert places_of("coulomb") == ["motor", "belt", "platter"]
+    assert places_of("cubic_spring") == ["belt"]  # a spring is there
+    assert places_of("heating") == ["motor"]  # the motor is there
+    assert places_of("gravity") == ["motor", "platter"]
+    assert places_of("dead_zone") == ["input"]
+    assert places_of("sensor_gain") == ["tacho"]  # relative to the encoder
+    assert places_of("sensor_cubic") == ["encoder", "tacho"]
+    assert calibrations(turntable) == [("voltage_offset", "input"), ("sensor_bias", "tacho")]
+
+
+def test_the_joint_is_searched_as_it_says_itself():
+    joint = rf.joints.paper()
+    named = {(cls.name, port) for cls, port in search_places(joint)}
+    known = {*joint.port_vectors, *joint.channels, "input"}
+    assert named == {(c.name, p) for c in CATALOG.values() for p in c.searched if p in known}
+
+
+def test_a_lone_tacho_has_no_bias_of_its_own():
+    """It could not be told from an offset of the voltage."""
+    alone = dataclasses.replace(
+        turntable,
+        outputs={"tacho": ("platter", "speed")},
+        effects=[e for e in turntable.effects if e.name != "rectifier"],
+        trusted=(),
+    )
+    assert calibrations(alone) == [("voltage_offset", "input")]
+
+
+def test_own_effect_is_searched_where_its_words_say(magnetic_brake):
+    assert places_of("magnetic_brake") == ["motor", "platter"]
+
+
+def test_an_effect_that_was_not_registered_is_named():
+    class Unknown(Coulomb):
+        name = "unknown"
+
+    scales = {p: Scale(1.0, 1.0, 1.0, 1.0) for p in turntable.port_vectors}
+    with pytest.raises(InputError, match=r"Unknown is to be tried, but is not in the catalogue.*@register"):
+        build(turntable, [(Unknown, "platter")], scales)
+
+
+def test_first_guess_of_the_state_uses_springs_where_sensors_are_silent():
+    """The platter's angle is not measured, and its speed only without a sign: the belt tells both."""
+    t = np.arange(25) * 0.004
+    for way in (1.0, -1.0):
+        y = np.column_stack([12.0 + 3.0 * way * t, np.full(25, 3.0)])
+        state = rough_state(turntable.structure, y, 0.004)
+        np.testing.assert_allclose(state, [12.0, 12.0, 3.0 * way, 3.0 * way], atol=1e-9)
+
+
+def test_a_rectified_sensor_corrects_the_state_the_right_way_round():
+    """A gain for straight sensors would push a platter that turns backwards ever faster."""
+    run = recording(Truth())
+    true = Model(
+        turntable.with_values(
+            {
+                "motor.inertia.inertia": 0.002,
+                "platter.inertia.inertia": 0.006,
+                "belt.spring.stiffness": 6.0,
+                "belt.viscous.coefficient": 0.004,
+                "motor.viscous.coefficient": 0.002,
+            }
+        )
+    )
+    noise = np.array([2e-3, 0.03])
+    y_hat = true.predict(run, {"motor": 1e-4, "platter": 1e-4}, noise)
+    error = np.sqrt(np.mean((run.y - y_hat)[run.n_init :] ** 2, axis=0))
+    assert np.mean(np.diff(run.y[:, 0]) < 0) > 0.2  # it turns backwards too
+    assert np.all(error < 2 * noise), error
+
+
+def test_fit_of_ones_own_machine_recovers_its_numbers():
+    train, test = recording(Truth(friction=0.03)).split(0.7)
+    fit = rf.fit(turntable + Coulomb(at="platter", level=0.01), train)
+    for name, value in (
+        ("motor.inertia.inertia", 0.002),
+        ("platter.inertia.inertia", 0.006),
+        ("belt.spring.stiffness", 6.0),
+        ("platter.coulomb.level", 0.03),
+    ):
+        assert fit[name].value == pytest.approx(value, rel=0.02), name
+    error = rf.metrics.rmse(test.y, fit.model.simulate(test), test.n_init)
+    assert np.all(error < 2 * np.array([2 * np.pi / 1000 / np.sqrt(12), 0.03]))  # near the sensors' noise
+
+
+@pytest.mark.slow
+def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
+    """Called as for any joint: friction and a user's own effect are found, both at the right port."""
+    train, test = recording(FOR_THE_NOTEBOOK).split(0.7)
+    result = rf.discover(turntable, train, test)
+    found = {(r.effect, r.port): r for r in result.rounds}
+    assert set(found) == {("coulomb", "platter"), ("magnetic_brake", "platter")}
+    assert found["coulomb", "platter"].parameters["level"].value == pytest.approx(0.03, rel=0.05)
+    brake = found["magnetic_brake", "platter"].parameters
+    assert brake["coefficient"].value == pytest.approx(0.03, rel=0.1)
+    assert brake["knee"].value == pytest.approx(4.0, rel=0.1)
+    assert result.verdict in ("found", "ambiguous")
+
+
+def test_recording_of_the_notebook_is_what_the_simulator_makes(tmp_path):
+    write(str(tmp_path / "again.csv"))
+    here = Path(__file__).resolve().parent.parent / "notebooks" / "turntable.csv"
+    again, kept = (np.loadtxt(f, delimiter=",", skiprows=1) for f in (tmp_path / "again.csv", here))
+    np.testing.assert_allclose(again, kept, atol=1e-6)
+
+
+def machine(**changes):
+    given = {
+        "coordinates": ["phi"],
+        "ports": {"shaft": (1,)},
+        "effects": [Motor(at="shaft"), Inertia(at="shaft")],
+        "outputs": {"angle": "shaft"},
+    }
+    return rf.Mechanism(**(given | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"coordinates": "phi"}, r"coordinates were given as 'phi', but a list is needed; write \['phi'\]"),
+        ({"ports": ["shaft"]}, "ports were given as .* names with one number per coordinate"),
+        ({"ports": {"shaft": 1}}, "ports were given as .* names with one number per coordinate"),
+        ({"ports": {"shaft": (1, 0)}}, "Port 'shaft' was given 2 entries, but the mechanism has the 1 coord"),
+        ({"effects": Motor(at="shaft")}, r"one Motor, but a list is needed; write \[Motor\(...\)\]"),
+        ({"effects": [Motor]}, r"Motor was given as an effect, .* write Motor\(at=\"...\"\)"),
+        ({"effects": [Motor(at="shaf")]}, "Motor was put at 'shaf', but this mechanism has 'shaft'"),
+        ({"outputs": ["shaft"]}, "outputs were given as .* channels with the port that each shows"),
+        ({"outputs": {"angle": ("shaft", "sped")}}, "'position' or 'speed'"),
+        ({"outputs": {"angle": ("shaft", "speed", 1)}}, "needs a port, or a port and 'speed'"),
+        ({"outputs": {"angle": "wheel"}}, r"needs one of the ports \('shaft',\)"),
+        ({"trusted": "shaft.inertia.inertia"}, "trusted parameters were given as .* a list is needed"),
+        ({"trusted": ["shaft.inertia"]}, "this mechanism has .*shaft.inertia.inertia"),
+    ],
+)
+def test_mistakes_of_a_beginner_are_told_in_one_sentence(changes, sentence):
+    with pytest.raises(InputError, match=sentence) as error:
+        machine(**changes)
+    assert "\n" not in str(error.value)
+
+
+def test_a_coordinate_without_inertia_is_named_before_anything_runs():
+    light = dataclasses.replace(
+        turntable, effects=[e for e in turntable.effects if (e.name, e.at) != ("inertia", "platter")]
+    )
+    with pytest.raises(InputError, match=r"Nothing gives psi an inertia, .* \(belt, platter\)"):
+        Model(light)
