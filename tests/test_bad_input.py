@@ -358,4 +358,4 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
     with h5py.File(tmp_path / "run.mat", "w") as file:
         file["t"] = GOOD["t"]
     monkeypatch.setitem(sys.modules, "h5py", None)
-    refused(lambda: load(tmp_path / "run.mat"), r'needs the package h5py.*"rotflex_jax\[io\]"')
+    refused(lambda: load(tmp_path / "run.mat"), r'needs the package h5py.*"rotflex_jax\[all\]"')
