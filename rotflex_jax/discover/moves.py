@@ -72,9 +72,7 @@ def with_each(judge: Judge, base: Hypothesis, promising: list[Score]) -> list[Hy
     gains = [h.log_likelihood - base.log_likelihood for h in refitted]
     stuck = {i for i, gain in enumerate(gains) if gain < STUCK * max(promising[i].gain, 0.0)}
     again = [(i, row[-1]) for (i, _), row in zip(shapes, starts, strict=True) if i in stuck]
-    fitted = refit(judge, [h for _, h in again]) if again else []
-    for (i, _), h in zip(again, fitted, strict=True):
-        refitted[i] = max(refitted[i], h, key=lambda x: x.log_likelihood)
+    refitted = _begun_again(judge, refitted, again)
     # A law that contains another one is never worse: where a refit says so, it starts again from there.
     below = [
         (i, in_place_of(judge, refitted[j], [t.place], s, SHARES[-1]))
@@ -84,10 +82,18 @@ def with_each(judge: Judge, base: Hypothesis, promising: list[Score]) -> list[Hy
         and t.place[0] in CATALOG[s.place[0]].contains
         and refitted[i].log_likelihood < refitted[j].log_likelihood
     ]
-    fitted = refit(judge, [h for _, h in below]) if below else []
-    for (i, _), h in zip(below, fitted, strict=True):
-        refitted[i] = max(refitted[i], h, key=lambda x: x.log_likelihood)
-    return refitted
+    return _begun_again(judge, refitted, below)
+
+
+def _begun_again(
+    judge: Judge, refitted: list[Hypothesis], starts: list[tuple[int, Hypothesis]]
+) -> list[Hypothesis]:
+    """Refits, some from other starts (number of the candidate, start) too, and the likelier one kept."""
+    best = list(refitted)
+    fitted = refit(judge, [h for _, h in starts]) if starts else []
+    for (i, _), h in zip(starts, fitted, strict=True):
+        best[i] = max(best[i], h, key=lambda x: x.log_likelihood)
+    return best
 
 
 def _best_shapes(judge: Judge, of: list[int], starts: list[Hypothesis]) -> list[Hypothesis]:

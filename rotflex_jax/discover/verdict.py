@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from rotflex_jax.discover.result import Round, Stage
 from rotflex_jax.discover.score import Score
 from rotflex_jax.recording import Recording
@@ -11,11 +9,6 @@ from rotflex_jax.recording import Recording
 # The model explains the record if short held-out runs come this near to the sensor noise and process
 # torques gain no more than this per measured number [nat].
 NEAR_FLOOR, NATS_PER_NUMBER = 1.5, 0.07
-
-
-def near_floor(windows: np.ndarray, noise: np.ndarray) -> bool:
-    """Whether short held-out runs come as near to the sensor noise as those of a right model do."""
-    return bool(np.all(windows < NEAR_FLOOR * noise))
 
 
 def judge_end(
@@ -36,7 +29,7 @@ def judge_end(
     """
     ratios = {c: final.held_out_rmse_windows[c] / floor[c] for c in floor}
     numbers = sum(r.N for r in test) * len(floor)
-    near = near_floor(np.array([final.held_out_rmse_windows[c] for c in floor]), np.array([*floor.values()]))
+    near = all(ratio < NEAR_FLOOR for ratio in ratios.values())
     explained = near and final.process_noise_nats < NATS_PER_NUMBER * numbers
     seconds = final.window_seconds
     left = ", ".join(f"{c} {_times(r)}" for c, r in ratios.items())
