@@ -9,10 +9,13 @@ import pytest
 
 from rotflex_jax.data.datasets import DATASETS, FOLDER_VARIABLE, load_dataset
 from rotflex_jax.discover.room import make_room
+from rotflex_jax.fastloops import enable_compilation_cache
 from rotflex_jax.recording import Recording
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+# What one test has compiled serves the others, those of a process beside it, and the next run.
+enable_compilation_cache(Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled")
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 if BESIDE.is_dir():

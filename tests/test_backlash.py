@@ -306,7 +306,8 @@ def test_a_search_meets_play_at_its_size():
     )
     h = judge.with_process_noise(h, {"hub": 0.0, "joint": 0.0})
     off, on = (s.part(s.gates(places)).mechanism for places in ((), (PLACE,)))
-    assert not any(isinstance(e, fx.Gear) for e in (*off.effects, *s.probed(s.gates(())).mechanism.effects))
+    gentle = s.probed(s.gates(()), [c for c in s.candidates.values() if not c.sudden]).mechanism
+    assert not any(isinstance(e, fx.Gear) for e in (*off.effects, *gentle.effects))
     assert any(isinstance(e, fx.Gear) for e in on.effects)
     assert h.seated(judge.bench, (PLACE,)).shape == (1, 6)
 

@@ -10,7 +10,7 @@ import pytest
 
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.lanes import Bench, Directions, Lane
-from rotflex_jax.discover.probing import probe
+from rotflex_jax.discover.probing import Absent, probe
 from rotflex_jax.discover.supermodel import SuperModel, build, state_rows
 from rotflex_jax.fit.residuals import Data
 from rotflex_jax.joints import paper
@@ -212,7 +212,11 @@ def test_probes_are_the_slopes_of_the_whole():
     along.gates[4] = s.gates([("lag", "input")]) - s.gates(())
     values, put_in = now.values.copy(), lane("all").gates - along.gates[4]
     values[:, [s.mechanism.parameter_names.index(name) for name in names]] = 0.0
-    J = probe(bench(), now, [Lane(values, now.x0, put_in, now.K)], [along])[0]
+    families = s.families([c for c in s.candidates.values() if not c.sudden])
+    put = Lane(values, now.x0, put_in, now.K)
+    # A direction belongs to one family; in the programs of the others nothing moves along it.
+    J = probe(bench(), now, [Absent(family, put, along) for family in families]).sum(axis=0)
+    assert len(families) == 3
     whole = whole_run(numbers("one memory")._replace(values=values, gates=put_in), along)[1]
     for name, mine, expected in zip((*names, "lag"), J, whole, strict=True):
         size = np.abs(expected).max()

@@ -8,7 +8,6 @@ from rotflex_jax.discover.lanes import Bench, Directions, Lane
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.discover.whiten import Whitener
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.parameters import Transform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,4 +98,4 @@ def seat(bench: Bench, places: tuple[Place, ...], x0: np.ndarray, of: tuple[Plac
 
 def constrain(bench: Bench, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Physical values of unconstrained ones (..., P), and their derivative."""
-    return Transform.of(bench.supermodel.mechanism.parameter_specifications).physical(z)
+    return bench.supermodel.transform.physical(z)

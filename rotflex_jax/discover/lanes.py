@@ -169,7 +169,9 @@ def _side_by_side(run: Callable[[Any], Any], parts: list[Any]) -> list[Any]:
         run: What to call; compiled before, so that no two threads compile the same.
         parts: Its arguments.
     """
-    if not parts:
-        return []
-    with ThreadPoolExecutor(min(len(parts), os.cpu_count() or 1)) as pool:
-        return list(pool.map(run, parts))
+    return list(_threads().map(run, parts))
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count())

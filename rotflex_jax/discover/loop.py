@@ -4,6 +4,8 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
 
+from threadpoolctl import threadpool_limits
+
 from rotflex_jax.discover.calibrations import own_notes, settle
 from rotflex_jax.discover.decide import choose, describe, on_equal_terms, samples_of
 from rotflex_jax.discover.fine import refined
@@ -12,6 +14,7 @@ from rotflex_jax.discover.heldout import Away, held_out
 from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.locate import locate
 from rotflex_jax.discover.merge import merged
+from rotflex_jax.discover.milestone import milestone
 from rotflex_jax.discover.moves import (
     begin,
     eliminate,
@@ -32,6 +35,7 @@ from rotflex_jax.effects.kinds import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import everywhere, torque_scale
 from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
+from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.model import Model
@@ -43,6 +47,8 @@ Progress = Callable[[str], None]
 REFITTED, ROUNDS = 4, 4
 
 
+# Matrices here are small and many: threads of a linear algebra library only wait for one another.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def discover(
     mechanism: Mechanism | Model,
     train: Recording | Sequence[Recording],
@@ -75,7 +81,7 @@ def discover(
         Discovery.
 
     Raises:
-        InputError: No recording, or channels that the model lacks.
+        InputError: No recording, channels that the model lacks, or one that moves against the model.
     """
     began, say = time.perf_counter(), progress or (lambda _: None)
     make_room()
@@ -84,6 +90,7 @@ def discover(
     unseen = (test,) if isinstance(test, Recording) else tuple(test)
     if not model.mechanism.free_names:
         raise InputError("All parameters are trusted, but discovery fits the model; release one.")
+    check_signs(model, (*trained, *unseen))
     data = stack(trained, model)
     torque = torque_scale(model.mechanism, data)
     wanted = list(search_places(model.mechanism) if candidates is None else candidates)
@@ -105,6 +112,9 @@ def discover(
     say("fitting the model as it is")
     now = begin(judge, supermodel, model, trained)
     base = held_out(away, now)
+    channels = model.mechanism.channels
+    own_units = {c: unseen[0].units[unseen[0].channels.index(c)] for c in channels}
+    say(milestone("as it is", channels, own_units, base.windows, noise))
     ranking: list[Score] = []
     taken: list[tuple[Place, float]] = []
     passed = [base.hypothesis]
@@ -135,7 +145,7 @@ def discover(
         score = next(s.nats for s in chosen if s.place == place)
         taken.append((place, score))
         equivalents[place] = [t.place for t in rivals if t.place]
-        say(f"added {place[0]} at {place[1]}")
+        say(milestone(f"+ {place[0]} at {place[1]}", channels, own_units, winner.windows, noise))
         base = dataclasses.replace(winner, place=None, numbers=0)
         passed.append(base.hypothesis)
 

@@ -16,15 +16,13 @@ from rotflex_jax.discover.whiten import Whitener
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.residuals import first_states
 from rotflex_jax.model import Model
-from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
 
 
 def begin(judge: Judge, s: SuperModel, model: Model, trained: Sequence[Recording]) -> Hypothesis:
     """The user's model with calibrations, fitted from a short, a middle and an endless horizon."""
     R, C = len(trained), len(s.mechanism.channels)
-    specs = s.mechanism.parameter_specifications
-    z = Transform.of(specs).unconstrain(s.mechanism.values)
+    z = s.transform.unconstrain(s.mechanism.values)
     for i in s.local:
         z[i] = 0.0
     start = Hypothesis(

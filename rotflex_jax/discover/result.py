@@ -143,6 +143,11 @@ class Discovery:
             self.proposal.save_csv(Path(folder) / NEXT)
         return page
 
+    def _repr_html_(self) -> str:
+        from rotflex_jax.display.cards import discovery_card  # the layer above, when a notebook asks
+
+        return discovery_card(self)
+
     def __str__(self) -> str:
         lines = [self.sentence]
         lines += [f"  {i}. {r.sentence}" for i, r in enumerate(self.rounds, 1)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.lanes import Bench, Directions, Lane
-from rotflex_jax.discover.probing import probe
+from rotflex_jax.discover.probing import Absent, probe
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.supermodel import Candidate, Place
 from rotflex_jax.effects import CATALOG
@@ -64,14 +64,30 @@ class _Probe:
     member: int
 
 
-def _lane_for(bench: Bench, h: Hypothesis, candidates: list[Candidate], shape: int) -> Lane:
+def _packed(candidates: list[Candidate]) -> list[list[_Probe]]:
+    """Probes that share a lane: as many as it has directions, of each candidate one shape only."""
+    batches: list[list[_Probe]] = []
+    for c in candidates:
+        for shape, group in enumerate(c.probes):
+            mine = [_Probe(c, shape, member) for member in range(len(group))]
+            room = [
+                b for b in batches if len(b) + len(mine) <= PROBES and all(p.candidate is not c for p in b)
+            ]
+            if room:
+                room[0].extend(mine)
+            else:
+                batches.append(mine)
+    return batches
+
+
+def _lane_for(bench: Bench, h: Hypothesis, probes: list[_Probe]) -> Lane:
     """The hypothesis with candidates on at zero amplitude, or off where they have no amplitude."""
     values = h.values(bench)
     gates = bench.supermodel.gates(h.places)
-    for c in candidates:
-        group = c.probes[min(shape, len(c.probes) - 1)]
+    for p in probes:
+        c = p.candidate
         for k, i in enumerate(c.parameters):
-            values[:, i] = 0.0 if c.amplitudes[k] else group[0][k]
+            values[:, i] = 0.0 if c.amplitudes[k] else c.probes[p.shape][0][k]
         gates[c.effect] = 1.0 if any(c.amplitudes) else 0.0
     return Lane(values, h.x0, gates, h.K)
 
@@ -82,26 +98,15 @@ def scores(judge: Judge, h: Hypothesis) -> list[Score]:
     candidates = [c for c in bench.supermodel.candidates.values() if c.place not in h.places]
     if not candidates:
         return []
-    probes = [
-        _Probe(c, s, m)
-        for c in candidates
-        for s, group in enumerate(c.probes)
-        for m in range(len(group))
-        if not c.sudden
-    ]
     gentle = [c for c in candidates if not c.sudden]
-    # Alternatives that differ in amplitudes only share a lane; shapes need lanes of their own.
-    batches: list[tuple[int, list[_Probe]]] = []
-    for shape in sorted({p.shape for p in probes}):
-        mine = [p for p in probes if p.shape == shape]
-        batches += [(shape, mine[i : i + PROBES]) for i in range(0, len(mine), PROBES)]
+    families = bench.supermodel.families(gentle)
+    batches = [(family, probes) for family in families for probes in _packed(family)]
     present = h.lane(bench)
     e, J = bench.slopes([present], [h.directions(bench, max(judge.directions(), h.moved))])
     w = h.whitener(e[0], seen)
     N = _expanded(h, h.whitener(J[0, : h.moved], seen))
-    lanes = [_lane_for(bench, h, gentle, shape) for shape, _ in batches]
-    tangents = [_tangents(bench, h, part) for _, part in batches]
-    J = probe(bench, present, lanes, tangents) if lanes else ()
+    jobs = [Absent(family, _lane_for(bench, h, part), _tangents(bench, h, part)) for family, part in batches]
+    J = probe(bench, present, jobs) if jobs else ()
     Q = np.linalg.qr(N.T / np.maximum(np.linalg.norm(N, axis=1), 1e-300))[0]
     r = w.ravel()
     r = r - Q @ (Q.T @ r)

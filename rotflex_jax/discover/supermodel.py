@@ -17,6 +17,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import effects_of
 from rotflex_jax.mechanism.roles import calibrations as places_of_calibrations
+from rotflex_jax.parameters import Transform
 
 Place = tuple[str, str]  # (effect name, port)
 
@@ -80,6 +81,11 @@ class SuperModel:
     parts: dict[frozenset[int], Part] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
+    def transform(self) -> Transform:
+        """Between the parameter values and what a fit moves."""
+        return Transform.of(self.mechanism.parameter_specifications)
+
+    @functools.cached_property
     def costly(self) -> frozenset[int]:
         """Candidates' effects that make a run dearer: states of their own, or a friction contact."""
         own = state_rows(self.mechanism)
@@ -98,10 +104,21 @@ class SuperModel:
         on = frozenset(i for i in self.costly if np.any(gates[..., i] != 0))
         return self._without(self.costly - on)
 
-    def probed(self, gates: np.ndarray) -> Part:
-        """The super-model without the sudden candidates whose gate (E,) is zero."""
-        sudden = [c.effect for c in self.candidates.values() if c.sudden]
-        return self._without(frozenset(i for i in sudden if gates[i] == 0))
+    def probed(self, gates: np.ndarray, family: Iterable[Candidate]) -> Part:
+        """The super-model with no other candidates than a family and those whose gate (E,) is not zero."""
+        kept = {c.effect for c in family}
+        others = (c.effect for c in self.candidates.values() if c.effect not in kept)
+        return self._without(frozenset(i for i in others if gates[i] == 0))
+
+    def families(self, candidates: Iterable[Candidate]) -> list[list[Candidate]]:
+        """Candidates by what it takes to probe them: states of their own, a torque, a signal."""
+        own = state_rows(self.mechanism)
+        found: dict[str, list[Candidate]] = {}
+        for c in candidates:
+            signal = isinstance(self.mechanism.effects[c.effect], Actuation | Sensing)
+            kind = "states" if c.effect in own else "signal" if signal else "torque"
+            found.setdefault(kind, []).append(c)
+        return list(found.values())
 
     def _without(self, left_out: frozenset[int]) -> Part:
         if left_out not in self.parts:
@@ -131,12 +148,12 @@ class SuperModel:
         head = f"{place[1]}.{place[0]}."
         return [i for i, n in enumerate(self.mechanism.parameter_names) if n.startswith(head)]
 
-    @property
+    @functools.cached_property
     def local(self) -> list[int]:
         """Parameters that each recording has for itself."""
         return [i for place in self.calibrations for i in self.parameter_indices(place)]
 
-    @property
+    @functools.cached_property
     def baseline_free(self) -> list[int]:
         """Free parameters of the baseline."""
         names = self.mechanism.parameter_names

@@ -21,6 +21,7 @@ from rotflex_jax.fit.residuals import (
     sensor_noise,
     stack,
 )
+from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Mechanism, Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import equations
 from rotflex_jax.model import Model, window_starts
@@ -32,6 +33,10 @@ Progress = Callable[[str], None]
 # A step is the last when it lowers the negative log-likelihood by less than this [nat]. A relative
 # tolerance would stop a long recording many nats short of the optimum.
 NATS = 0.1
+# What optimistix says at length.
+UNSOLVED = (
+    "stopped: the linear equations of a step have no finite solution; the model diverges near these numbers"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +108,8 @@ def fit(
         `local` has each recording's own and `model_of` the model with them.
 
     Raises:
-        InputError: Nothing to fit, or a local name that is not a free parameter.
+        InputError: Nothing to fit, a local name that is not a free parameter, or a channel that moves
+            against the model.
         RuntimeError: The fit failed and `throw` is set.
     """
     model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
@@ -118,6 +124,7 @@ def fit(
             )
     if not m.free_names:
         raise InputError("All parameters are trusted, but a fit needs a free one; release one.")
+    check_signs(model, listed)
     indices = tuple(names.index(n) for n in local)
     listed, windows_of = _windows(listed, window_seconds)
     coordinates = Coordinates(m.structure, indices, len(listed), windows_of)
@@ -226,7 +233,7 @@ def _levenberg_marquardt(
         say(f"fit: {used} steps, cost {cost:.1f}")
         if not gain > NATS and count == 16:
             bad = result not in (optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
-            status = str(result) if bad else "converged"
+            status = UNSOLVED if bad else "converged"
             break
     out = flat.copy()
     out[index] = np.asarray(moved)

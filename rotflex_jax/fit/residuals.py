@@ -6,7 +6,7 @@ alone, then the first states of all recordings. A fit moves some of them; the re
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -139,9 +139,32 @@ def predicted(
     rest = jnp.asarray(rest_state(structure, np.float64))[x0.shape[1] :]
     start = jnp.concatenate([x0, jnp.broadcast_to(rest, (len(x0), len(rest)))], axis=1)
     run = functools.partial(predictor_run, structure, solver)
-    return jax.vmap(run, in_axes=(0, None, 0, 0, 0, 0, 0, 0))(
+    return each_recording(run, in_axes=(0, None, 0, 0, 0, 0, 0, 0))(
         values, gates, start, data.u, data.y, data.seen, K, data.Ts
     )[1]
+
+
+def each_recording(run: Callable[..., Any], in_axes: tuple[int | None, ...], out_axes: int = 0) -> Callable:
+    """`jax.vmap` over recordings; a single one is run as it is, which takes half the time to trace.
+
+    Args:
+        run: What one recording goes through.
+        in_axes: Axis of the recordings in each argument; None where all share it. The first has one.
+        out_axes: Axis of the recordings in the results.
+    """
+
+    def mapped(*arguments: Any) -> Any:
+        if jax.tree.leaves(arguments[0])[0].shape[in_axes[0]] != 1:
+            return jax.vmap(run, in_axes, out_axes)(*arguments)
+        one = [
+            a
+            if axis is None
+            else jax.tree.map(lambda x, axis=axis: jax.lax.index_in_dim(x, 0, axis, False), a)
+            for a, axis in zip(arguments, in_axes, strict=True)
+        ]
+        return jax.tree.map(lambda x: jnp.expand_dims(x, out_axes), run(*one))
+
+    return mapped
 
 
 def first_states(model: Model, recordings: Sequence[Recording]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """A mechanism: coordinates, named ports, effects at the ports, and what the sensors see."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
@@ -22,6 +23,9 @@ class _Slot:
 
     def __repr__(self) -> str:
         return "·"
+
+    def __reduce__(self) -> str:
+        return "_SLOT"  # the one and only, also in another process
 
 
 _SLOT = _Slot()
@@ -86,9 +90,9 @@ class Mechanism:
         """Names of the outputs, in order."""
         return tuple(channel for channel, _ in self.outputs)
 
-    @property
+    @functools.cached_property
     def structure(self) -> Self:
-        """The mechanism without its numbers: hashable, equal for equal structure."""
+        """The mechanism without its numbers; hashable, and equal for equal structure."""
         empty = tuple(e.replace(**dict.fromkeys(e.values, _SLOT)) for e in self.effects)
         return dataclasses.replace(self, effects=empty, trusted=frozenset())
 
@@ -127,12 +131,12 @@ class Mechanism:
 
     # -- parameters --------------------------------------------------------------------------------
 
-    @property
+    @functools.cached_property
     def parameter_names(self) -> tuple[str, ...]:
         """Full names `port.effect.parameter`, in the order of `values`."""
         return tuple(f"{e.at}.{e.name}.{p}" for e in self.effects for p in e.values)
 
-    @property
+    @functools.cached_property
     def parameter_specifications(self) -> tuple[Specification, ...]:
         """Unit, bounds and size of each parameter, in the order of `values`."""
         u = self.units
@@ -153,7 +157,7 @@ class Mechanism:
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Parameters that a fit moves: all but the trusted ones."""
+        """Parameters that a fit moves, all but the trusted ones."""
         return tuple(n for n in self.parameter_names if n not in self.trusted)
 
     def with_values(self, values: Mapping[str, float] | Sequence[Any] | np.ndarray | jax.Array) -> Self:
@@ -208,6 +212,11 @@ class Mechanism:
         ):
             object.__setattr__(rebuilt, field, value)
         return rebuilt
+
+    def _repr_html_(self) -> str:
+        from rotflex_jax.display.cards import mechanism_card  # the layer above, when a notebook asks
+
+        return mechanism_card(self)
 
     def __str__(self) -> str:
         lines = [f"Mechanism of {', '.join(self.coordinates)}; outputs {', '.join(self.channels)}"]

@@ -1,0 +1,73 @@
+"""Does the machine move the way the model would? A sign turned round lets no fit succeed."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import linearise
+from rotflex_jax.model import Model
+from rotflex_jax.recording import Recording
+
+# Moves over each of these shares of the recording, of at most so many samples, are compared.
+SHARES, SAMPLES = (0.001, 0.003, 0.01, 0.03), 20_000
+# A channel that moves against the model at all shares, correlated at least this much.
+AGAINST = -0.6
+
+
+def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
+    """Refuses recordings whose channels move against the model.
+
+    The linear part of the model, with the numbers that it has, runs under the recorded input. Rough
+    numbers will do, as only the way of each move counts. A resonance that the model puts on the far side
+    of all excited frequencies turns a channel round as well: then a nearer start helps.
+
+    Args:
+        model: Before any fit.
+        recordings: To be fitted.
+
+    Raises:
+        InputError: Channels that move the other way.
+    """
+    linear = linearise(model.mechanism)
+    against: set[str] = set()
+    worst = 0.0
+    for recording in recordings:
+        r = recording.slice(0, min(recording.N, SAMPLES))
+        y, would = model.measured(r).astype(float), _response(linear.discretise(r.Ts), linear.C, r.u)
+        if not np.all(np.isfinite(would)):
+            continue
+        for channel, a, b in zip(model.mechanism.channels, y.T, would.T, strict=True):
+            found = [_alike(a, b, max(round(share * r.N), 1)) for share in SHARES]
+            if max(found) < AGAINST:
+                against.add(channel)
+                worst = min(worst, *found)
+    if not against:
+        return
+    every = against == set(model.mechanism.channels)
+    names = " and ".join(c for c in model.mechanism.channels if c in against)
+    what = "the input" if every else f"the column of {names}"
+    verb = "moves" if len(against) == 1 else "move"
+    raise InputError(
+        f"{names} {verb} against what the model would do under this input (correlation {worst:.2f}), as with "
+        f"a sign turned round; negate {what} if that is so, or give the model a start nearer to the machine."
+    )
+
+
+def _response(discrete: tuple[np.ndarray, np.ndarray], C: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Outputs (N, C) of a linear system from rest."""
+    A, B = discrete
+    x, out = np.zeros(len(A)), np.empty((len(u), len(C)))
+    with np.errstate(all="ignore"):
+        for k, v in enumerate(u):
+            out[k] = C @ x
+            x = A @ x + B * v
+    return out
+
+
+def _alike(a: np.ndarray, b: np.ndarray, step: int) -> float:
+    """Correlation of moves over a number of samples; zero where nothing moves."""
+    moves = [x[step:] - x[:-step] for x in (a, b)]
+    if min(np.ptp(m) for m in moves) == 0:
+        return 0.0
+    return float(np.corrcoef(*moves)[0, 1])

@@ -1,0 +1,50 @@
+"""A sign turned round is told in one sentence; what only looks odd is not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from arena.records import make_record
+
+import rotflex_jax as rf
+from rotflex_jax.fit.signs import check_signs
+
+JOINT = rf.Model(rf.joints.paper())
+
+
+def recorded(u: float = 1, theta: float = 1, alpha: float = 1, kind: str = "noise") -> rf.Recording:
+    """A joint with friction and a constant torque, by the independent simulator; signs as given."""
+    hidden = [("coulomb", "hub"), ("voltage_offset", "input")]
+    made = make_record(hidden, kind=kind, seed=107, seconds=8.0, fs=250.0)
+    y = made["y"] * np.array([theta, alpha])
+    return rf.Recording(u=u * made["u"], y=y, Ts=made["Ts"], channels=("theta", "alpha"))
+
+
+@pytest.mark.parametrize(
+    ("signs", "sentence"),
+    [
+        ({"theta": -1}, "theta moves against .* negate the column of theta"),
+        ({"alpha": -1}, "alpha moves against .* negate the column of alpha"),
+        ({"u": -1}, "theta and alpha move against .* negate the input"),
+    ],
+)
+def test_a_sign_turned_round_is_named(signs: dict[str, float], sentence: str) -> None:
+    for run in (lambda r: check_signs(JOINT, [r]), lambda r: rf.fit(JOINT, r)):
+        with pytest.raises(rf.InputError, match=sentence):
+            run(recorded(**signs))
+    good, bad = recorded(), recorded(**signs)
+    with pytest.raises(rf.InputError, match=sentence):
+        rf.discover(JOINT, good, bad)
+
+
+@pytest.mark.parametrize("kind", ["noise", "multisine", "prbs", "steps", "sweep"])
+def test_right_signs_pass_whatever_the_input(kind: str) -> None:
+    check_signs(JOINT, [recorded(kind=kind)])
+
+
+def test_rough_numbers_pass() -> None:
+    """Every constant wrong by half or twofold."""
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        values = JOINT.mechanism.values * 2.0 ** rng.uniform(-1, 1, len(JOINT.mechanism.values))
+        check_signs(dataclasses.replace(JOINT, mechanism=JOINT.mechanism.with_values(values)), [recorded()])
