@@ -12,11 +12,13 @@ from rotflex_jax import adaptive, basis, data, effects, export, joints, kernels,
 from rotflex_jax.compare import Comparison, compare
 from rotflex_jax.data import load
 from rotflex_jax.discover import Discovery, LearnedTorqueResult, discover, learn_torque, locate
+from rotflex_jax.display import explore, live
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
-from rotflex_jax.fit import SeriesFit, fit, forward_regression, least_squares
+from rotflex_jax.fit import ManyStarts, SeriesFit, fit, forward_regression, least_squares, many_starts
 from rotflex_jax.fit.fitted import Fit
+from rotflex_jax.fleet import Fleet, fleet
 from rotflex_jax.latent import LatentTorque, latent_torque
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, linearise, simulate
 from rotflex_jax.model import Model
@@ -31,10 +33,12 @@ __all__ = [
     "Experiment",
     "Exponential",
     "Fit",
+    "Fleet",
     "InputError",
     "LatentTorque",
     "LearnedTorqueResult",
     "Limits",
+    "ManyStarts",
     "Mechanism",
     "Model",
     "Recording",
@@ -49,8 +53,10 @@ __all__ = [
     "effects",
     "enable_compilation_cache",
     "enable_fast_loops",
+    "explore",
     "export",
     "fit",
+    "fleet",
     "forward_regression",
     "joints",
     "kernels",
@@ -58,8 +64,10 @@ __all__ = [
     "learn_torque",
     "least_squares",
     "linearise",
+    "live",
     "load",
     "locate",
+    "many_starts",
     "metrics",
     "next_experiment",
     "simulate",

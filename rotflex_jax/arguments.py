@@ -31,7 +31,7 @@ JointName = Annotated[
     ),
 ]
 InputColumn = Annotated[
-    str | None, typer.Option("--input", metavar="COLUMN", help="Column of the motor voltage [V].")
+    str | None, typer.Option("--input", metavar="COLUMN", help="Column of the motor voltage in volts.")
 ]
 OutputColumns = Annotated[
     list[str] | None,
@@ -46,7 +46,9 @@ SamplingPeriod = Annotated[
     float | None,
     typer.Option("--Ts", metavar="SECONDS", help="Sampling period, where no column has the time."),
 ]
-TimeColumn = Annotated[str | None, typer.Option("--time", metavar="COLUMN", help="Column of the time [s].")]
+TimeColumn = Annotated[
+    str | None, typer.Option("--time", metavar="COLUMN", help="Column of the time in seconds.")
+]
 Accept = Annotated[
     list[str] | None,
     typer.Option("--accept", metavar="FAULT", help="Accept a named fault of the data, such as saturated."),
@@ -70,6 +72,18 @@ HeldOut = Annotated[
 Share = Annotated[
     float | None,
     typer.Option("--split", metavar="SHARE", help="Share of each FILE to learn from: 0.7."),
+]
+Each = Annotated[
+    bool,
+    typer.Option("--each", help="Search each FILE by itself, many at once; --report has the summary."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="With --each: Dask scheduler whose workers search."),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(metavar="COUNT", help="With --each: processes here; by cores and memory unless given."),
 ]
 
 
@@ -104,22 +118,26 @@ class Columns:
         if file.is_dir():
             raise InputError(f"{file} is a folder, but a recording is one file; name the file.")
         from rotflex_jax.data import load
+
+        try:
+            return load(file, **self.reading())
+        except InputError as error:
+            raise InputError(as_options(str(error))) from None
+
+    def reading(self) -> dict[str, Any]:
+        """The same as arguments of `rotflex_jax.load`."""
         from rotflex_jax.mechanism.states import output_units
 
         units = {} if self.mechanism is None else output_units(self.mechanism)
-        try:
-            return load(
-                file,
-                input=self.input,
-                outputs=_channels(self.outputs or (), tuple(units)),
-                units=units,
-                degrees=self.degrees,
-                Ts=self.Ts,
-                time=self.time,
-                accept=tuple(self.accept or ()),
-            )
-        except InputError as error:
-            raise InputError(_as_options(str(error))) from None
+        return {
+            "input": self.input,
+            "outputs": _channels(self.outputs or (), tuple(units)),
+            "units": units,
+            "degrees": self.degrees,
+            "Ts": self.Ts,
+            "time": self.time,
+            "accept": tuple(self.accept or ()),
+        }
 
     def load_parts(
         self, files: Sequence[Path], held_out: Sequence[Path], share: float
@@ -142,7 +160,7 @@ def _channels(outputs: Sequence[str], model: Sequence[str]) -> Sequence[str] | M
     return dict(zip(model, outputs, strict=True)) if named else outputs or None
 
 
-def _as_options(sentence: str) -> str:
+def as_options(sentence: str) -> str:
     """A sentence about arguments of `rotflex_jax.load`, told in options of the command line."""
     sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
     sentence = sentence.replace("degrees=True", "--degrees").replace("degrees=False", "no --degrees")

@@ -17,6 +17,7 @@ from rotflex_jax.data_commands import data_app
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment_command import experiment
 from rotflex_jax.export_command import export
+from rotflex_jax.fleet_command import check_each, search_each
 from rotflex_jax.reproduce_command import reproduce
 from rotflex_jax.simulate_command import simulate
 
@@ -105,14 +106,23 @@ def discover(
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
     save_model: given.ModelFile = None,
+    each: given.Each = False,
+    scheduler: given.Scheduler = None,
+    workers: given.Workers = None,
 ) -> None:
     """Find the effects that the model lacks, with evidence on data the fit never saw."""
+    check_each(
+        each, {"scheduler": scheduler, "workers": workers}, {"held-out": held_out, "save-model": save_model}
+    )
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, held_out or [])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
     model, options = given.model(joint), (degrees, Ts, time_column, accept)
     columns = given.Columns(input_column, output_columns, *options, model.mechanism)
+    if each:
+        search_each(model, files, columns, share, report, json_file, scheduler, workers)
+        return
     train, test = columns.load_parts(files, held_out or [], share)
     _discover(model, train, test, report, json_file, save_model)
 

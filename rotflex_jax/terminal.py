@@ -11,6 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+# Rows of a long table that are shown.
+LISTED = 60
+
 
 def output() -> Console:
     """The console for results. Made on use, so that it follows a redirected stdout."""
@@ -117,6 +120,31 @@ def print_comparison(result: Any) -> None:
     console = output()
     console.print("Free runs over the held-out data", style="bold")
     console.print(str(result), markup=False)
+
+
+def print_fleet(result: Any, reworded: Callable[[str], str]) -> None:
+    """One line a recording, and the counts."""
+    good = [row for row in result.rows if row.verdict]
+    rows = [
+        (
+            row.name,
+            row.verdict.replace("_", " "),
+            row.found or "-",
+            *(
+                " to ".join(_errors(end, {channel: unit})[0] for end in (row.before, row.after))
+                for channel, unit in result.units.items()
+            ),
+            f"{row.seconds:.0f}",
+        )
+        for row in good[:LISTED]
+    ]
+    errors = [f"{channel} [{shown(None, unit)[1]}]" for channel, unit in result.units.items()]
+    print_rows(("recording", "verdict", "found", *errors, "s"), rows)
+    for row in result.failed[:LISTED]:
+        message(f"{row.name} failed: {reworded(row.reason)}")
+    if len(good) > LISTED or len(result.failed) > LISTED:
+        message(f"The rest of the list is in {result.folder / 'summary.csv'}.")
+    message(str(result))
 
 
 def print_findings(recordings: Sequence[Any]) -> None:

@@ -15,7 +15,7 @@ from rotflex_jax.compare import Comparison, Fitted
 from rotflex_jax.compare.horizon import against_horizon, pieces
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.report.comparison_figures import horizons, overlays, ranks, spectra
+from rotflex_jax.report.comparison_figures import drawn, horizons, overlays, ranks, spectra
 
 
 def recorded(N: int = 1200, seed: int = 0) -> Recording:
@@ -172,3 +172,11 @@ def test_the_command_writes_the_page(tmp_path, monkeypatch, capsys) -> None:
         cli.main([*line, "--methods", "arx", "--quick"])
     assert left.value.code == 2
     assert "--quick and --methods" in capsys.readouterr().err
+
+
+def test_of_a_fast_signal_only_so_many_swings_are_drawn() -> None:
+    t = 1e-3 * np.arange(5000)
+    fast, slow = np.sin(2 * np.pi * 50 * t), np.sin(2 * np.pi * 0.5 * t)
+    count = {name: drawn(Recording(u=y, y=y, Ts=1e-3)) for name, y in {"fast": fast, "slow": slow}.items()}
+    assert count["slow"] == 5000
+    assert count["fast"] == pytest.approx(600, abs=20)  # sixty times through the mean

@@ -11,7 +11,8 @@ import scipy.signal
 
 import rotflex_jax as rf
 from rotflex_jax.compare import SINDy
-from rotflex_jax.compare.sindy import smooth
+from rotflex_jax.compare.smoothing import smooth, smoothed_input
+from rotflex_jax.compare.sparse_runs import Piece, refined
 from rotflex_jax.compare.sparse_terms import SparseLaw, Terms, motions
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
@@ -38,11 +39,12 @@ def pendulum(seed: int = 0, seconds: float = 12.0, noise: float = 0.0) -> Record
     return Recording(u=u, y=y + noise * rng.normal(size=N), Ts=Ts, channels="q", n_init=40)
 
 
-@pytest.mark.parametrize("variant", ["plain", "ensemble", "weak"])
+@pytest.mark.parametrize("variant", ["plain", "ensemble", "weak", "free runs"])
 def test_the_law_behind_the_data_is_found(variant: Any) -> None:
     pytest.importorskip("pysindy")
     train, test = pendulum(0, noise=1e-5), pendulum(1)
-    fitted = SINDy(variant=variant, degrees=(3,), bags=5, **LIMITS).fit(None, [train], lambda _: None)  # type: ignore[arg-type]
+    kind = {"variant": "weak", "free_runs": True} if variant == "free runs" else {"variant": variant}
+    fitted = SINDy(**kind, degrees=(3,), bags=5, **LIMITS).fit(None, [train], lambda _: None)  # type: ignore[arg-type]
     law: Any = fitted.simulator
     found = dict(zip(law.terms.names, law.W[:, 0], strict=True))
     assert found["u"] == pytest.approx(3.0, rel=0.05)
@@ -65,7 +67,7 @@ def test_the_weights_are_those_of_pysindy_called_directly() -> None:
     v, a = (scipy.signal.savgol_filter(y, 9, 3, deriv=d, delta=Ts) for d in (1, 2))
     q = scipy.signal.savgol_filter(y, 9, 3)
     s = 0.03 * np.sqrt(np.mean(v**2))
-    u = (train.u + np.concatenate([train.u[:1], train.u[:-1]])) / 2
+    u = smoothed_input(train, ("savgol", 9), 2)
     library = np.column_stack([u * 0 + 1, u, q, q**2, q**3, v, v * abs(v), np.tanh(v / s), v**3])[10:-10]
     size, rate = np.sqrt(np.mean(library**2, axis=0)), a[10:-10]
     out = np.sqrt(np.mean(rate**2))
@@ -87,6 +89,37 @@ def test_smoothing_gives_speed_and_acceleration(kind: tuple[str, float]) -> None
         smooth(record, ("wavelet", 3))
 
 
+@pytest.mark.parametrize("width", [9, 31])
+def test_the_input_is_seen_through_the_same_smoothing(width: int) -> None:
+    """One and two integrators under a held input: smoothed rates are the smoothed input to rounding."""
+    u = np.random.default_rng(3).normal(size=400)
+    speed = np.concatenate([[0.0], np.cumsum(Ts * u)[:-1]])
+    place = np.concatenate([[0.0], np.cumsum(Ts * speed + Ts**2 / 2 * u)[:-1]])
+    inside = slice(width, -width)
+    for y, order in ((speed, 1), (place, 2)):
+        record = Recording(u=u, y=y, Ts=Ts, channels="q")
+        rate = smooth(record, ("savgol", width))[:, order]
+        np.testing.assert_allclose(
+            rate[inside], smoothed_input(record, ("savgol", width), order)[inside], atol=1e-10
+        )
+        spline = smooth(record, ("spline", 12.0))[:, order][60:-60]
+        seen = smoothed_input(record, ("spline", 12.0), order)[60:-60]
+        assert np.std(spline - seen) < 0.1 * np.std(spline)
+
+
+def test_numbers_refined_for_free_runs_are_those_of_the_pendulum() -> None:
+    record, terms = pendulum(4), Terms(("q",), 2, 3, (1e-3,))
+    true = {"u": 3.0, "q": -9.0, "q'": -0.4, "q^3": -2.0}
+    W = np.zeros((len(terms.names), 1))
+    for name, w in true.items():
+        W[terms.names.index(name)] = 1.15 * w
+    states = smooth(record, ("savgol", 5))
+    pieces = [Piece(states[k, :2], record.u[k : k + 200], record.y[k : k + 200]) for k in (100, 400, 700)]
+    found = dict(zip(terms.names, refined(terms, W, pieces, Ts)[:, 0], strict=True))
+    assert {n: found[n] for n in true} == pytest.approx(true, rel=0.02)
+    assert not any(found[n] for n in found if n not in true)
+
+
 def test_motion_is_that_of_scipy() -> None:
     record = pendulum(2, 3.0)
     terms = Terms(("q",), 2, 3, (1e-3,))
@@ -102,6 +135,24 @@ def test_motion_is_that_of_scipy() -> None:
     y[k:] += 0.5
     changed = dataclasses.replace(record, y=y)
     np.testing.assert_array_equal(law.predict(record)[: k + 1], law.predict(changed)[: k + 1])
+
+
+def test_an_input_that_runs_on_is_not_held() -> None:
+    """q'' = -9 q - 0.4 q' + 3 sin 5t, whose input turns a tenth of a turn from sample to sample."""
+    step, N = 0.1, 120
+    t = step * np.arange(N)
+    law = lambda s, x: [x[1], -9 * x[0] - 0.4 * x[1] + 3 * np.sin(5 * s)]  # noqa: E731
+    true = scipy.integrate.solve_ivp(law, (0.0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11).y[0]
+    errors = {}
+    for held in (True, False):
+        terms = Terms(("q",), 2, 1, (1e-3,), held)
+        W = np.zeros((len(terms.names), 1))
+        for name, w in {"u": 3.0, "q": -9.0, "q'": -0.4}.items():
+            W[terms.names.index(name)] = w
+        run = motions(terms, W[None], np.zeros((1, 1, 2)), np.sin(5 * t)[None], step)[0, 0, :, 0]
+        errors[held] = np.std(run - true) / np.std(true)
+    assert errors[False] < 0.01
+    assert errors[True] > 0.1
 
 
 def test_without_pysindy_the_row_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,9 @@ import pytest
 from turntable import FOR_THE_NOTEBOOK, Truth, record, write
 
 import rotflex_jax as rf
+from rotflex_jax.discover.looks import as_read
 from rotflex_jax.discover.supermodel import build
+from rotflex_jax.display import Live
 from rotflex_jax.effects import CATALOG, Coulomb, Force, Inertia, Motor, Rectifier, Spring, Viscous, register
 from rotflex_jax.effects.kinds import Scale
 from rotflex_jax.errors import InputError
@@ -170,7 +172,8 @@ def test_fit_of_ones_own_machine_recovers_its_numbers():
 def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
     """Called as for any joint: friction and a user's own effect are found, both at the right port."""
     train, test = recording(FOR_THE_NOTEBOOK).split(0.7)
-    result = rf.discover(turntable, train, test)
+    follow = Live("search")
+    result = rf.discover(turntable, train, test, progress=follow)
     # The tacho does not show the way, so a fit may end in another optimum: kinds and ports are certain,
     # and that they help, but not every number.
     assert (result.rounds[0].effect, result.rounds[0].port) == ("magnetic_brake", "platter")
@@ -178,6 +181,11 @@ def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
     assert {r.effect for r in result.rounds[1:]} & {"coulomb", "stribeck"}
     before, after = result.baseline.held_out_rmse_windows, result.final.held_out_rmse_windows
     assert all(after[c] < before[c] / 3 for c in before)
+    # What was shown while it ran, in units that people read.
+    assert follow.labels[:2] == ["as it is", "+ magnetic brake at platter"]
+    units = [as_read(1.0, unit)[1] for unit in test.units]
+    shown = [follow.errors[f"{channel} [{unit}]"] for channel, unit in zip(before, units, strict=True)]
+    assert np.prod([errors[1] / errors[0] for errors in shown]) < 1
 
 
 def test_recording_of_the_notebook_is_what_the_simulator_makes(tmp_path):

@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from arena.records import make_record
 
 import rotflex_jax as rf
+from arena.records import make_record
 from rotflex_jax.fit.signs import check_signs
 
 JOINT = rf.Model(rf.joints.paper())

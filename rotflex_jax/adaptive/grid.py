@@ -12,6 +12,7 @@ from rotflex_jax.adaptive.objectives import Objective, blocks
 from rotflex_jax.adaptive.settings import Build
 from rotflex_jax.adaptive.tuned import Tuned
 from rotflex_jax.basis import Basis
+from rotflex_jax.devices import mesh_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
@@ -26,6 +27,7 @@ def grid(
     *,
     objective: Objective,
     test: Sequence[Recording] = (),
+    devices: Sequence[Any] | None = None,
 ) -> Tuned:
     """The objective of `tune` at every combination of given settings.
 
@@ -40,6 +42,8 @@ def grid(
         channel: as in `tune`.
         objective: as in `tune`.
         test: as in `tune`.
+        devices: to share the combinations out to; all of this process unless given. With
+            `jax.distributed`, `jax.devices()` are those of all processes, of which each makes this call.
 
     Returns:
         The best combination, with all values.
@@ -56,7 +60,10 @@ def grid(
     points = np.array(list(itertools.product(*tried.values())))
     with double_precision():
         data = blocks(basis, recordings, channel, objective)
-        run = values_at(jnp.asarray(points), data, names=tuple(tried), build=build, objective=objective)
+        mesh = mesh_of(devices)
+        run = values_at(
+            jnp.asarray(points), data, names=tuple(tried), build=build, objective=objective, mesh=mesh
+        )
         values = np.asarray(run)
     if not np.isfinite(values).any():
         raise InputError("The filter diverges at every point of the grid; try smaller steps.")

@@ -96,8 +96,11 @@ def identify(
         InputError: no such channel, or a basis that is not the one that the filter is made for.
     """
     y, n = recording.channel(channel), recording.n_init
-    phi = _own_input(filter, basis, recording) if filter.from_input else basis.regressors(recording.u)
-    return Identified(run(filter, phi[n:], y[n:], keep_every=keep_every), basis, recording, channel)
+    if filter.from_input:
+        done = run(filter, _own_input(filter, basis, recording)[n:], y[n:], keep_every=keep_every)
+    else:
+        done = run(filter, recording.u, y[n:], basis=basis, keep_every=keep_every)
+    return Identified(done, basis, recording, channel)
 
 
 def _own_input(filter: AdaptiveFilter, basis: Basis, recording: Recording) -> Float[np.ndarray, " N"]:

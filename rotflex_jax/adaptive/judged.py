@@ -7,15 +7,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.bounds import Stability, analyse
+from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.lms import LMS
 from rotflex_jax.adaptive.moments import Moments
 from rotflex_jax.adaptive.objectives import Blocks, Objective, blocks, evaluate, unit
+from rotflex_jax.adaptive.ranges import per_weight
 from rotflex_jax.adaptive.settings import Build, built
+from rotflex_jax.adaptive.sweep import lanes, sweep
 from rotflex_jax.adaptive.tuned import Tuned
 from rotflex_jax.basis import Basis
+from rotflex_jax.devices import spread
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 
@@ -27,16 +32,52 @@ ROWS = 20_000
 """Samples that the moments for this are taken from."""
 
 
-@functools.partial(jax.jit, static_argnames=("names", "build", "objective"))
+@functools.partial(jax.jit, static_argnames=("names", "build", "objective", "mesh"))
 def values_at(
+    points: Float[Array, "K n"],
+    data: Blocks,
+    *,
+    names: tuple[str, ...],
+    build: Build,
+    objective: Objective,
+    mesh: Mesh | None = None,
+) -> Float[Array, " K"]:
+    """The objective at many points, on each device some at a time; compiled once per `build`."""
+    values = functools.partial(_values, names=names, build=build, objective=objective)
+    return spread(values, mesh)(points, data)
+
+
+def _values(
     points: Float[Array, "K n"], data: Blocks, *, names: tuple[str, ...], build: Build, objective: Objective
 ) -> Float[Array, " K"]:
-    """The objective at many points, some at a time; compiled once per `build`."""
+    def made(point: Array) -> tuple[AdaptiveFilter, Basis | None]:
+        return built(build, dict(zip(names, point, strict=True)))
 
-    def value(point: Array) -> Array:
-        return evaluate(data, objective, *built(build, dict(zip(names, point, strict=True))))
-
+    filter, changed = made(points[0])
+    if type(filter) is LMS and changed is None:
+        return _swept(
+            points, data, made, objective, not isinstance(filter.leakage, float) or filter.leakage != 0
+        )
+    value = lambda point: evaluate(data, objective, *made(point))  # noqa: E731
     return jax.lax.map(value, points, batch_size=min(LANES, len(points)))
+
+
+def _swept(points: Array, data: Blocks, made: Any, objective: Objective, leaks: bool) -> Float[Array, " K"]:
+    """`values_at` for LMS on fixed regressors, as many points at a time as there is room for."""
+    K, P = len(points), data.phi.shape[2]
+
+    def settings(point: Array) -> tuple[Array, Array]:
+        filter = made(point)[0]
+        return per_weight("mu", filter.mu, P, data.phi.dtype), jnp.asarray(filter.leakage, data.phi.dtype)
+
+    some = min(lanes(P), K)
+    padded = jnp.concatenate([points, jnp.broadcast_to(points[-1:], (-K % some, points.shape[1]))])
+
+    def at(points: Array) -> Array:
+        mu, leakage = jax.vmap(settings)(points)
+        return sweep(data, objective, mu, leakage if leaks else None)
+
+    return jax.lax.map(at, padded.reshape(-1, some, points.shape[1])).reshape(-1)[:K]
 
 
 def sample_moments(phi: Any) -> Moments:

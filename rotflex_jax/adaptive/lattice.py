@@ -80,7 +80,7 @@ class VolterraLattice(AdaptiveFilter):
 
     @property
     def size(self) -> int:
-        """Weights: of the constant, M linear and M (M + 1) / 2 quadratic ones."""
+        """How many weights, one of the constant, M linear and M (M + 1) / 2 quadratic ones."""
         return len(monomials(self.memory)) + self.constant
 
     @property

@@ -7,6 +7,7 @@ from jaxtyping import Array
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter, Weights
 from rotflex_jax.adaptive.ranges import Number, PerWeight, per_weight, within
+from rotflex_jax.adaptive.sums import tree_sum
 
 
 class LMS(AdaptiveFilter):
@@ -49,5 +50,5 @@ class LMS(AdaptiveFilter):
         """One step."""
         mu = per_weight("mu", self.mu, len(phi), phi.dtype)
         leakage = jnp.asarray(self.leakage).astype(phi.dtype)
-        e = y - jnp.sum(state.w * phi)
+        e = y - tree_sum(state.w * phi)
         return Weights(state.w - (mu * leakage) * state.w + (mu * e) * jnp.conj(phi)), e

@@ -26,7 +26,7 @@ class Moments:
 
     Attributes:
         R: E[phi phi'] (P, P).
-        pairs: S as a matrix over `pack`ed symmetric matrices (D, D), D = P (P + 1) / 2; None for samples.
+        pairs: S as a matrix over packed symmetric matrices (D, D), D = P (P + 1) / 2; None for samples.
         samples: regressors (N, P) that all moments are means over; None for exact moments.
     """
 
@@ -140,7 +140,7 @@ class Moments:
 
     @property
     def condition(self) -> float:
-        """Largest over smallest eigenvalue of R: how much slower LMS is in its slowest direction."""
+        """Largest over smallest eigenvalue of R, how much slower LMS is in its slowest direction."""
         values = self.eigenvalues
         return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter, Weights
 from rotflex_jax.adaptive.ranges import Number, within
+from rotflex_jax.adaptive.sums import tree_sum
 from rotflex_jax.errors import InputError
 
 
@@ -42,8 +43,8 @@ class NLMS(AdaptiveFilter):
     def step(self, state: Weights, phi: Array, y: Array) -> tuple[Weights, Array]:
         """One step."""
         mu, eps = (jnp.asarray(x).astype(phi.dtype) for x in (self.mu, self.eps))
-        e = y - jnp.sum(state.w * phi)
-        power = jnp.sum(phi * jnp.conj(phi))
+        e = y - tree_sum(state.w * phi)
+        power = tree_sum(phi * jnp.conj(phi))
         return Weights(state.w + (mu * e / (eps + power)) * jnp.conj(phi)), e
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.ranges import Number, PerWeight, per_weight, real_data, within
 from rotflex_jax.adaptive.root import correct
+from rotflex_jax.adaptive.sums import tree_sum
 
 
 class Root(NamedTuple):
@@ -61,6 +62,6 @@ class RLS(AdaptiveFilter):
 
     def step(self, state: Root, phi: Array, y: Array) -> tuple[Root, Array]:
         """One step."""
-        e = y - jnp.sum(state.w * phi)
+        e = y - tree_sum(state.w * phi)
         S, g, _ = correct(state.S, phi, self.lam, 1.0)
         return Root(state.w + g * e, S), e

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.ranges import Number
+from rotflex_jax.adaptive.sums import tree_sum
 
 
 def correct(
@@ -31,7 +32,7 @@ def correct(
     r = lam / gamma
     # Full products also where a device would round the factors of a matrix product first.
     v = jnp.matmul(phi, S, precision=jax.lax.Precision.HIGHEST)
-    a = r + jnp.sum(v * v)
+    a = r + tree_sum(v * v)
     g = jnp.matmul(S, v, precision=jax.lax.Precision.HIGHEST) / a
     share = 1 / (1 + jnp.sqrt(r / a))
     return (S - (share * g)[:, None] * v[None, :]) / jnp.sqrt(lam), g, jnp.divide(lam, a)

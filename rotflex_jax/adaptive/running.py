@@ -10,6 +10,10 @@ import numpy as np
 from jaxtyping import Array, Inexact
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter, in_dtype, regressor_size, scan
+from rotflex_jax.adaptive.forms import quickest
+from rotflex_jax.adaptive.rebuilt import Rebuilt
+from rotflex_jax.basis import Basis, Volterra
+from rotflex_jax.basis.bank import require_basis, signal
 from rotflex_jax.errors import InputError
 from rotflex_jax.precision import working_precision
 
@@ -45,16 +49,29 @@ class Run:
         return self.status != "ok"
 
 
-def run(filter: AdaptiveFilter, phi: Any, y: Any, *, state: Any = None, keep_every: int = 0) -> Run:
+def run(
+    filter: AdaptiveFilter,
+    phi: Any,
+    y: Any,
+    *,
+    basis: Basis | None = None,
+    state: Any = None,
+    keep_every: int = 0,
+) -> Run:
     """Runs a filter over a record, one sample after the other.
 
     One compiled loop; another call with the same shapes and other values compiles nothing. A filter
     has diverged where an error is not finite, or ten thousand times larger than any output.
 
+    With a basis, a Volterra series of delays is worked out inside of the loop: that is several times
+    quicker than `basis.regressors` beforehand, and of the regressors nothing is stored.
+
     Args:
         filter: with its settings.
-        phi: regressors (N, P), or the input (N,) for a filter that makes its own.
+        phi: regressors (N, P); with a basis, or for a filter that makes its own, the input (N,).
         y: measured output (N,).
+        basis: makes the regressors of the input, which may begin before the output: what is too much at
+            its beginning only fills the memory of the basis.
         state: `Run.state` of an earlier run, to go on from; the filter's start if None. Two runs in a
             row give what one run over all samples gives.
         keep_every: keep the weights after every so many samples; 0 keeps only the last.
@@ -69,56 +86,96 @@ def run(filter: AdaptiveFilter, phi: Any, y: Any, *, state: Any = None, keep_eve
     >>> run(LMS(mu=3.0), np.ones((100, 1)), np.ones(100)).status
     'diverged at sample 14'
     """
+    if basis is not None:
+        return _over_basis(filter, basis, phi, y, state, _chunk(keep_every))
     phi, y = _samples(filter, phi, y)
-    if isinstance(keep_every, bool) or not isinstance(keep_every, int | np.integer) or keep_every < 0:
+    return _run_on(filter, None, phi, y, state, _chunk(keep_every))
+
+
+def _over_basis(filter: AdaptiveFilter, basis: Basis, u: Any, y: Any, state: Any, every: int) -> Run:
+    """A run on the regressors that a basis makes of an input."""
+    if filter.from_input:
         raise InputError(
-            f"Argument `keep_every` must be a whole number of samples, but is {keep_every!r}; "
-            "give 0 to keep only the last weights."
+            f"{type(filter).__name__} makes its own regressors, but `basis` was given too; leave it out."
         )
-    with working_precision(phi.real):
+    require_basis(basis)
+    u, y = signal(u, "phi"), np.asarray(y)
+    before = len(u) - len(y) if y.ndim == 1 else -1
+    if before < 0:
+        raise InputError(
+            f"The output must have the shape (N,), no longer than its input, but has {y.shape} where the "
+            f"input has {u.shape}; give an input for every output sample."
+        )
+    form = None if y.dtype.kind == "c" else quickest(filter, basis, not every)
+    if form is None:
+        phi, y = _samples(filter, basis.regressors(u)[before:], y)
+        return _run_on(filter, None, phi, y, state, every)
+    assert isinstance(basis, Volterra)
+    # The newest delay comes first; what is longer ago than the record is zero.
+    reach = form.memory + basis.bank.first
+    line = np.concatenate([np.zeros(max(0, reach - before), u.dtype), u[max(0, before - reach) :]])
+    x, y = _finite(line[: len(line) - basis.bank.first], y)
+    return _run_on(filter, form, x, y, state, every)
+
+
+def _run_on(
+    filter: AdaptiveFilter, form: Rebuilt | None, phi: np.ndarray, y: np.ndarray, state: Any, every: int
+) -> Run:
+    size = regressor_size(phi) if form is None else form.size
+    with working_precision(np.real(phi)):
         # Settings of one kind whatever they were given as, so that only shapes decide what is compiled.
         filter = in_dtype(filter, phi.dtype)
-        start = None if state is None else _resumed(filter, phi, state)
-        result = _run(filter, jnp.asarray(phi), jnp.asarray(y), start, int(keep_every))
+        start = None if state is None else _resumed(filter, size, phi.dtype, state)
+        result = _run(filter, jnp.asarray(phi), jnp.asarray(y), start, form, every)
         end, errors, path, weights = jax.device_get(result)
     errors, status = _judged(errors, y)
-    return Run(errors, weights, path, np.arange(len(path)) * keep_every, end, status)
+    return Run(errors, weights, path, np.arange(len(path)) * every, end, status)
 
 
-@functools.partial(jax.jit, static_argnums=4)
+@functools.partial(jax.jit, static_argnums=(4, 5))
 def _run(
-    filter: AdaptiveFilter, phi: Array, y: Array, state: Any, every: int
+    filter: AdaptiveFilter, phi: Array, y: Array, state: Any, form: Rebuilt | None, every: int
 ) -> tuple[Any, Array, Array, Array]:
-    if state is None:
-        state = filter.init(regressor_size(phi), phi.dtype)
+    size = regressor_size(phi) if form is None else form.size
+    state = filter.init(size, phi.dtype) if state is None else state
+    step: Any = lambda state, phi, y: scan(filter, phi, y, state)  # noqa: E731
+    close: Any = lambda state: state  # noqa: E731
+    if form is not None:
+        lags, phi = phi[: form.memory][::-1], phi[form.memory :]
+        state = form.begin(filter, state, lags)
+        step, close = functools.partial(form.scan, filter), functools.partial(form.end, filter)
+    weights = lambda state: filter.weights(close(state))  # noqa: E731
     if not every:
-        state, errors = scan(filter, phi, y, state)
-        weights = filter.weights(state)
-        return state, errors, jnp.zeros((0, *weights.shape), weights.dtype), weights
-    first = filter.weights(state)
+        state, errors = step(state, phi, y)
+        last = weights(state)
+        return close(state), errors, jnp.zeros((0, *last.shape), last.dtype), last
+    first = weights(state)
     # An outer loop over chunks keeps the weights at their ends; what does not fill one follows.
     whole = len(y) // every * every
     chunks = jax.tree.map(lambda x: x[:whole].reshape(-1, every, *x.shape[1:]), (phi, y))
 
     def chunk(state: Any, samples: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array]]:
-        state, errors = scan(filter, *samples, state)
-        return state, (errors, filter.weights(state))
+        state, errors = step(state, *samples)
+        return state, (errors, weights(state))
 
     state, (errors, path) = jax.lax.scan(chunk, state, chunks)
-    state, rest = scan(filter, phi[whole:], y[whole:], state)
+    state, rest = step(state, phi[whole:], y[whole:])
     path = jnp.concatenate([first[None], path])
-    return state, jnp.concatenate([errors.reshape(-1), rest]), path, filter.weights(state)
+    return close(state), jnp.concatenate([errors.reshape(-1), rest]), path, weights(state)
+
+
+def _chunk(keep_every: Any) -> int:
+    if isinstance(keep_every, bool) or not isinstance(keep_every, int | np.integer) or keep_every < 0:
+        raise InputError(
+            f"Argument `keep_every` must be a whole number of samples, but is {keep_every!r}; "
+            "give 0 to keep only the last weights."
+        )
+    return int(keep_every)
 
 
 def _samples(filter: AdaptiveFilter, phi: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
     """Both as finite arrays of one floating dtype."""
     phi, y = np.asarray(phi), np.asarray(y)
-    named = (("phi", phi), ("y", y))
-    for name, x in named:
-        if x.dtype.kind not in "iufc":
-            raise InputError(
-                f"Argument `{name}` must hold numbers, but holds {x.dtype.name}; convert it first."
-            )
     dimensions, wanted, advice = (
         (1, "(N,)", "the input itself") if filter.from_input else (2, "(N, P)", "a row of regressors")
     )
@@ -127,7 +184,17 @@ def _samples(filter: AdaptiveFilter, phi: Any, y: Any) -> tuple[np.ndarray, np.n
             f"Arguments `phi` and `y` of {type(filter).__name__} must have the shapes {wanted} and (N,), "
             f"but have {phi.shape} and {y.shape}; give {advice} for every output sample."
         )
+    return _finite(phi, y)
+
+
+def _finite(phi: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both in the finer of their precisions."""
+    named = (("phi", phi), ("y", y))
     for name, x in named:
+        if x.dtype.kind not in "iufc":
+            raise InputError(
+                f"Argument `{name}` must hold numbers, but holds {x.dtype.name}; convert it first."
+            )
         good = np.isfinite(x)
         if not good.all():
             k = int(np.argmin(good.reshape(len(x), -1).all(axis=1)))
@@ -139,14 +206,14 @@ def _samples(filter: AdaptiveFilter, phi: Any, y: Any) -> tuple[np.ndarray, np.n
     return phi.astype(dtype, copy=False), y.astype(dtype, copy=False)
 
 
-def _resumed(filter: AdaptiveFilter, phi: np.ndarray, state: Any) -> Any:
+def _resumed(filter: AdaptiveFilter, size: int, dtype: Any, state: Any) -> Any:
     """A state to go on from, in the precision of the data."""
-    wanted = jax.eval_shape(lambda: filter.init(regressor_size(phi), phi.dtype))
+    wanted = jax.eval_shape(lambda: filter.init(size, dtype))
     shapes = lambda tree: (jax.tree.structure(tree), [np.shape(x) for x in jax.tree.leaves(tree)])  # noqa: E731
     if shapes(state) != shapes(wanted):
         raise InputError(
             f"Argument `state` must come from a run of the same kind of filter over as many regressors, "
-            f"but is {type(state).__name__} where {type(wanted).__name__} for {regressor_size(phi)} is "
+            f"but is {type(state).__name__} where {type(wanted).__name__} for {size} is "
             "needed; give the state of such a run, or None."
         )
     return jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), state, wanted)
@@ -154,9 +221,11 @@ def _resumed(filter: AdaptiveFilter, phi: np.ndarray, state: Any) -> Any:
 
 def _judged(errors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, str]:
     """The errors, NaN after a divergence, and the status."""
-    size = np.abs(errors)
     # A state to go on from may belong to larger outputs, which its first error then shows.
-    scale = max(float(np.max(np.abs(y))), float(np.nan_to_num(size[0], posinf=0.0)))
+    scale = max(_largest(y), float(np.nan_to_num(np.abs(errors[0]), posinf=0.0)))
+    if _largest(errors) <= RUNAWAY * scale:
+        return errors, "ok"
+    size = np.abs(errors)
     bad = ~np.isfinite(size) | (size > RUNAWAY * scale) & (scale > 0)
     if not bad.any():
         return errors, "ok"
@@ -164,3 +233,8 @@ def _judged(errors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, str]:
     errors = errors.copy()
     errors[k + 1 :] = np.nan
     return errors, f"diverged at sample {k}"
+
+
+def _largest(x: np.ndarray) -> float:
+    """Largest magnitude, without a copy of real numbers; NaN where one is not a number."""
+    return float(np.max(np.abs(x))) if x.dtype.kind == "c" else float(max(np.max(x), -np.min(x)))

@@ -79,12 +79,16 @@ register(
 register(SINDy())
 register(SINDy("sindy_ensemble", "a sparse law of motion, median of an ensemble", "ensemble"))
 register(SINDy("sindy_weak", "a sparse law of motion, weak form", "weak"))
-
-QUICK = tuple(
-    name
-    for name in METHODS
-    if name not in ("discovered", "learned_torque", "sindy_ensemble", "volterra_lms_gradient")
+register(
+    SINDy(
+        "sindy_free_run",
+        "a sparse law of motion, weak form, its numbers refined for free runs",
+        "weak",
+        free_runs=True,
+    )
 )
+
+QUICK = tuple(name for name in METHODS if name not in ("discovered", "learned_torque", "sindy_ensemble"))
 """Names of the methods without a long search."""
 
 __all__ = [

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from rotflex_jax import joints
 from rotflex_jax.compare.horizon import against_horizon
@@ -19,6 +20,8 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
 
 
+# Matrices here are small and many: threads of a linear algebra library only wait for one another.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def compare(
     recordings: Recording | Sequence[Recording],
     methods: Iterable[str | Method] | None = None,

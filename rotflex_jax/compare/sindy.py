@@ -7,19 +7,19 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-import scipy.interpolate
-import scipy.signal
 from jaxtyping import Float
 
 from rotflex_jax.compare.held_in import one_period
 from rotflex_jax.compare.method import Fitted, Progress
-from rotflex_jax.compare.sparse_terms import SparseLaw, Terms, motions
+from rotflex_jax.compare.smoothing import Smoothing, smooth, smoothed_input
+from rotflex_jax.compare.sparse_runs import Piece, costs, refined
+from rotflex_jax.compare.sparse_terms import SparseLaw, Terms
 from rotflex_jax.errors import InputError
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
-Smoothing = tuple[str, float]
-"""`savgol` with a window in samples, or `spline` with the cutoff of its smoothing in samples."""
+Span = tuple[float, float]
+"""From which share of a recording to which."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,9 +28,9 @@ class SINDy:
 
     States are the outputs and their speeds, from smoothing; that a speed is the rate of its output is
     not fitted. How the data are smoothed, the threshold, and whether the law gives accelerations or
-    rates are those with the best free runs over the last part of the training recordings. Not for
-    coarse sensors at a high sampling rate, where smoothing decides the answer: the note says how much
-    it did here.
+    rates are those with the best free runs over the part of the training recordings that was left out, the
+    last and then the first. The input is smoothed as the accelerations are. Not for coarse sensors at a
+    high sampling rate, where smoothing decides the answer: the note says how much it did here.
 
     Source: Brunton, Proctor and Kutz 2016, PNAS 113; ensembles Fasel et al. 2022, Proc. R. Soc. A 478;
     weak form Messenger and Bortz 2021, Multiscale Model. Simul. 19.
@@ -47,6 +47,8 @@ class SINDy:
         share: First part of each recording; the rest decides.
         seconds: Length of the free runs that decide [s]; those over all of a recording must not diverge.
         bags: Fits of an ensemble.
+        free_runs: Whether the numbers of the law that was found are refined for free runs, which is no part
+            of SINDy.
     """
 
     name: str = "sindy"
@@ -64,62 +66,102 @@ class SINDy:
     share: float = 0.7
     seconds: float = 2.0
     bags: int = 20
+    free_runs: bool = False
     family: str = "sindy"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Takes no notice of the model."""
+        """Takes no notice of the model, but for how its input runs between samples."""
         ps = _pysindy()
+        held = getattr(getattr(model, "solver", None), "between", "held") != "smooth"
         one_period(train, "the smoothing")
         tried: list[tuple[float, tuple[int, int], Smoothing, float]] = []
+        # Learnt from the first part and judged on the rest, then the other way round.
+        folds: tuple[tuple[Span, Span], ...] = (
+            ((0.0, self.share), (self.share, 1.0)),
+            ((1 - self.share, 1.0), (0.0, 1 - self.share)),
+        )
         for smoothing in self.smoothings:
             states = [smooth(r, smoothing) for r in train]
             for order, degree in itertools.product(self.orders, self.degrees):
-                terms = _terms(train[0], states, order, degree)
-                W = [
-                    self._weights(ps, terms, train, states, threshold, self.share)
-                    for threshold in self.thresholds
-                ]
-                costs = self._costs(terms, np.stack(W), train, states)
+                terms = _terms(train[0], states, order, degree, held)
+                total = np.zeros(len(self.thresholds))
+                for learnt, judged in folds:
+                    rows = self._rows(terms, train, states, smoothing, learnt)
+                    W = np.stack([self._weights(ps, rows, threshold) for threshold in self.thresholds])
+                    total += costs(terms, W, self._pieces(train, states, judged), train, states)
                 tried += [
-                    (c, (order, degree), smoothing, t) for c, t in zip(costs, self.thresholds, strict=True)
+                    (float(c) / 2, (order, degree), smoothing, t)
+                    for c, t in zip(total, self.thresholds, strict=True)
                 ]
             say(f"{smoothing[0]} {smoothing[1]:g}: log error {min(tried)[0]:.2f}")
         cost, (order, degree), smoothing, threshold = min(tried)
         if not np.isfinite(cost):
             raise RuntimeError("every choice of smoothing and threshold diverges in free run")
         states = [smooth(r, smoothing) for r in train]
-        terms = _terms(train[0], states, order, degree)
-        W = self._weights(ps, terms, train, states, threshold, 1.0)
+        terms = _terms(train[0], states, order, degree, held)
+        W, said = self._weights(ps, self._rows(terms, train, states, smoothing, (0.0, 1.0)), threshold), ""
+        if self.free_runs:
+            first = self._weights(
+                ps, self._rows(terms, train, states, smoothing, (0.0, self.share)), threshold
+            )
+            W, said = self._refined(terms, W, first, train, states, say)
         law = SparseLaw(terms, W, train[0].Ts)
         chosen = f"{smoothing[0]} over {smoothing[1]:g} samples, threshold {threshold:g}"
-        words = f"{chosen}, order {order}, powers to {degree}; {_sensitivity(tried)}"
+        words = f"{chosen}, order {order}, powers to {degree}; {_sensitivity(tried)}{said}"
         return Fitted(law, int(np.count_nonzero(W)), words, law.predict)
 
-    def _weights(
+    def _refined(
         self,
-        ps: Any,
+        terms: Terms,
+        W: np.ndarray,
+        first: np.ndarray,
+        train: Sequence[Recording],
+        states: list[np.ndarray],
+        say: Progress,
+    ) -> tuple[np.ndarray, str]:
+        """Weights refined for free runs, if that helps those of the first part over the rest."""
+        last = self._pieces(train, states, (self.share, 1.0))
+        part = refined(terms, first, self._pieces(train, states, (0.0, self.share)), train[0].Ts)
+        before, after = costs(terms, np.stack([first, part]), last, train, states)
+        say(f"refined for free runs: log error {before:.2f} to {after:.2f}")
+        if not after < before:
+            return W, "; refining its numbers for free runs did not help and was dropped"
+        whole = refined(terms, W, self._pieces(train, states, (0.0, 1.0)), train[0].Ts)
+        there = costs(terms, whole[None], last, train, states)[0]
+        return (whole if np.isfinite(there) else part), "; its numbers refined for free runs"
+
+    def _rows(
+        self,
         terms: Terms,
         train: Sequence[Recording],
         states: list[np.ndarray],
-        threshold: float,
-        share: float,
-    ) -> Float[np.ndarray, "P C"]:
-        """Weights from the first part of the recordings, by an optimiser of pysindy."""
+        smoothing: Smoothing,
+        span: Span,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Terms (N, P) and rates (N, C) from a part of each recording."""
         rows, targets = [], []
+        C, edge = len(terms.channels), 10
         for r, x in zip(train, states, strict=True):
-            n, C = round(share * r.N), len(terms.channels)
-            u = r.u[:n].astype(float)
-            # A smoothed sample lies between the input held before it and the one held after it.
-            u = (u + np.concatenate([u[:1], u[:-1]])) / 2
-            phi = terms.values(_state(x[:n], terms), u)
+            i, j = (round(s * r.N) for s in span)
             if self.variant == "weak":
-                T, dT = _tests(n, terms.order, r.Ts)
-                rows.append(T @ phi)
-                targets.append(dT @ r.y[:n].astype(float))
+                u = r.u.astype(float)
+                if terms.held:
+                    u = (u + np.concatenate([u[:1], u[:-1]])) / 2
+                T, dT = _tests(j - i, terms.order, r.Ts)
+                rows.append(T @ terms.values(_state(x[i:j], terms), u[i:j]))
+                targets.append(dT @ r.y[i:j].astype(float))
             else:
-                rows.append(phi[10:-10])
-                targets.append(x[10 : n - 10, terms.order * C : (terms.order + 1) * C])
-        phi, rate = np.vstack(rows), np.vstack(targets)
+                i, j = max(i, edge), min(j, r.N - edge)
+                u = smoothed_input(r, smoothing, terms.order, terms.held)
+                rows.append(terms.values(_state(x[i:j], terms), u[i:j]))
+                targets.append(x[i:j, terms.order * C : (terms.order + 1) * C])
+        return np.vstack(rows), np.vstack(targets)
+
+    def _weights(
+        self, ps: Any, rows: tuple[np.ndarray, np.ndarray], threshold: float
+    ) -> Float[np.ndarray, "P C"]:
+        """Weights by an optimiser of pysindy, for terms and rates of size one."""
+        phi, rate = rows
         size, out = np.sqrt(np.mean(phi**2, axis=0)), np.sqrt(np.mean(rate**2, axis=0))
         size, out = np.where(size > 0, size, 1.0), np.where(out > 0, out, 1.0)
         phi, rate = phi / size, rate / out
@@ -127,73 +169,27 @@ class SINDy:
             if self.variant == "ensemble":
                 seeds = np.random.default_rng(0)
                 bags = [seeds.integers(0, len(phi), len(phi)) for _ in range(self.bags)]
-                each = np.stack([_thresholded(ps, phi[b], rate[b], threshold) for b in bags])
-                W = np.median(each, axis=0)
+                W = np.median([_thresholded(ps, phi[b], rate[b], threshold) for b in bags], axis=0)
             else:
                 W = _thresholded(ps, phi, rate, threshold)
         return W / size[:, None] * out
 
-    def _costs(
-        self,
-        terms: Terms,
-        W: Float[np.ndarray, "K P C"],
-        train: Sequence[Recording],
-        states: list[np.ndarray],
-    ) -> list[float]:
-        """Mean log error of free runs from smoothed states, over the last parts."""
-        C = len(terms.channels)
-        lengths = [r.N - round(self.share * r.N) for r in train]
-        length = min(min(lengths), max(8, round(self.seconds / train[0].Ts)))
-        x0, u, y = [], [], []
-        for r, x, left in zip(train, states, lengths, strict=True):
-            for i in range(r.N - left, r.N - length + 1, length):
-                x0.append(_state(x[i], terms))
-                u.append(r.u[i : i + length])
-                y.append(r.y[i : i + length])
-        with np.errstate(all="ignore"):
-            start = np.broadcast_to(np.array(x0), (len(W), len(x0), len(x0[0])))
-            runs = motions(terms, W, start, np.array(u, float), train[0].Ts)[..., :C]
-            rms = np.sqrt(np.mean((runs - np.array(y, float)) ** 2, axis=(1, 2)))
-            cost = np.mean(np.log(rms + 1e-300), axis=1)
-            for r, x in zip(train, states, strict=True):
-                start = np.broadcast_to(_state(x[0], terms), (len(W), 1, terms.order * C))
-                whole = motions(terms, W, start, r.u[None].astype(float), r.Ts)[:, 0, :, :C]
-                reach = np.max(np.abs(whole - r.y[0]) / np.maximum(np.ptp(r.y, axis=0), 1e-300), axis=(1, 2))
-                cost = np.where(reach < 20, cost, np.inf)
-        return [float(c) if np.isfinite(c) else np.inf for c in cost]
-
-
-def smooth(recording: Recording, smoothing: Smoothing) -> Float[np.ndarray, "N 3C"]:
-    """Outputs, speeds and accelerations after smoothing, one block of columns after the other."""
-    y, (kind, width) = recording.y.astype(float), smoothing
-    if kind == "savgol":
-        window = min(int(width) // 2 * 2 + 1, (recording.N - 1) // 2 * 2 + 1)
-        parts = [
-            np.asarray(
-                scipy.signal.savgol_filter(y, window, min(3, window - 1), deriv=d, delta=recording.Ts, axis=0)
-            )
-            for d in range(3)
+    def _pieces(self, train: Sequence[Recording], states: list[np.ndarray], span: Span) -> list[Piece]:
+        """Stretches that free runs are made over, all of one length, from a part of each recording."""
+        bounds = [[round(s * r.N) for s in span] for r in train]
+        length = min(min(j - i for i, j in bounds), max(8, round(self.seconds / train[0].Ts)))
+        return [
+            Piece(x[k], r.u[k : k + length].astype(float), r.y[k : k + length].astype(float))
+            for (i, j), r, x in zip(bounds, train, states, strict=True)
+            for k in range(i, j - length + 1, length)
         ]
-        return np.concatenate(parts, axis=1)
-    if kind != "spline":
-        raise InputError(f"A smoothing is 'savgol' or 'spline', but {kind!r} was given; name one of these.")
-    # The smoother of a random walk of the acceleration's integral: its cutoff is the width.
-    t = np.arange(recording.N, dtype=float)
-    splines = [scipy.interpolate.make_smoothing_spline(t, c, lam=(width / (2 * np.pi)) ** 4) for c in y.T]
-    return np.concatenate(
-        [
-            np.stack([s.derivative(d)(t) / recording.Ts**d if d else s(t) for s in splines], axis=1)
-            for d in range(3)
-        ],
-        axis=1,
-    )
 
 
-def _terms(recording: Recording, states: list[np.ndarray], order: int, degree: int) -> Terms:
+def _terms(recording: Recording, states: list[np.ndarray], order: int, degree: int, held: bool) -> Terms:
     C = len(recording.channels)
     speed = np.concatenate([x[:, (order - 1) * C : order * C] for x in states])
     width = np.maximum(0.03 * np.sqrt(np.mean(speed**2, axis=0)), 1e-12)
-    return Terms(recording.channels, order, degree, tuple(width.tolist()))
+    return Terms(recording.channels, order, degree, tuple(width.tolist()), held)
 
 
 def _state(x: np.ndarray, terms: Terms) -> np.ndarray:

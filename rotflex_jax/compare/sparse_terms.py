@@ -28,12 +28,14 @@ class Terms:
         order: 2 where the law gives accelerations of the outputs, 1 where it gives their rates.
         degree: 3 for powers of outputs and speeds, 1 for none.
         width: Speed within which the sign turns, for each output.
+        held: Whether the input is held between samples, or runs on smoothly.
     """
 
     channels: tuple[str, ...]
     order: int
     degree: int
     width: tuple[float, ...]
+    held: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -102,9 +104,9 @@ class SparseLaw:
         v = np.stack([np.convolve(c, slope[::-1])[: len(y)] for c in y.T], axis=1)
         v[: k - 1] = v[k - 1]
         x = np.concatenate([y, v], axis=1) if self.terms.order == 2 else y
-        ahead = motions(
-            self.terms, self.W[None], x[None], np.repeat(recording.u.astype(float)[:, None], 2, 1), self.Ts
-        )
+        u = recording.u.astype(float)
+        pairs = np.stack([u, np.concatenate([u[1:], u[-1:]])], axis=1)
+        ahead = motions(self.terms, self.W[None], x[None], pairs, self.Ts)
         return np.concatenate([y[:1], ahead[0, :-1, 1, :C]])
 
     def _check(self, recording: Recording) -> None:
@@ -150,24 +152,33 @@ def motions(
     u: Float[np.ndarray, "M N"],
     Ts: float,
 ) -> Float[np.ndarray, "K M N n"]:
-    """States of K laws from M first states each, under M inputs held between samples."""
+    """States of K laws from M first states each, under M inputs."""
     N = u.shape[1]
-    padded = np.zeros((len(u), max(2, 1 << (N - 1).bit_length())))
+    padded = np.repeat(u[:, -1:], max(2, 1 << (N - 1).bit_length()), axis=1)
     padded[:, :N] = u
     with double_precision():
         run = _motions(
             terms.order,
             terms.degree,
             terms.channels,
+            terms.held,
             np.array(terms.width),
             *map(jnp.asarray, (W, x0, padded, float(Ts))),
         )
         return np.asarray(run)[:, :, :N]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _motions(
-    order: int, degree: int, channels: tuple[str, ...], width: Array, W: Array, x0: Array, u: Array, Ts: Array
+    order: int,
+    degree: int,
+    channels: tuple[str, ...],
+    held: bool,
+    width: Array,
+    W: Array,
+    x0: Array,
+    u: Array,
+    Ts: Array,
 ) -> Array:
     terms, C = Terms(channels, order, degree, width), len(channels)  # pyright: ignore[reportArgumentType]
 
@@ -177,12 +188,17 @@ def _motions(
             return jnp.concatenate([x[C:], last]) if order == 2 else last
 
         def step(x: Array, u: Array) -> tuple[Array, Array]:
-            a = rate(x, u)
-            b = rate(x + Ts / 2 * a, u)
-            c = rate(x + Ts / 2 * b, u)
-            d = rate(x + Ts * c, u)
+            a = rate(x, u[0])
+            b = rate(x + Ts / 2 * a, u[1])
+            c = rate(x + Ts / 2 * b, u[1])
+            d = rate(x + Ts * c, u[2])
             return x + Ts / 6 * (a + 2 * b + 2 * c + d), x
 
         return jax.lax.scan(step, x, u)[1]
 
-    return jax.vmap(lambda W, x: jax.vmap(lambda x, u: one(W, x, u))(x, u))(W, x0)
+    end = u if held else jnp.concatenate([u[:, 1:], u[:, -1:]], axis=1)
+    middle = (u + end) / 2
+    if not held and u.shape[1] > 3:  # a cubic through the four samples around
+        middle = middle.at[:, 1:-2].set((9 * (u[:, 1:-2] + u[:, 2:-1]) - u[:, :-3] - u[:, 3:]) / 16)
+    within = jnp.stack([u, middle, end], axis=-1)
+    return jax.vmap(lambda W, x: jax.vmap(lambda x, u: one(W, x, u))(x, within))(W, x0)

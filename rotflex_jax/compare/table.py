@@ -207,6 +207,11 @@ class Comparison:
         """The table, then a line for each method that has something to say."""
         return "\n".join([*aligned(self.cells()), *self.remarks()])
 
+    def _repr_html_(self) -> str:
+        from rotflex_jax.display.cards import comparison_card  # the layer above, when a notebook asks
+
+        return comparison_card(self)
+
     def remarks(self) -> list[str]:
         """What there is to say about each method: why it failed, what it chose."""
         lines = []

@@ -42,7 +42,7 @@ class Directions(NamedTuple):
 def _innovations(structure: Mechanism, solver: Solver, lanes: Lane, data: Data) -> jax.Array:
     def one(lane: Lane) -> jax.Array:
         y_hat = predicted(structure, solver, lane.values, lane.x0, lane.gates, data, lane.K)
-        return (data.y - y_hat) * data.seen[:, :, None]
+        return jnp.where(data.seen[:, :, None] > 0, data.y - y_hat, 0.0)
 
     return jax.vmap(one)(lanes)
 
@@ -59,8 +59,9 @@ def _slopes(
         return jax.jvp(run, point, (dv, jnp.broadcast_to(dx, lane.x0.shape), dg))
 
     y_hat, J = jax.vmap(slope, out_axes=(None, 0))(*along)
-    mask = data.seen[:, :, None]
-    return (data.y - y_hat) * mask, -J * mask[None]
+    # Not a product: beyond its last sample a run may diverge.
+    seen = data.seen[:, :, None] > 0
+    return jnp.where(seen, data.y - y_hat, 0.0), jnp.where(seen[None], -J, 0.0)
 
 
 def _stacked(parts: list[Lane]) -> Lane:

@@ -34,7 +34,7 @@ from rotflex_jax.discover.verdict import judge_end
 from rotflex_jax.effects.kinds import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import everywhere, torque_scale
-from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
+from rotflex_jax.fit.residuals import first_states, roomy, sensor_noise, stack
 from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
@@ -91,7 +91,7 @@ def discover(
     if not model.mechanism.free_names:
         raise InputError("All parameters are trusted, but discovery fits the model; release one.")
     check_signs(model, (*trained, *unseen))
-    data = stack(trained, model)
+    data = stack(trained, model, roomy(trained))
     torque = torque_scale(model.mechanism, data)
     wanted = list(search_places(model.mechanism) if candidates is None else candidates)
     supermodel = build(model.mechanism, wanted, scales(model, trained, torque))
@@ -103,7 +103,7 @@ def discover(
     )
     judge = Judge(Bench(supermodel, solver, data), noise, torque, ports)
     away = Away(
-        Judge(Bench(supermodel, solver, stack(unseen, model)), noise, torque, ports),
+        Judge(Bench(supermodel, solver, stack(unseen, model, roomy(unseen))), noise, torque, ports),
         unseen,
         first_states(model, unseen),
         window_seconds,

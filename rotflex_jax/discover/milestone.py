@@ -38,7 +38,8 @@ def milestone(
         label: What the model is.
         channels: Outputs of the model, in order.
         units: Channel -> its own unit.
-        errors: Held-out error of short free runs, by channel (C,).
+        errors: Held-out error of short free runs, by channel (C,). While a search runs, their first states
+            are fitted; its result has the errors from states that only the first samples tell.
         floor: Noise of the sensor, by channel (C,).
 
     >>> line = milestone("+ coulomb at hub", ["theta"], {"theta": "rad"}, np.array([0.01]), np.array([5e-4]))

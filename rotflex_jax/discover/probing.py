@@ -44,7 +44,7 @@ def _probed(
     J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0), out_axes=1)(
         lane.values, lane.x0, lane.K, A, along.values, *data
     )
-    return -J * data.seen[None, :, :, None]
+    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
 
 
 class Absent(NamedTuple):

@@ -70,11 +70,9 @@ def _packed(candidates: list[Candidate]) -> list[list[_Probe]]:
     for c in candidates:
         for shape, group in enumerate(c.probes):
             mine = [_Probe(c, shape, member) for member in range(len(group))]
-            room = [
-                b for b in batches if len(b) + len(mine) <= PROBES and all(p.candidate is not c for p in b)
-            ]
-            if room:
-                room[0].extend(mine)
+            room = [b for b in batches if len(b) + len(mine) <= PROBES]
+            if apart := [b for b in room if all(p.candidate is not c for p in b)]:
+                apart[0].extend(mine)
             else:
                 batches.append(mine)
     return batches

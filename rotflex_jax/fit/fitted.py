@@ -62,6 +62,11 @@ class Fit:
 
         return save(Saved(self.model, self.parameters, self.covariance, self.free_names), path)
 
+    def _repr_html_(self) -> str:
+        from rotflex_jax.display.cards import fit_card  # the layer above, when a notebook asks
+
+        return fit_card(self)
+
     def __str__(self) -> str:
         lines = [f"Fit: {self.status} after {self.steps} steps, cost {self.cost:.1f}"]
         lines += [f"  residual {c}: {s:.3g} rms" for c, s in self.noise.items()]

@@ -13,14 +13,7 @@ import optimistix as optx
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.estimates import report
 from rotflex_jax.fit.fitted import Fit
-from rotflex_jax.fit.residuals import (
-    Coordinates,
-    Data,
-    first_states,
-    predicted,
-    sensor_noise,
-    stack,
-)
+from rotflex_jax.fit.residuals import Coordinates, Data, first_states, predicted, sensor_noise, stack
 from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Mechanism, Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import equations
@@ -34,9 +27,7 @@ Progress = Callable[[str], None]
 # tolerance would stop a long recording many nats short of the optimum.
 NATS = 0.1
 # What optimistix says at length.
-UNSOLVED = (
-    "stopped: the linear equations of a step have no finite solution; the model diverges near these numbers"
-)
+UNSOLVED = "stopped: a step has no finite solution; the model diverges near these numbers"
 
 
 @dataclasses.dataclass(frozen=True)

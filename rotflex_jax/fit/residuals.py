@@ -31,8 +31,18 @@ class Data(NamedTuple):
     Ts: Any  # (R,)
 
 
+def roomy(recordings: Sequence[Recording]) -> int:
+    """A length for `stack` that recordings of nearby lengths share, and with it what is compiled for it.
+
+    The longest, rounded up to one of eight lengths between powers of two: 1/16 more on average.
+    """
+    longest = max((r.N for r in recordings), default=0)
+    step = 2 ** max(0, longest.bit_length() - 4)
+    return -(-longest // step) * step
+
+
 def stack(recordings: Sequence[Recording], model: Model, length: int | None = None) -> Data:
-    """Recordings as arrays, float64, with the channels the model has."""
+    """Recordings as arrays, float64, with the channels the model has; of the given length at least."""
     if not recordings:
         raise InputError("No recording was given, but at least one is needed; pass a Recording.")
     N = max(length or 0, *(r.N for r in recordings))

@@ -70,4 +70,4 @@ def _alike(a: np.ndarray, b: np.ndarray, step: int) -> float:
     moves = [x[step:] - x[:-step] for x in (a, b)]
     if min(np.ptp(m) for m in moves) == 0:
         return 0.0
-    return float(np.corrcoef(*moves)[0, 1])
+    return float(np.corrcoef(moves[0], moves[1])[0, 1])

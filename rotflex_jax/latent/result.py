@@ -161,6 +161,11 @@ class LatentTorque:
             )
         return self.ports.index(port)
 
+    def _repr_html_(self) -> str:
+        from rotflex_jax.display.cards import latent_card  # the layer above, when a notebook asks
+
+        return latent_card(self)
+
     def __str__(self) -> str:
         lines = ["Latent torque, root mean square and log-likelihood it gains"]
         lines += [f"  {p}: {self.size(p):.3g} {self.effort}, {self.gain_nats[p]:.0f} nat" for p in self.ports]

@@ -15,6 +15,7 @@ from rotflex_jax.recording.samples import (
     aligned,
     finite,
     initial_samples,
+    labels,
     real_numbers,
     sampling_period,
 )
@@ -91,7 +92,7 @@ class Recording:
     ) -> None:
         u, y = aligned(real_numbers(u, "Argument `u`"), real_numbers(y, "Argument `y`"))
         Ts = sampling_period(Ts)
-        names, units = _labels(channels, units, y.shape[1])
+        names, units = labels(channels, units, y.shape[1])
         finite(u, f"Input {input_name!r}")
         for x, name in zip(y.T, names, strict=True):
             finite(x, f"Channel {name!r}")
@@ -221,6 +222,11 @@ class Recording:
             accept=quality.ACCEPTABLE,
         )
 
+    def _repr_html_(self) -> str:
+        from rotflex_jax.display.cards import recording_card  # the layer above, when a notebook asks
+
+        return recording_card(self)
+
     def __repr__(self) -> str:
         pairs = zip(self.channels, self.units, strict=True)
         outputs = ", ".join(f"{name} [{unit}]" for name, unit in pairs)
@@ -229,22 +235,3 @@ class Recording:
             f"{self.input_name} [{self.input_unit}] to {outputs}"
             f"{f', {self.source}' if self.source else ''})"
         )
-
-
-def _labels(
-    channels: str | Sequence[str] | None, units: str | Sequence[str] | None, width: int
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units of the outputs, by default those of the joint."""
-    default = ("theta", "alpha")[:width] if width <= 2 else ()
-    names = _tuple(default if channels is None else channels)
-    each = _tuple(("rad",) * width if units is None else units)
-    if not len(set(names)) == len(names) == len(each) == width:
-        raise InputError(
-            f"Arguments `channels` and `units` must have a name of its own and a unit for each of "
-            f"the {width} columns of `y`, but are {names} and {each}; give them in order."
-        )
-    return names, each
-
-
-def _tuple(words: str | Sequence[str]) -> tuple[str, ...]:
-    return (words,) if isinstance(words, str) else tuple(words)

@@ -1,5 +1,6 @@
 """What numbers must be before they are of use: real, finite, aligned, evenly spaced, enough to begin with."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -186,3 +187,22 @@ def initial_samples(n_init: int | None, N: int, Ts: float) -> int:
             f"but is {n_init} of {N} samples; 0.2 s are {round(0.2 / Ts)} samples."
         )
     return int(n_init)
+
+
+def labels(
+    channels: str | Sequence[str] | None, units: str | Sequence[str] | None, width: int
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of the outputs, by default those of the joint."""
+    default = ("theta", "alpha")[:width] if width <= 2 else ()
+    names = _tuple(default if channels is None else channels)
+    each = _tuple(("rad",) * width if units is None else units)
+    if not len(set(names)) == len(names) == len(each) == width:
+        raise InputError(
+            f"Arguments `channels` and `units` must have a name of its own and a unit for each of "
+            f"the {width} columns of `y`, but are {names} and {each}; give them in order."
+        )
+    return names, each
+
+
+def _tuple(words: str | Sequence[str]) -> tuple[str, ...]:
+    return (words,) if isinstance(words, str) else tuple(words)

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from rotflex_jax.compare.table import Comparison, Row
+from rotflex_jax.recording import Recording
 from rotflex_jax.report.style import (
     BASELINE,
     BETWEEN,
@@ -21,8 +22,9 @@ from rotflex_jax.report.style import (
 )
 from rotflex_jax.report.wording import readable
 
-# Longer recordings are shown in part [s]; the errors are those of the whole.
-LONGEST = 10.0
+# Longer recordings are shown in part [s], fast ones only so many times through their mean; the errors are
+# those of the whole.
+LONGEST, CROSSINGS = 10.0, 60
 # In this order by rank; dashes and marks tell them apart without colour.
 COLOURS = (FINAL, BASELINE, *BETWEEN)
 DASHES = ("-", (0, (6, 1.5)), (0, (3, 1.5)), (0, (6, 1.5, 1.2, 1.5)), (0, (1.2, 1.2)), (0, (9, 3)))
@@ -50,7 +52,7 @@ def overlays(comparison: Comparison) -> Figure:
     """Measured and simulated outputs of the best method of each family, with their errors."""
     i, by_channel = _longest(comparison), _units(comparison)
     r, shown = comparison.test[i], looks(comparison)
-    part = slice(0, min(r.N, round(LONGEST / r.Ts)))
+    part = slice(0, drawn(r))
     figure = blank(10.0, 3.3 * len(by_channel) + 0.6)
     axes = figure.subplots(
         2 * len(by_channel), 1, sharex=True, squeeze=False, height_ratios=(1.5, 1.1) * len(by_channel)
@@ -84,6 +86,16 @@ def overlays(comparison: Comparison) -> Figure:
     figure.align_ylabels(axes)
     legend_above(figure, axes, columns=4)
     return figure
+
+
+def drawn(recording: Recording) -> int:
+    """How many samples are drawn, so that single swings can be told apart."""
+    most = min(recording.N, round(LONGEST / recording.Ts))
+    away = recording.y[:most, 0] - recording.y[:most, 0].mean()
+    # Only swings count: about the mean, noise crosses it at every sample.
+    swings = np.flatnonzero(np.abs(away) > 0.5 * away.std())
+    turns = swings[1:][np.diff(away[swings] > 0)]
+    return most if len(turns) < CROSSINGS else max(recording.n_init + 2, int(turns[CROSSINGS - 1]))
 
 
 def _within(ax: Axes, y: np.ndarray, reach: float) -> None:

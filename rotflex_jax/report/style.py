@@ -72,9 +72,19 @@ def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
     return inside
 
 
+class Drawing(Figure):
+    """A figure that a notebook shows by itself, whether or not a backend of pyplot is loaded there."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        with matplotlib.rc_context(_LOOK):
+            self.savefig(buffer, format="png", dpi=80)
+        return buffer.getvalue()
+
+
 def blank(width: float, height: float) -> Figure:
     """An empty figure [inch]; 10 is the width of the page."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Drawing(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

@@ -1,0 +1,180 @@
+"""How quick filters, simulation and fits are, beside C, numba and the libraries that people use.
+
+    python benchmarks/B7_speed.py                       # everything
+    python benchmarks/B7_speed.py --only lms motion     # some subsets; the others stay as they were
+    python benchmarks/B7_speed.py --plain --only lms    # without the compiler's option for small loops
+
+Everything compared is timed in one process, in turn and in random order; compiling is apart. Where others
+use the machine too, only the ratios of minima within one subset tell something.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rotflex_jax
+
+HERE = Path(__file__).resolve().parent / "results"
+SUBSETS = ("lms", "rls", "pairs", "motion", "fit", "joint", "starts", "cold", "growth")
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="SUBSET")
+    parser.add_argument("--rounds", type=int, default=5, help="visits of every case")
+    parser.add_argument("--visit", type=float, default=0.1, help="seconds of a visit")
+    parser.add_argument("--quick", action="store_true", help="short records: to see whether it runs")
+    parser.add_argument("--plain", action="store_true", help="without the option for small loops")
+    chosen = parser.parse_args()
+    if not chosen.plain:
+        rotflex_jax.enable_fast_loops()
+    run(chosen)
+
+
+def run(chosen: argparse.Namespace) -> None:
+    """Measures, and keeps what was measured before of the other subsets."""
+    from rich.progress import Progress
+
+    from speed import table
+
+    path = HERE / ("B7_plain.json" if chosen.plain else "B7.json")
+    results = json.loads(path.read_text()) if path.exists() else {}
+    results["machine"] = machine()
+    with Progress() as progress:
+        for name in chosen.only:
+            results[name] = SUBSET[name](chosen, progress)
+            path.write_text(json.dumps(results, indent=1) + "\n")
+    if not chosen.plain:
+        path.with_suffix(".md").write_text(table.page(results))
+
+
+def machine() -> dict[str, Any]:
+    """What it ran on."""
+    import jax
+
+    model = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
+    return {
+        "processor": model[0].split(":")[1].strip() if model else platform.processor(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "date": time.strftime("%Y-%m-%d"),
+    }
+
+
+def compared(
+    groups: list[list[Any]], chosen: argparse.Namespace, progress: Any, title: str
+) -> dict[str, Any]:
+    """Groups of cases, each timed together; the noise of the machine beside."""
+    from speed.rounds import noise, timed
+
+    found = []
+    for cases in groups:
+        results = timed(cases, chosen.rounds, progress, title, visit=chosen.visit)
+        rows = [dataclasses.asdict(r) for r in results.values()]
+        found.append({"rows": rows, "noise": noise(results)})
+    return {"groups": found}
+
+
+def _lms(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import filters
+
+    sizes = {5: 1_000_000, 10: 300_000, 20: 100_000, 50: 20_000}
+    groups = [filters.lms_cases(M, N // 20 if chosen.quick else N) for M, N in sizes.items()]
+    return compared(groups, chosen, progress, "LMS")
+
+
+def _rls(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import filters
+
+    sizes = {5: 40_000, 10: 8_000, 20: 800}
+    groups = [filters.rls_cases(M, N // 4 if chosen.quick else N) for M, N in sizes.items()]
+    return compared(groups, chosen, progress, "RLS")
+
+
+def _pairs(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import filters
+
+    return compared([filters.pairs_cases(5_000 if chosen.quick else 100_000)], chosen, progress, "pairs")
+
+
+def _motion(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import motion
+
+    found = compared([motion.cases(2_000 if chosen.quick else 20_000)], chosen, progress, "motion")
+    return {**found, "facts": motion.errors()}
+
+
+def _seconds(chosen: argparse.Namespace) -> float:
+    return 1.0 if chosen.quick else 10.0
+
+
+def _fit(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import fits
+
+    found = compared([fits.one_start(_seconds(chosen))], chosen, progress, "fit")
+    return {**found, "facts": fits.quality(_seconds(chosen))}
+
+
+def _joint(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import fits
+
+    return compared([fits.joint_fit(16, _seconds(chosen))], chosen, progress, "joint fit")
+
+
+def _starts(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import fits
+
+    cases, reached = fits.many(16 if chosen.quick else 64, 4.0 if chosen.quick else 10.0)
+    found = compared([cases], chosen, progress, "starts")
+    return {**found, "facts": reached}
+
+
+def _cold(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed import fits
+
+    first, *warm = fits.cold(_seconds(chosen))
+    return {"facts": {"whole process, first [s]": first, "whole process, warm cache [s]": min(warm)}}
+
+
+def _growth(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed.growth import WORK, grown
+
+    longest = 5 if chosen.quick else 7
+    lengths = [10**k for k in range(4, longest + 1)]
+    bar = progress.add_task("growth", total=len(WORK) * len(lengths))
+    found: dict[str, Any] = {}
+    for work in WORK:
+        # A recording of ten million samples is no recording any more.
+        for N in lengths if work != "two runs of a fit" else lengths[:-1]:
+            found.setdefault(work, {})[str(N)] = grown(work, N)
+            progress.advance(bar)
+    return {"growth": found}
+
+
+SUBSET: dict[str, Callable[[argparse.Namespace, Any], dict[str, Any]]] = {
+    "lms": _lms,
+    "rls": _rls,
+    "pairs": _pairs,
+    "motion": _motion,
+    "fit": _fit,
+    "joint": _joint,
+    "starts": _starts,
+    "cold": _cold,
+    "growth": _growth,
+}
+
+
+if __name__ == "__main__":
+    main()

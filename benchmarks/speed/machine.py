@@ -1,0 +1,88 @@
+"""The flexible joint of the measurements: smooth friction, cubic spring, and the same numbers for the C."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+import rotflex_jax as rf
+from rotflex_jax.effects import Coulomb, CubicSpring
+from rotflex_jax.effects.kinds import Force, Probe, Scalar, Scale
+from rotflex_jax.parameters import parameter
+
+Ts = 1e-3
+RESISTANCE, INDUCTANCE, CONSTANT, GEAR = 2.6, 0.18e-3, 0.00767, 70.0
+# Hub inertia, arm inertia, stiffness, motor gain, motor damping, hub damping, joint damping, cubic
+# stiffness, friction level, width of its tanh.
+GAIN = CONSTANT * GEAR / RESISTANCE
+TRUE = np.array([0.0021, 0.0059, 1.61, GAIN, GAIN * CONSTANT * GEAR, 0.005, 0.004, 5.0, 0.05, 0.05])
+MOTOR = np.array([CONSTANT * GEAR, CONSTANT * GEAR, RESISTANCE, INDUCTANCE])
+MOVED = (0, 1, 2, 5, 6, 7, 8, 9)
+"""Places of the eight parameters that are fitted; the motor is known."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SmoothFriction(Force):
+    """Friction without sticking. tau = -level tanh(speed / width)"""
+
+    name: ClassVar[str] = "smooth_friction"
+    title: ClassVar[str] = "friction without sticking"
+    equation: ClassVar[str] = "tau = -level * tanh(speed / width)"
+    amplitudes: ClassVar[tuple[str, ...]] = ("level",)
+    searched: ClassVar[tuple[str, ...]] = ()
+
+    level: float = parameter(0.05, unit="N m", lower=0.0, meaning="friction torque")
+    width: float = parameter(0.05, unit="rad/s", lower=1e-4, meaning="speed over which it changes sign")
+
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m]."""
+        return -self.level * jnp.tanh(speed / self.width)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """None."""
+        return []
+
+
+@dataclasses.dataclass(frozen=True)
+class Hardening(CubicSpring):
+    """A cubic spring known to harden, so that its logarithm can be fitted."""
+
+    name: ClassVar[str] = "hardening_spring"
+
+    stiffness: float = parameter(5.0, unit="N m/rad^3", lower=0.0, meaning="cubic stiffness")
+
+
+def voltage(N: int, seed: int = 0) -> np.ndarray:
+    """Steps of random height, each a twentieth of a second."""
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-6, 6, -(-N // 50)), 50)[:N]
+
+
+def linear(current: bool = False) -> Any:
+    """The joint without friction and cubic spring."""
+    return rf.joints.paper(
+        hub_damping=TRUE[5], joint_damping=TRUE[6], inductance=INDUCTANCE if current else None
+    )
+
+
+def smooth(current: bool = False, p: np.ndarray = TRUE) -> Any:
+    """The joint with smooth friction and cubic spring; eight numbers are free."""
+    joint = rf.joints.paper(
+        hub_inertia=p[0],
+        arm_inertia=p[1],
+        stiffness=p[2],
+        hub_damping=p[5],
+        joint_damping=p[6],
+        inductance=INDUCTANCE if current else None,
+    )
+    joint = joint + Hardening(at="joint", stiffness=p[7]) + SmoothFriction(at="hub", level=p[8], width=p[9])
+    return joint.release("arm.inertia.inertia").trust("hub.motor.torque_constant")
+
+
+def dry(current: bool = False) -> Any:
+    """The joint with dry friction, which sticks, and the cubic spring."""
+    return linear(current) + Hardening(at="joint", stiffness=TRUE[7]) + Coulomb(at="hub", level=TRUE[8])

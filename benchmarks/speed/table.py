@@ -1,0 +1,75 @@
+"""The measurements as a page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+TITLES = {
+    "lms": "Volterra LMS [ns per sample]",
+    "rls": "RLS [ns per sample]",
+    "pairs": "Step sizes [ns per sample; of 100 pairs, per pair]",
+    "motion": "Simulation [ns per sample]",
+    "fit": "A fit of eight parameters [ms]",
+    "joint": "Joint fits [ms]",
+    "starts": "Many starts [s]",
+    "cold": "From a new process",
+    "growth": "Growth",
+}
+
+
+def page(results: dict[str, Any]) -> str:
+    """Everything that was measured."""
+    m = results["machine"]
+    lines = [
+        "# Speed",
+        "",
+        f"`python benchmarks/B7_speed.py` on {m['processor']}, {m['cores']} cores, Python {m['python']}, "
+        f"jax {m['jax']}, {m['date']}. Every row in turn and in random order, one process, compiling apart; "
+        "the ratio is to the first row of C or scipy in its table, of least processor times. Others used the "
+        "machine, so times by the clock are too long, and only what stands in one table may be compared.",
+    ]
+    for name, title in TITLES.items():
+        if name in results:
+            lines += ["", f"## {title}", ""]
+            part = results[name]
+            for group in part.get("groups", []):
+                lines += [*_rows(group), ""]
+            lines += [f"- {what}: {value:.3g}" for what, value in part.get("facts", {}).items()]
+            if "growth" in part:
+                lines += _growth(part["growth"])
+    text = "\n".join(lines)
+    while "\n\n\n" in text:
+        text = text.replace("\n\n\n", "\n\n")
+    return text.rstrip() + "\n"
+
+
+def _rows(group: dict[str, Any]) -> list[str]:
+    rows = group["rows"]
+    base = next((r for r in rows if "C -O3" in r["name"] or "scipy" in r["name"]), rows[0])
+    lines = [
+        "| | processor | ratio | clock, least | clock, median | first call [s] | |",
+        "|---|---:|---:|---:|---:|---:|---|",
+    ]
+    for r in rows:
+        lines.append(
+            f"| {r['name']} | {r['cpu']:.4g} | {r['cpu'] / base['cpu']:.3g} | {r['least']:.4g} "
+            f"| {r['median']:.4g} | {r['first']:.2f} | {r['note']} |"
+        )
+    noise = group["noise"]
+    return [
+        *lines,
+        "",
+        f"Noise: by the clock, medians lie {100 * noise['typical_spread']:.0f} % above minima (at most "
+        f"{100 * noise['largest_spread']:.0f} %), load {noise['load']:.1f}.",
+    ]
+
+
+def _growth(found: dict[str, Any]) -> list[str]:
+    lines = ["| | samples | s | ns per sample | memory [MB] |", "|---|---:|---:|---:|---:|"]
+    for work, by_length in found.items():
+        for N, r in by_length.items():
+            lines.append(
+                f"| {work} | {int(N):,} | {r['seconds']:.4g} | {r['seconds'] / int(N) * 1e9:.1f} "
+                f"| {r['memory_mb']:.0f} |"
+            )
+    return lines

@@ -1,0 +1,131 @@
+"""Levenberg-Marquardt on the normal equations of free runs, compiled as one loop, start after start."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rotflex_jax.fit.normal_equations import Sums, normal_equations
+from rotflex_jax.fit.residuals import Data
+from rotflex_jax.mechanism import Mechanism, Solver
+from rotflex_jax.parameters import Transform
+
+BOUND = 1.0
+"""Most that one coordinate moves in a step; of a parameter with a bound, a factor of e."""
+ENOUGH = 1e-9
+"""A step that lowers the cost by less than this share of it is the last."""
+
+
+class Problem(NamedTuple):
+    """What all starts have in common.
+
+    Attributes:
+        values: Of all parameters; those that are not free stay (P,).
+        free: Places of the free ones (K,).
+        data: The recordings.
+        scale: Size of the error of each channel (C,).
+    """
+
+    values: Any
+    free: Any
+    data: Data
+    scale: Any
+
+
+class Place(NamedTuple):
+    """Where a start stands: free coordinates (K,), first states (R, m), their sums, and how it got there."""
+
+    z: Array
+    x0: Array
+    sums: Sums
+    damping: Array
+    steps: Array
+    done: Array
+
+
+class Reached(NamedTuple):
+    """Where starts ended: values of all parameters (S, P), first states (S, R, m), costs (S,), steps (S,)."""
+
+    values: Any
+    x0: Any
+    cost: Any
+    steps: Any
+    z: Any
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def descend(
+    structure: Mechanism,
+    solver: Solver,
+    z: Float[Array, "S K"],
+    x0: Float[Array, "S R m"],
+    problem: Problem,
+    most: int,
+) -> Reached:
+    """Where every start leads, one after the other.
+
+    Side by side they would wait for the slowest, and a run with all its sums fills a core as it is.
+
+    Args:
+        structure: Mechanism without numbers; static.
+        solver: Integration rule; static.
+        z: Unconstrained coordinates of the free parameters at each start.
+        x0: First positions and speeds at each start.
+        problem: What they have in common.
+        most: Most runs of each.
+    """
+    transform = Transform.of(structure.parameter_specifications)
+
+    def values(z: Array) -> Array:
+        whole = jnp.zeros_like(problem.values).at[problem.free].set(z)
+        return problem.values.at[problem.free].set(transform.constrain(whole)[problem.free])
+
+    def sums(z: Array, x0: Array) -> Sums:
+        p, slopes = jax.jvp(values, (z,), (jnp.ones_like(z),))
+        ways = jnp.zeros((len(z), len(p)), p.dtype)
+        ways = ways.at[jnp.arange(len(z)), problem.free].set(slopes[problem.free])
+        run = functools.partial(normal_equations, structure, solver, p, ways)
+        return jax.lax.map(lambda r: run(r[0], r[1], problem.scale), (x0, tuple(problem.data)))
+
+    def one(start: tuple[Array, Array]) -> Reached:
+        z, x0 = start
+        first = Place(z, x0, sums(z, x0), jnp.asarray(1e-3), jnp.asarray(1), jnp.asarray(False))
+        end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < most), functools.partial(_turn, sums), first)
+        return Reached(values(end.z), end.x0, jnp.sum(end.sums.cost), end.steps, end.z)
+
+    return jax.lax.map(one, (z, x0))
+
+
+def _turn(sums: Any, place: Place) -> Place:
+    """One step, taken where it lowers the cost."""
+    dz, dx = _step(place)
+    z, x0 = place.z + dz, place.x0 + dx
+    trial = sums(z, x0)
+    before, after = jnp.sum(place.sums.cost), jnp.sum(trial.cost)
+    better = after < before  # not where it is not a number
+    keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
+    damping = jnp.where(better, jnp.maximum(place.damping / 10, 1e-12), place.damping * 8)
+    done = (better & (before - after <= ENOUGH * after)) | (damping > 1e10)
+    kept = Sums(*(keep(new, old) for new, old in zip(trial, place.sums, strict=True)))
+    return Place(keep(z, place.z), keep(x0, place.x0), kept, damping, place.steps + 1, done)
+
+
+def _step(place: Place) -> tuple[Array, Array]:
+    """Damped Gauss-Newton; the first state of a recording is eliminated, for it meets only its own samples.
+
+    A step of a parameter is bounded: far from the answer the linear picture is wrong about where it ends,
+    and without the bound two starts in three from a wide box end elsewhere than at the least cost.
+    """
+    K = len(place.z)
+    g, H = place.sums.g, place.sums.H
+    tiny = 1e-14 * jnp.max(jnp.abs(jnp.diagonal(H, axis1=1, axis2=2)))
+    damped = lambda m: m + jnp.diag(place.damping * jnp.diag(m) + tiny)  # noqa: E731
+    A, B, C = damped(jnp.sum(H[:, :K, :K], axis=0)), H[:, :K, K:], jax.vmap(damped)(H[:, K:, K:])
+    # What the first states would do by themselves, and what they do with the parameters.
+    inner = jnp.linalg.solve(C, jnp.concatenate([jnp.swapaxes(B, 1, 2), g[:, K:, None]], axis=2))
+    left = A - jnp.sum(jnp.einsum("rkm,rml->rkl", B, inner[:, :, :K]), axis=0)
+    right = jnp.sum(g[:, :K] - jnp.einsum("rkm,rm->rk", B, inner[:, :, K]), axis=0)
+    dz = jnp.clip(-jnp.linalg.solve(left, right), -BOUND, BOUND)
+    return dz, -inner[:, :, K] - jnp.einsum("rmk,k->rm", inner[:, :, :K], dz)

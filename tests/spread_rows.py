@@ -1,0 +1,67 @@
+"""A sweep over several devices, as a program: `spread_rows.py [PROCESS PORT]` prints what it found as JSON.
+
+Alone it has eight virtual devices; as one of two processes it has two, and shares all four.
+"""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rotflex_jax.adaptive import LMS
+from rotflex_jax.adaptive.grid import grid
+from rotflex_jax.adaptive.judged import values_at
+from rotflex_jax.basis import Delays, Volterra
+from rotflex_jax.devices import mesh_of, spread
+from rotflex_jax.recording import Recording
+
+ALONE = len(sys.argv) == 1
+jax.config.update("jax_num_cpu_devices", 8 if ALONE else 2)
+if not ALONE:
+    jax.distributed.initialize(f"127.0.0.1:{sys.argv[2]}", num_processes=2, process_id=int(sys.argv[1]))
+
+# Neither two, four nor eight devices divide it.
+ROWS = 11
+
+
+def build(settings: dict) -> LMS:
+    return LMS(settings["mu"])
+
+
+def sweep(devices: list, factor: float = 1.0) -> list[float]:
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(600)
+    basis = Volterra(Delays(3))
+    y = basis.regressors(u) @ rng.standard_normal(10) + 0.3 * rng.standard_normal(600)
+    recordings = [Recording(u[k : k + 300], y[k : k + 300], 0.1) for k in (0, 300)]
+    axes = {"mu": factor * np.geomspace(1e-3, 0.05, ROWS)}
+    found = grid(build, axes, basis, recordings, "theta", objective="final", devices=devices)
+    assert found.values is not None
+    return found.values.tolist()
+
+
+def where(devices: list) -> list[int]:
+    """The device that had each row."""
+    mesh = mesh_of(devices)
+    run = jax.jit(spread(lambda rows: jnp.full(len(rows), jax.lax.axis_index("rows")), mesh))
+    return np.asarray(run(np.zeros((ROWS, 2)))).tolist()
+
+
+sets = {str(n): jax.devices()[:n] for n in ((2, 8) if ALONE else (4,))}
+plain = sweep(jax.local_devices()[:1])
+spreads = {n: sweep(devices) for n, devices in sets.items()}
+compiled = values_at._cache_size()
+again = {n: sweep(devices, 0.9) for n, devices in sets.items()}
+print(
+    json.dumps(
+        {
+            "plain": plain,
+            "spread": spreads,
+            "where": {n: where(devices) for n, devices in sets.items()},
+            "compiled_again": values_at._cache_size() - compiled,
+            "changed": all(again[n] != spreads[n] for n in sets),
+        }
+    )
+)

@@ -1,0 +1,100 @@
+"""A model under sliders, tried without a browser: values of widgets are set, and what they show is read."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import rotflex_jax as rf
+from rotflex_jax.display.explorer import Explorer
+from rotflex_jax.errors import InputError
+from rotflex_jax.model import _free_many
+
+pytest.importorskip("ipywidgets")
+
+FRICTION, SPRING = "coulomb at hub", "cubic spring at joint"
+
+
+@pytest.fixture(scope="module")
+def truth() -> rf.Mechanism:
+    return rf.joints.paper() + rf.effects.Coulomb(at="hub", level=0.05)
+
+
+@pytest.fixture(scope="module")
+def recording(truth: rf.Mechanism) -> rf.Recording:
+    u = rf.data.excitation.noise(600, 0.01, rms=2.0, seed=4)
+    noise = 5e-4 * np.random.default_rng(6).standard_normal((600, 2))
+    return rf.Recording(u, rf.simulate(truth, u, 0.01) + noise, 0.01, accept="units")
+
+
+@pytest.fixture
+def explorer(truth: rf.Mechanism, recording: rf.Recording) -> Explorer:
+    spring = rf.effects.CubicSpring(at="joint", stiffness=30.0)
+    return rf.explore(rf.Model(truth), recording, candidates=[spring])
+
+
+def test_it_begins_with_the_model_as_given(explorer: Explorer) -> None:
+    assert explorer.switches[FRICTION].value and not explorer.switches[SPRING].value
+    assert "joint spring" not in " ".join(explorer.switches) and "viscous at hub" in explorer.switches
+    assert explorer.errors == explorer.given
+    # The truth is as good as the sensor, whose noise is 5e-4 rad: a candidate that is off changes nothing.
+    assert max(explorer.errors.values()) < 1.5e-3
+
+
+def test_switching_an_effect_off_and_on_shows_at_once(explorer: Explorer) -> None:
+    before, picture = dict(explorer.errors), explorer._image.value
+    explorer.switches[FRICTION].value = False
+    assert explorer.errors["theta"] > 5 * before["theta"]
+    assert explorer._image.value != picture
+    assert "+" in explorer._text.value and "%" in explorer._text.value
+    explorer.switches[FRICTION].value = True
+    assert explorer.errors == pytest.approx(before)
+
+
+def test_a_moved_number_is_that_of_the_model(explorer: Explorer, recording: rf.Recording) -> None:
+    explorer.parameter.value = "joint.spring.stiffness"
+    explorer.factor.value = 1.3
+    assert "joint.spring.stiffness = 2.093 N m/rad" in explorer._text.value
+    by_hand = rf.Model(
+        explorer._begun.mechanism.with_values({"joint.spring.stiffness": 1.3 * 1.61}),
+        gates=explorer._begun.gates,
+    )
+    np.testing.assert_allclose(
+        explorer.model.simulate_windows(recording), by_hand.simulate_windows(recording), atol=1e-12
+    )
+    # Another number is moved besides; the slider remembers where each stands.
+    explorer.parameter.value = "hub.coulomb.level"
+    assert explorer.factor.value == 1.0
+    explorer.factor.value = 0.5
+    explorer.parameter.value = "joint.spring.stiffness"
+    assert explorer.factor.value == pytest.approx(1.3)
+    explorer.reset()
+    assert explorer.errors == pytest.approx(explorer.given) and explorer.factor.value == 1.0
+
+
+def test_nothing_is_compiled_anew(explorer: Explorer) -> None:
+    explorer.switches[SPRING].value = True
+    compiled = _free_many._cache_size()
+    explorer.switches[FRICTION].value = False
+    explorer.parameter.value = "hub.inertia.inertia"
+    explorer.factor.value = 0.8
+    assert _free_many._cache_size() == compiled
+
+
+def test_the_picture_is_one(explorer: Explorer) -> None:
+    pixels = imread(io.BytesIO(explorer._image.value))
+    assert pixels.shape[1] == 900 and pixels.std() > 0.05
+
+
+def test_what_cannot_be_explored_is_refused(
+    recording: rf.Recording, truth: rf.Mechanism, monkeypatch
+) -> None:
+    with pytest.raises(InputError, match="give a Fit"):
+        rf.explore(3, recording)
+    with pytest.raises(InputError, match="No recording"):
+        rf.explore(truth, [])
+    monkeypatch.setitem(sys.modules, "ipywidgets", None)
+    with pytest.raises(InputError, match="ipywidgets"):
+        rf.explore(truth, recording)
