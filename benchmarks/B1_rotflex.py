@@ -9,6 +9,7 @@ tables of the README and of docs/measured_joint.md, writes `results/B1.json` and
     arm      the joint by itself: the arm behind the measured hub, with one law after the other
     fits     named structures by an integrator of its own, fitted for free runs of 2 s; what differs between
              the runs
+    play     the same with play in the gear
     figures  from the results of `fits`
 """
 
@@ -20,7 +21,7 @@ import time
 import numpy as np
 
 import rotflex_jax as rf
-from measured_joint import arm_alone, drawing, fine_run
+from measured_joint import arm_alone, drawing, fine_run, with_play
 
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE / "results" / "B1.json"
@@ -125,16 +126,24 @@ def arm(A: rf.Recording, B: rf.Recording) -> dict:
     return out
 
 
+def play(A: rf.Recording, B: rf.Recording) -> dict:
+    """Structures with play in the gear."""
+    print("\n| structure | learnt from, judged on | no offset | its offset | whole 10 s, its offset |")
+    print("|---|---|---|---|---|")
+    return with_play.compare(A, B)
+
+
 def main(parts: list[str]) -> None:
     rf.enable_fast_loops()
     A, B = rf.data.load_dataset("rotflex")
     kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    kept = kept if set(kept) & {"search", "repeats", "arm", "fits"} else {}
-    for part in parts or ["search", "repeats", "arm", "fits", "figures"]:
+    kept = kept if set(kept) & {"search", "repeats", "arm", "fits", "play"} else {}
+    does = {"search": search, "repeats": repeats, "arm": arm, "fits": fits, "play": play}
+    for part in parts or [*does, "figures"]:
         if part == "figures":
             drawing.draw(A, B, kept["fits"], HERE.parent / "docs" / "figures")
             continue
-        kept[part] = {"search": search, "repeats": repeats, "arm": arm, "fits": fits}[part](A, B)
+        kept[part] = does[part](A, B)
         if part == "fits":
             kept["differences"] = differences(A, B)
         RESULTS.parent.mkdir(exist_ok=True)

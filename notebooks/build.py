@@ -5,6 +5,7 @@ carry the outputs, so that figures show where the project is read on the web.
 
     python notebooks/build.py                 # run every script, write its notebook
     python notebooks/build.py 00_first_look   # only this one
+    python notebooks/build.py --text          # take over text that changed, where no code did
     python notebooks/build.py --check         # exit status 1 where a notebook is missing or stale
 """
 
@@ -57,6 +58,23 @@ def build(script: Path, timeout: float) -> None:
     nbformat.write(notebook, script.with_suffix(".ipynb"))
 
 
+def retext(script: Path) -> str:
+    """Take over text cells without running anything; says why, where that is not possible."""
+    target = script.with_suffix(".ipynb")
+    if not target.exists():
+        return "is missing"
+    kept, new = nbformat.read(target, as_version=4), jupytext.read(script)
+    codes = [[c.source.strip() for c in n.cells if c.cell_type == "code"] for n in (kept, new)]
+    if codes[0] != codes[1]:
+        return "has other code"
+    ran = iter([c for c in kept.cells if c.cell_type == "code"])
+    kept.cells = [next(ran) if c.cell_type == "code" else c for c in new.cells]
+    for number, cell in enumerate(kept.cells):
+        cell["id"] = f"cell-{number}"
+    nbformat.write(kept, target)
+    return ""
+
+
 def faults(script: Path) -> list[str]:
     """What is wrong with the notebook of a script."""
     target = script.with_suffix(".ipynb")
@@ -81,10 +99,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Build or check the notebooks.")
     parser.add_argument("names", nargs="*", help="scripts without .py; all unless given")
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
+    parser.add_argument("--text", action="store_true", help="run nothing, take over text")
     parser.add_argument("--timeout", type=float, default=600.0, help="limit per cell [s]")
     arguments = parser.parse_args()
     stale = False
     for script in scripts(arguments.names):
+        if arguments.text:
+            print(f"{script.stem}: {retext(script) or 'ok'}")
+            continue
         if not arguments.check:
             print(f"{script.name} ...", flush=True)
             build(script, arguments.timeout)

@@ -26,9 +26,22 @@ def _case(case: dict[str, Any]) -> list[str]:
         same = f" Or: {', '.join(f'{e} at {p}' for e, p in r['equivalent'])}." if r["equivalent"] else ""
         lines.append(f"- {r['effect']} at {r['port']}: {r['sentence']}.{same}")
     lines += [f"- {note}" for note in case["notes"]]
-    kinds = ("estimates", "predictor estimates")
-    last = [row for row in case["rows"] if any(k in row for k in kinds)][-1]
+    for entry in case.get("free-run rounds", []):
+        lines.append(f"- {_free_round(entry)}")
+    kinds = ("estimates", "predictor estimates", "free-run estimates")
+    last = {k: row[k] for k in kinds for row in case["rows"] if k in row}
     return [*lines, "", *_parameters(case, last)]
+
+
+def _free_round(entry: dict[str, Any]) -> str:
+    """What a round of the search by free runs tried, errors of both held-out parts in thousandths."""
+    pair = lambda e: " and ".join(f"{1e3 * v:.3g}" for v in e)  # noqa: E731
+    nearest = sorted(entry["tried"], key=lambda k: entry["tried"][k][0] * entry["tried"][k][1])[:4]
+    listed = ", ".join(f"{k} {pair(entry['tried'][k])}" for k in nearest)
+    return (
+        f"by free runs, round {entry['round']}: {entry['taken'] or 'nothing'} taken; held-out parts before "
+        f"it {pair(entry['held_out'])}, with the best candidates {listed} (thousandths of the output's unit)."
+    )
 
 
 def _errors(case: dict[str, Any]) -> list[str]:

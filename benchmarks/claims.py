@@ -1,0 +1,244 @@
+"""What documents say of the benchmarks where it takes a count, a median or several numbers of the results."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+# Name -> the text that stands between the marks of that name.
+NAMED: dict[str, Callable[[], str]] = {}
+
+
+def named(function: Callable[[], str]) -> Callable[[], str]:
+    """Registers a function under its name."""
+    NAMED[function.__name__] = function
+    return function
+
+
+@functools.cache
+def results(file: str) -> Any:
+    """A file of results."""
+    return json.loads((RESULTS / file).read_text(encoding="utf-8"))
+
+
+# -- the measured joint -------------------------------------------------------------------------------------
+
+WAYS = {"ab": "A to B", "ba": "B to A", "mixed": "first 7 s of both to the last 3 s"}
+
+
+def _three(value: float) -> str:
+    """Three digits, but no more than two decimals."""
+    return f"{value:.2f}" if value < 10 else f"{value:.1f}"
+
+
+IN_WORDS = {"coulomb": "Coulomb friction", "lugre": "LuGre friction", "bouc_wen": "Bouc-Wen hysteresis"}
+
+
+def joint_errors(way: str, stage: int) -> str:
+    """Errors of short runs, and in brackets of one run, of a stage of a search [deg]."""
+    found = results("B1.json")["search"][WAYS[way]]
+    here = [found["baseline"], *found["rounds"]][stage]
+    short, whole = (
+        " / ".join(_three(math.degrees(here[kind][c])) for c in ("theta", "alpha"))
+        for kind in ("held_out_rmse_windows", "held_out_rmse")
+    )
+    return f"{short} ({whole})"
+
+
+def joint_effects(way: str) -> list[str]:
+    """Effects that a search found, in order, in words."""
+    rounds = results("B1.json")["search"][WAYS[way]]["rounds"]
+    return [f"{IN_WORDS.get(r['effect'], r['effect'].replace('_', ' '))} at the {r['port']}" for r in rounds]
+
+
+def joint_first(way: str) -> str:
+    """The first effect and the errors with it."""
+    found = joint_effects(way)
+    return f"{found[0]}: {joint_errors(way, 1)}" if found else "none was found"
+
+
+def joint_all(way: str) -> str:
+    """The further effects and the errors with all."""
+    found = joint_effects(way)
+    return f"{', '.join(found[1:])}: {joint_errors(way, -1)}" if len(found) > 1 else "the same"
+
+
+for _way in WAYS:
+    NAMED[f"joint_{_way}_baseline"] = functools.partial(joint_errors, _way, 0)
+    NAMED[f"joint_{_way}_first"] = functools.partial(joint_first, _way)
+    NAMED[f"joint_{_way}_all"] = functools.partial(joint_all, _way)
+
+
+@named
+def joint_noise() -> str:
+    """Noise of the sensors [deg]."""
+    floor = results("B1.json")["search"]["A to B"]["noise_floor"]
+    return " / ".join(f"{math.degrees(floor[c]):.3f}" for c in ("theta", "alpha"))
+
+
+@named
+def joint_fitted_freely() -> str:
+    """Short free runs over run B of LuGre friction and hysteresis, fitted to free runs over run A [deg]."""
+    found = results("B1.json")["fits"]["LuGre at the hub, Bouc-Wen at the joint, from A"]
+    return " / ".join(f"{e:.2f}" for e in found["judged"]["B"]["no_offset"])
+
+
+@named
+def joint_theta_fall() -> str:
+    """By how much the first effect lets the short-run error of theta fall, from run A to run B."""
+    found = results("B1.json")["search"]["A to B"]
+    before, after = (s["held_out_rmse_windows"]["theta"] for s in (found["baseline"], found["rounds"][0]))
+    return f"{before / after:.1f}"
+
+
+# -- the arena ----------------------------------------------------------------------------------------------
+
+
+def records(*, outside: bool = False, hidden: bool = True) -> list[dict[str, Any]]:
+    """Records of the arena: of one effect that the search knows, of others, or of nothing it could find."""
+    ran = [r for r in results("B0.json")["records"].values() if "error" not in r]
+    if outside:
+        return [r for r in ran if r["outside"]]
+    if not hidden:
+        return [r for r in ran if not r["outside"] and not r["wanted"]]
+    return [r for r in ran if not r["outside"] and len(r["wanted"]) == 1 and r.get("size", 1.0) == 1.0]
+
+
+@named
+def arena_hidden() -> str:
+    """Records with one effect to be found."""
+    return str(len(records()))
+
+
+@named
+def arena_first() -> str:
+    """How many of them named it first."""
+    return str(sum(bool(r["first"]) for r in records()))
+
+
+@named
+def arena_inside() -> str:
+    """In how many of them the effect is found or in a set that was reported."""
+    return str(sum(bool(r["inside"]) for r in records()))
+
+
+@named
+def arena_nothing() -> str:
+    """Records in which nothing is to be found."""
+    return str(len(records(hidden=False)))
+
+
+@named
+def arena_alarms() -> str:
+    """How many of them raised an alarm."""
+    return str(sum(bool(r["rounds"]) for r in records(hidden=False)))
+
+
+@named
+def arena_outside() -> str:
+    """Records with an effect that the catalogue lacks."""
+    return str(len(records(outside=True)))
+
+
+@named
+def arena_unexplained() -> str:
+    """How many of them were called unexplained."""
+    return str(sum(r["verdict"] == "unexplained" for r in records(outside=True)))
+
+
+@named
+def arena_over_oracle() -> str:
+    """Median of held-out error over that of the true structure, over all records and channels."""
+    ratios = sorted(v for r in records() for v in r.get("over_oracle", {}).values())
+    return f"{ratios[len(ratios) // 2]:.2f}"
+
+
+@named
+def arena_intervals() -> str:
+    """Share of 95 % intervals that hold the truth [%]."""
+    numbers = [p for r in records() for p in r["parameters"].values() if p.get("std")]
+    held = sum(abs(p["estimate"] - p["true"]) <= 1.96 * p["std"] for p in numbers)
+    return f"{100 * held / len(numbers):.0f}" if numbers else "–"
+
+
+@named
+def arena_numbers() -> str:
+    """How many parameters these intervals speak of."""
+    return str(sum(bool(p.get("std")) for r in records() for p in r["parameters"].values()))
+
+
+@named
+def arena_seconds() -> str:
+    """Median processor time of a search [s]; other programs ran beside it."""
+    times = sorted(r["cpu_s"] for r in records())
+    return f"{times[len(times) // 2]:.0f}"
+
+
+@named
+def arena_commit() -> str:
+    """Revision of the code of the latest run."""
+    return results("B0.json")["runs"][-1]["commit"]
+
+
+# -- public machines ----------------------------------------------------------------------------------------
+
+
+def _row(machine: str, words: str) -> dict[str, Any]:
+    return next(r for r in results("B3.json")[machine]["rows"] if words in r["model"])
+
+
+def _last_effect(machine: str) -> dict[str, Any]:
+    """The row of the last effect that the search itself added."""
+    return results("B3.json")[machine]["rows"][len(results("B3.json")[machine]["rounds"])]
+
+
+for _part in ("multisine", "arrow"):
+    NAMED[f"silverbox_{_part}"] = lambda part=_part: f"{_last_effect('silverbox')['free run'][part]:.2f}"
+    NAMED[f"silverbox_{_part}_published"] = lambda part=_part: (
+        f"{min(p[part] for p in results('B3.json')['silverbox']['published'].values()):.2f}"
+    )
+
+
+@named
+def emps_found() -> str:
+    """Official error with the effects that were found [mm]."""
+    return f"{_last_effect('emps')['free run']['pulses']:.1f}"
+
+
+@named
+def emps_published() -> str:
+    """The published errors that the text names [mm]."""
+    p = results("B3.json")["emps"]["published"]
+    return f"{p['polynomial NARX']['pulses']:g} and {p['dynoNet']['pulses']:g}"
+
+
+# -- every method -------------------------------------------------------------------------------------------
+
+
+@named
+def methods_count() -> str:
+    """Methods that were compared on the mixed split of the measured joint."""
+    return str(len(results("B5/rotflex_mixed.json")["rows"]))
+
+
+# -- the next experiment ------------------------------------------------------------------------------------
+
+
+@named
+def next_ratio() -> str:
+    """How many times a design is worth the best standard input: the least and the largest."""
+    ratios = []
+    for row in results("B4.json")["rows"]:
+        if row["pair"] == "delay or lag":
+            total = {True: 0.0, False: 0.0}
+            for i in row["inputs"]:
+                worth = i["train"] + i["held_out"]
+                total[i["input"] == "design"] = max(total[i["input"] == "design"], worth)
+            ratios.append(total[True] / total[False])
+    return f"{min(ratios):.0f} to {max(ratios):.0f}"

@@ -1,0 +1,147 @@
+"""The measured joint with play in the gear: motor and hub are two bodies that touch at the ends of a gap.
+
+    motor  (1 - share) J vm' = drive (v + offset) - damping vm - friction(vm) - contact
+    hub          share J v'  = contact + spring - load_level sign v
+    contact = stiff (|m - theta| - gap) where that is positive
+
+Integrated as in `fine_run`, whose laws of friction and of the joint these are. The sensor is at the hub,
+behind the play.
+"""
+
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+from scipy.optimize import least_squares
+
+import rotflex_jax as rf
+from measured_joint import fine_run
+from measured_joint.fine_run import ARM_INERTIA, SEEN, STEPS, WEIGHTS, WINDOW, _shrink
+
+# Stiffness and damping of the contact [N m/rad, N m s/rad]: stiff enough for the steps, and held.
+STIFF, SOFT = 150.0, 0.05
+NUMBERS: dict[str, tuple[float, float]] = fine_run.NUMBERS | {
+    "share": (0.25, 0.3),
+    "gap": (0.0023, 0.002),
+    "load_level": (0.003, 0.005),
+}
+NONNEGATIVE = fine_run.NONNEGATIVE | {"share", "gap", "load_level"}
+PLAY = ("share", "gap")
+STRUCTURES: dict[str, tuple[str, ...]] = {
+    "Coulomb and play": (*fine_run.LINEAR, "level", *PLAY, "load_level"),
+    "LuGre and play": (*fine_run.LINEAR, *fine_run.LUGRE, *PLAY),
+    "LuGre and play, Bouc-Wen at the joint": (
+        *fine_run.LINEAR,
+        *fine_run.LUGRE,
+        *PLAY,
+        "load_level",
+        *fine_run.BOUC_WEN,
+    ),
+}
+
+
+@numba.njit(cache=True)
+def _window(p, lugre, u, theta, alpha, Ts):
+    c, d_hub, J, k, d, level, rise, slow, pre, joint, width, beta, offset, bias, share, gap, load = p
+    h, J_hub, J_motor = Ts / STEPS, J * share, J * (1 - share)
+    phi, m = theta + alpha - bias, theta
+    v, vm, w, z, s = 0.0, 0.0, 0.0, 0.0, 0.0
+    out = np.empty((len(u), 2))
+    for i in range(len(u)):
+        out[i, 0], out[i, 1] = theta, phi - theta + bias
+        for _ in range(STEPS):
+            a, da, e = phi - theta, w - v, m - theta
+            pull = k * a + d * da + joint * z
+            contact = 0.0
+            if e > gap:
+                contact = max(STIFF * (e - gap) + SOFT * (vm - v), 0.0)
+            elif e < -gap:
+                contact = min(STIFF * (e + gap) + SOFT * (vm - v), 0.0)
+            free = c * (u[i] + offset) - d_hub * vm - contact
+            if lugre:
+                g = 1.0 + rise * np.exp(-((vm / slow) ** 2))
+                rate = abs(vm) / (g * pre)
+                if rate * h > 1e-9:
+                    end = np.sign(vm) * g + (s - np.sign(vm) * g) * np.exp(-rate * h)
+                else:
+                    end = s + h * vm / pre
+                vm, s = vm + h * (free - level * 0.5 * (s + end)) / J_motor, end
+            else:
+                vm = _shrink(vm + h * free / J_motor, h * level / J_motor)
+            v = _shrink(v + h * (contact + pull) / J_hub, h * load / J_hub)
+            w = w - h * pull / ARM_INERTIA
+            z = z + h * (da - beta * abs(da) * z - (1 - beta) * da * abs(z)) / width
+            z = min(max(z, -1.5), 1.5)
+            m, theta, phi = m + h * vm, theta + h * v, phi + h * w
+    return out
+
+
+def residual(numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW) -> np.ndarray:
+    """Errors (W, N, 2) of what counts [deg], of free runs that begin at rest in the middle of the play."""
+    p = np.array([numbers[k] for k in NUMBERS])
+    parts = []
+    for i in range(0, run.N - width + 1, width):
+        u, first = run.u[i : i + width].astype(float), run.y[i : i + 50].mean(axis=0)
+        e = np.degrees(_window(p, lugre, u, first[0], first[1], run.Ts) - run.y[i : i + width])
+        parts.append(np.clip(np.nan_to_num(e[SEEN:], nan=100.0), -100.0, 100.0))
+    return np.array(parts)
+
+
+def rms(
+    numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW
+) -> tuple[float, float]:
+    """Errors of hub angle and deflection [deg] in windows of so many samples."""
+    theta, alpha = np.sqrt(np.mean(residual(numbers, lugre, run, width) ** 2, axis=(0, 1)))
+    return float(theta), float(alpha)
+
+
+def fit(
+    run: rf.Recording,
+    free: Sequence[str],
+    lugre: bool,
+    start: dict[str, float] | None = None,
+) -> dict[str, float]:
+    """Numbers with the least squared free runs over windows of one run."""
+    held = {k: v for k, (v, _) in NUMBERS.items()} | {
+        k: 0.0 for k in ("joint_level", "load_level") if k not in free
+    }
+    held |= start or {}
+    scale = np.array([NUMBERS[k][1] for k in free])
+    low = np.array([0.0 if k in NONNEGATIVE else -np.inf for k in free])
+    high = np.array([{"joint_beta": 1.0, "share": 0.9}.get(k, np.inf) for k in free])
+    low = np.where(np.array(free) == "share", 0.08, low)
+
+    def missed(x: np.ndarray) -> np.ndarray:
+        numbers = held | dict(zip(free, (x * scale).tolist(), strict=True))
+        return (residual(numbers, lugre, run) / WEIGHTS).ravel()
+
+    begin = np.clip(np.array([held[k] for k in free]) / scale, low / scale + 1e-6, high / scale - 1e-6)
+    found = least_squares(missed, begin, bounds=(low / scale, high / scale), diff_step=1e-3, max_nfev=60)
+    return held | dict(zip(free, (found.x * scale).tolist(), strict=True))
+
+
+def compare(A: rf.Recording, B: rf.Recording) -> dict:
+    """Each structure learnt from one run and judged on both, as the table of `fits` has it."""
+    runs, out = {"A": A, "B": B}, {}
+    for name, free in STRUCTURES.items():
+        lugre = "presliding" in free
+        for learnt in runs:
+            found = fit(runs[learnt], (*free, *fine_run.OWN), lugre)
+            judged = {}
+            for key, run in runs.items():
+                bare = found | {"offset": 0.0, "bias": 0.0}
+                own = found if key == learnt else fit(run, ("offset",), lugre, bare)
+                judged[key] = {
+                    "no_offset": rms(bare, lugre, run),
+                    "own_offset": rms(own, lugre, run),
+                    "offset": own["offset"],
+                    "whole": rms(own, lugre, run, run.N),
+                }
+                errors = " | ".join(
+                    " / ".join(f"{e:.2f}" for e in judged[key][k])
+                    for k in ("no_offset", "own_offset", "whole")
+                )
+                seen = "" if key != learnt else " (bound)"
+                print(f"| {name} | {learnt}, {key}{seen} | {errors} |", flush=True)
+            out[f"{name}, from {learnt}"] = {"judged": judged, "numbers": found}
+    return out

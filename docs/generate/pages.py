@@ -1,0 +1,52 @@
+"""Puts the pages that scripts make where the site finds them, and leads links to the pages of the site."""
+
+import re
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+from generate import catalogue, reference
+
+# Files beside `docs/` that have a page of their own here.
+PAGES = {"../CONTRIBUTING.md": "contributing.md", "../CHANGELOG.md": "changelog.md"}
+
+
+def write(folder: Path, pages: dict[str, str]) -> None:
+    """Write pages into a folder that holds nothing else; what has not changed keeps its date."""
+    folder.mkdir(exist_ok=True)
+    for old in {p.name for p in folder.iterdir()} - set(pages):
+        (folder / old).unlink()
+    for name, text in pages.items():
+        file = folder / name
+        if not file.exists() or file.read_text(encoding="utf-8") != text:
+            file.write_text(text, encoding="utf-8")
+
+
+def write_all(app: Sphinx) -> None:
+    """The catalogue of effects, the reference, and the notebooks as they were run."""
+    source = Path(app.srcdir)
+    run = sorted((source.parent / "notebooks").glob("*.ipynb"))
+    write(source / "notebooks", {file.name: file.read_text(encoding="utf-8") for file in run})
+    write(source / "effects", catalogue.pages())
+    write(source / "reference", reference.pages())
+
+
+def lead_links(app: Sphinx, page: str, content: list[str]) -> None:
+    """A link to a file beside `docs/` goes to its page; on a code host it stays a link to the file."""
+    if page.startswith("notebooks/"):
+        content[0] = content[0].replace("](../docs/", "](../")
+        for file, target in PAGES.items():
+            content[0] = content[0].replace(f"]({file}", f"](../{target}")
+        return
+    content[0] = content[0].replace("](../notebooks/", "](notebooks/")
+    for file, target in PAGES.items():
+        content[0] = content[0].replace(f"]({file}", f"]({target}")
+    # Anything else outside is a file to look at, not a page.
+    content[0] = re.sub(r"\]\((\.\./[^)#]+\.md)\)", r"](path:\1)", content[0])
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Enter both steps."""
+    app.connect("builder-inited", write_all)
+    app.connect("source-read", lead_links)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

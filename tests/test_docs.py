@@ -1,0 +1,231 @@
+"""The documentation: what it quotes is really said, what it shows runs, what it links to is there."""
+
+import contextlib
+import importlib
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import rotflex_jax as rf
+from rotflex_jax import cli
+from rotflex_jax.effects import CATALOG, LearnedTorque
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+BESIDE = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+sys.path.append(str(DOCS))  # for `generate`, which makes the catalogue
+
+N, TS = 400, 0.002
+GOOD: dict[str, Any] = {
+    "t": np.round(TS * np.arange(N), 6),
+    "voltage": np.round(rf.data.excitation.noise(N, TS, seed=3), 4),
+    "theta": 0.3 * np.sin(np.arange(N) / 40),
+    "alpha": 0.05 * np.cos(np.arange(N) / 11),
+}
+
+
+def file(**columns: Any) -> str:
+    """`run.csv` in the current folder, with other columns; None leaves one out."""
+    frame = {name: column for name, column in {**GOOD, **columns}.items() if column is not None}
+    pd.DataFrame(frame).to_csv("run.csv", index=False)
+    return "run.csv"
+
+
+def at(name: str, k: int, value: float) -> dict[str, Any]:
+    """One value of a column replaced."""
+    column = GOOD[name].copy()
+    column[k] = value
+    return {name: column}
+
+
+def lines(edit: Callable[[list[str]], list[str]]) -> str:
+    path = Path(file())
+    path.write_text("\n".join(edit(path.read_text().splitlines())) + "\n")
+    return str(path)
+
+
+def without(package: str, do: Callable[[], object]) -> object:
+    """As on a machine that lacks a package."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, package, None)
+        return do()
+
+
+def hdf5() -> str:
+    Path("run.mat").write_bytes(b"\x00" * 512 + b"\x89HDF\r\n\x1a\n" + b"\x00" * 600)
+    return "run.mat"
+
+
+def command(*arguments: str) -> None:
+    """The command line; its sentence on stderr as an error."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    assert left.value.code == 2
+    raise rf.InputError(said.getvalue().strip())
+
+
+def recording(**columns: Any) -> rf.Recording:
+    return rf.load(file(**columns))
+
+
+def clipped() -> rf.Recording:
+    k = np.arange(2000)
+    y = np.column_stack([0.3 * np.sin(k / 40), np.minimum(0.3 * np.cos(k / 60), 0.2)])
+    return rf.Recording(u=rf.data.excitation.noise(2000, TS, seed=3), y=y, Ts=TS)
+
+
+def held() -> rf.Discovery:
+    joint = rf.joints.paper()
+    return rf.discover(joint.trust(*joint.free_names), recording(), recording())
+
+
+def sindy() -> None:
+    (row,) = rf.compare(recording(), ["sindy"]).rows
+    raise rf.InputError(row.reason)
+
+
+def turned(u: float, *y: float) -> rf.Fit:
+    """A fit of the demo recording with signs turned round."""
+    demo = rf.data.demo_recording()
+    return rf.fit(rf.joints.paper(), rf.Recording(u=u * demo.u, y=demo.y * y, Ts=demo.Ts))
+
+
+RAISED: dict[str, Callable[[], object]] = {
+    "other names": lambda: rf.load(file(theta=None, angle=GOOD["theta"])),
+    "no time": lambda: rf.load(file(t=None)),
+    "no header": lambda: rf.load(lines(lambda rows: rows[1:])),
+    "degrees by name": lambda: rf.load(
+        file(theta=None, theta_deg=GOOD["theta"]), outputs=("theta_deg", "alpha")
+    ),
+    "degrees by size": lambda: recording(alpha=np.rad2deg(2 * GOOD["alpha"])),
+    "millivolts": lambda: recording(voltage=1000 * GOOD["voltage"]),
+    "milliseconds": lambda: recording(t=1000 * GOOD["t"]),
+    "nan": lambda: recording(**at("alpha", 120, np.nan)),
+    "gap": lambda: rf.load(lines(lambda rows: rows[:200] + rows[206:])),
+    "jitter": lambda: recording(**at("t", 120, GOOD["t"][120] + 0.0003)),
+    "rounded time": lambda: recording(t=np.round(GOOD["t"], 2)),
+    "constant input": lambda: recording(voltage=np.full(N, 1.0)),
+    "dead sensor": lambda: recording(alpha=np.zeros(N)),
+    "saturated": clipped,
+    "deflection turned round": lambda: turned(1, 1, -1),
+    "voltage turned round": lambda: turned(-1, 1, 1),
+    "short": lambda: rf.load(lines(lambda rows: rows[:41])),
+    "channels": lambda: rf.Model(rf.joints.paper()).simulate(
+        rf.load(file(), outputs={"hub": "theta", "tip": "alpha"})
+    ),
+    "no port": lambda: rf.joints.paper() + rf.effects.Coulomb(at="motor"),
+    "negative level": lambda: rf.effects.Coulomb("hub", level=-0.1),
+    "all trusted": held,
+    "no h5py": lambda: without("h5py", lambda: rf.load(hdf5())),
+    "no pysindy": lambda: without("pysindy", sindy),
+    "no file": lambda: command("discover", "rnu.csv"),
+    "effect without a port": lambda: command("simulate", file(), "--add", "coulomb"),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of its own, and a catalogue that is afterwards what it was."""
+    monkeypatch.chdir(tmp_path)
+    known = dict(CATALOG)
+    yield tmp_path
+    CATALOG.clear()
+    CATALOG.update(known)
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """Fenced blocks that are not marked as long."""
+    text = (DOCS / page).read_text()
+    found = re.findall(rf"(<!-- long[^>]*-->\n)?^```{language}\n(.*?)^```", text, re.S | re.M)
+    return [block for long, block in found if not long]
+
+
+def test_every_message_that_is_quoted_is_really_raised_and_the_other_way_round(folder: Path) -> None:
+    said = {}
+    for kind, do in RAISED.items():
+        with pytest.raises(rf.InputError) as caught:
+            do()
+        said[kind] = str(caught.value)
+    quoted = [block.strip() for block in blocks("troubleshooting.md", "text")]
+    assert sorted(quoted) == sorted(said.values())
+
+
+@pytest.mark.parametrize(
+    "page", ["first_look.md", "load_data.md", "add_effect.md", "from_matlab.md", "troubleshooting.md"]
+)
+def test_examples_run_as_they_stand(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # These two set up the process; here the rest of the suite shares it.
+    monkeypatch.setattr(rf, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(rf, "enable_compilation_cache", lambda: None)
+    namespace: dict[str, Any] = {"__name__": "example"}
+    examples = blocks(page, "python")
+    assert examples
+    for example in examples:
+        with contextlib.redirect_stdout(io.StringIO()):
+            exec(compile(example, page, "exec"), namespace)
+
+
+def anchors(page: Path) -> set[str]:
+    """Names that a link may point to in a page: its headings as a code host writes them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M), re.M)
+    return {re.sub(r"[^\w\- ]", "", t.replace("`", "").lower()).replace(" ", "-") for t in titles}
+
+
+MADE = ("effects", "reference")  # by scripts, when the site is built
+
+
+@pytest.mark.parametrize("page", [*PAGES, *BESIDE], ids=lambda p: p.name)
+def test_relative_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```|`[^`\n]*`", "", page.read_text(), flags=re.S | re.M)
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        place, _, anchor = unquote(target).partition("#")
+        there = (page.parent / place).resolve() if place else page
+        made = any(there.is_relative_to(DOCS / folder) for folder in MADE)
+        if made:
+            continue
+        if not there.exists() or (anchor and there.suffix == ".md" and anchor not in anchors(there)):
+            broken.append(target)
+    assert broken == []
+
+
+def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
+    from rotflex_jax.discover import decide, verdict
+
+    text = (DOCS / "method.md").read_text()
+    rows = dict(re.findall(r"\| ([\d.]+) \| `decide\.(\w+)` \|", text))
+    assert {name: getattr(decide, name) for name in rows.values()} == {n: float(v) for v, n in rows.items()}
+    assert len(rows) == 4
+    assert f"within {verdict.NEAR_FLOOR:g} times the noise" in text
+    assert f"less than {verdict.NATS_PER_NUMBER:g} nat" in text
+    assert decide.SEPARATE_Z == 2.0 and "less than two deviations" in text
+
+
+def test_the_catalogue_shows_every_effect_with_all_its_parameters() -> None:
+    catalogue, laws = (importlib.import_module(f"generate.{name}") for name in ("catalogue", "laws"))
+    shown = catalogue.shown()
+    own = {name for name, cls in CATALOG.items() if cls.__module__.startswith("rotflex_jax.")}
+    assert {cls.name for cls in shown} == own | {LearnedTorque.name}
+    for cls in shown:
+        page = catalogue._page(cls)
+        for name, spec in cls.declared().items():
+            assert f"``{name}``" in page
+            assert spec.meaning in page
+        assert ":Source: " in page and "none given" not in page
+        assert f".. figure:: {cls.name}.svg" in page
+    for cls in shown[::6]:  # the site draws all of them
+        for ax in laws.figure(cls).axes:
+            assert re.search(r"\[.+\]", ax.get_xlabel()) and re.search(r"\[.+\]", ax.get_ylabel())
+            assert ax.lines
