@@ -30,8 +30,15 @@ def joint(text: str) -> Any:
     return model(text).mechanism
 
 
-def model(text: str) -> Any:
-    """The model meant by a joint, by `FILE.py:NAME`, or by a saved `MODEL.json`."""
+def model(text: str, add: Iterable[str] = ()) -> Any:
+    """The model meant by a joint, by `FILE.py:NAME`, or by a saved `MODEL.json`, with effects added."""
+    found = _model(text)
+    for each in add:
+        found = found + effect(each)
+    return found
+
+
+def _model(text: str) -> Any:
     from rotflex_jax import joints
     from rotflex_jax.model import Model
 

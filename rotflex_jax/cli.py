@@ -163,7 +163,9 @@ def compare(
     columns = given.Columns(input_column, output_columns, *options, mechanism)
     train, test = columns.load_parts(files, held_out or [], share)
     terminal.print_findings([*train, *test])
-    _quicken()
+    from rotflex_jax.fastloops import quicken
+
+    quicken()
     import rotflex_jax as rf
 
     with terminal.progress("Comparing") as step:
@@ -188,14 +190,6 @@ def effects(
         terminal.print_effects(descriptions)
 
 
-def _quicken() -> None:
-    """Set up JAX for a program of its own; after the arguments, since an error needs no JAX."""
-    from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
-
-    enable_fast_loops()
-    enable_compilation_cache()
-
-
 def _discover(
     mechanism: Any,
     train: "list[Recording]",
@@ -205,7 +199,9 @@ def _discover(
     save_model: Path | None = None,
 ) -> None:
     terminal.print_findings([*train, *test])
-    _quicken()
+    from rotflex_jax.fastloops import quicken
+
+    quicken()
     import rotflex_jax as rf
 
     with terminal.progress("Searching for missing effects") as step:

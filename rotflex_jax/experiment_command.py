@@ -63,10 +63,8 @@ def experiment(
         given.check_writable(json_file=file)
     if given.STDOUT in (save, plot):
         raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
-    model = given.model(joint)
+    model = given.model(joint, add or ())
     columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
-    for text in add or []:
-        model = model + given.effect(text)
     first, second = (given.effect(text) for text in between)
     if (first.name, first.at) == (second.name, second.at):
         raise InputError(f"--between was given {between[0]} twice, but needs two effects; name another.")
@@ -75,15 +73,12 @@ def experiment(
     longest = max(recordings, key=lambda r: r.N)
     _check_length(seconds, longest.Ts)
     terminal.print_findings(recordings)
-    from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
+    from rotflex_jax.fastloops import quicken
 
-    enable_fast_loops()
-    enable_compilation_cache()
+    quicken()
     import rotflex_jax as rf
     from rotflex_jax.experiment import next_experiment
 
-    if (first.name, first.at) == (second.name, second.at):
-        raise InputError(f"--between was given {between[0]} twice, but needs two effects; name another.")
     with terminal.progress("Designing") as step:
         step(f"fitting the model with {between[0]}")
         fitted = rf.fit(model + first, recordings, progress=step)

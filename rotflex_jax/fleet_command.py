@@ -38,11 +38,11 @@ def search_each(
     workers: int | None,
 ) -> None:
     """Search every file, write the summary, show it."""
+    from rotflex_jax.fastloops import quicken
     from rotflex_jax.fleet import fleet
-    from rotflex_jax.fleet.task import prepare
 
     if workers == 0:
-        prepare()  # this process then does the work
+        quicken()  # this process then does the work
     with terminal.progress("Searching") as step:
         result = fleet(
             model,

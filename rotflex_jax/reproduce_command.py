@@ -63,10 +63,9 @@ def reproduce(
     parts = _recordings(columns, data or [], held_out or [], share)
     if parts and joint == "paper" and data == ["rotflex"]:
         mechanism = given.joint("quanser_2002")  # the laboratory's own constants
-    from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
+    from rotflex_jax.fastloops import quicken
 
-    enable_fast_loops()
-    enable_compilation_cache()
+    quicken()
     from rotflex_jax.reproduce import reproduce as run
     from rotflex_jax.reproduce.page import headings, table, write
     from rotflex_jax.reproduce.wording import headline

@@ -34,17 +34,14 @@ def simulate(
     given.check_distinct([file], fit or [])
     for target in (save, save_model):
         given.check_writable(json_file=target)
-    model = given.model(joint)
+    model = given.model(joint, add or ())
     columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
-    for text in add or []:
-        model = model + given.effect(text)
     recording = columns.load(file)
     train = [columns.load(other) for other in fit or []]
     terminal.print_findings([recording, *train])
-    from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
+    from rotflex_jax.fastloops import quicken
 
-    enable_fast_loops()
-    enable_compilation_cache()
+    quicken()
     import rotflex_jax as rf
     from rotflex_jax.export import Saved, save as save_to
 

@@ -10,8 +10,7 @@ import fleet_search
 import numpy as np
 import pytest
 
-from rotflex_jax import cli, terminal
-from rotflex_jax.fleet import task
+from rotflex_jax import cli, fastloops, terminal
 
 
 @pytest.fixture
@@ -21,7 +20,7 @@ def run(
     """The command line in this process, with a search that takes no time."""
     fleet = importlib.import_module("rotflex_jax.fleet")
     monkeypatch.setattr(fleet, "fleet", functools.partial(fleet.fleet, search=fleet_search.quick))
-    monkeypatch.setattr(task, "prepare", lambda: None)  # no global setting must leak into other tests
+    monkeypatch.setattr(fastloops, "quicken", lambda: None)  # no global setting must leak into other tests
     monkeypatch.chdir(tmp_path)
     for k, volts in enumerate((0.3, 3.0, 3.0)):
         u = volts * np.random.default_rng(k).normal(size=200 + k)

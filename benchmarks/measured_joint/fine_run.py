@@ -6,7 +6,8 @@ the toolkit finds with the same laws.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -104,29 +105,43 @@ def _window(p, lugre, u, theta, alpha, Ts):
     return out
 
 
-def free_runs(numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW) -> np.ndarray:
+class Law(NamedTuple):
+    """Equations of motion: names of the numbers in their order, and a run over one window."""
+
+    names: Sequence[str]
+    window: Callable[..., np.ndarray]
+
+
+RIGID = Law(tuple(NUMBERS), _window)
+
+
+def free_runs(
+    numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW, law: Law = RIGID
+) -> np.ndarray:
     """Angles (N, 2) over windows, each from rest at the mean of its first 50 samples [rad]."""
-    p = np.array([numbers[k] for k in NUMBERS])
+    p = np.array([numbers[k] for k in law.names])
     parts = []
     for i in range(0, run.N - width + 1, width):
         u, y = run.u[i : i + width].astype(float), run.y[i : i + width]
         first = y[:50].mean(axis=0)
-        parts.append(_window(p, lugre, u, first[0], first[1], run.Ts))
+        parts.append(law.window(p, lugre, u, first[0], first[1], run.Ts))
     return np.concatenate(parts)
 
 
-def residual(numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW) -> np.ndarray:
+def residual(
+    numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW, law: Law = RIGID
+) -> np.ndarray:
     """Errors (W, N, 2) of what counts [deg]."""
-    y_hat = free_runs(numbers, lugre, run, width)
+    y_hat = free_runs(numbers, lugre, run, width, law)
     e = np.degrees(y_hat - run.y[: len(y_hat)]).reshape(-1, width, 2)[:, SEEN:]
     return np.clip(np.nan_to_num(e, nan=100.0), -100.0, 100.0)
 
 
 def rms(
-    numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW
+    numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW, law: Law = RIGID
 ) -> tuple[float, float]:
     """Errors of hub angle and deflection [deg] in windows of so many samples."""
-    theta, alpha = np.sqrt(np.mean(residual(numbers, lugre, run, width) ** 2, axis=(0, 1)))
+    theta, alpha = np.sqrt(np.mean(residual(numbers, lugre, run, width, law) ** 2, axis=(0, 1)))
     return float(theta), float(alpha)
 
 

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 import rotflex_jax as rf
 from measured_joint import fine_run
-from measured_joint.fine_run import ARM_INERTIA, SEEN, STEPS, WEIGHTS, WINDOW, _shrink
+from measured_joint.fine_run import ARM_INERTIA, STEPS, WEIGHTS, Law, _shrink, residual, rms
 
 # Stiffness and damping of the contact [N m/rad, N m s/rad]: stiff enough for the steps, and held.
 STIFF, SOFT = 150.0, 0.05
@@ -76,23 +76,8 @@ def _window(p, lugre, u, theta, alpha, Ts):
     return out
 
 
-def residual(numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW) -> np.ndarray:
-    """Errors (W, N, 2) of what counts [deg], of free runs that begin at rest in the middle of the play."""
-    p = np.array([numbers[k] for k in NUMBERS])
-    parts = []
-    for i in range(0, run.N - width + 1, width):
-        u, first = run.u[i : i + width].astype(float), run.y[i : i + 50].mean(axis=0)
-        e = np.degrees(_window(p, lugre, u, first[0], first[1], run.Ts) - run.y[i : i + width])
-        parts.append(np.clip(np.nan_to_num(e[SEEN:], nan=100.0), -100.0, 100.0))
-    return np.array(parts)
-
-
-def rms(
-    numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW
-) -> tuple[float, float]:
-    """Errors of hub angle and deflection [deg] in windows of so many samples."""
-    theta, alpha = np.sqrt(np.mean(residual(numbers, lugre, run, width) ** 2, axis=(0, 1)))
-    return float(theta), float(alpha)
+# Runs begin at rest in the middle of the play.
+LAW = Law(tuple(NUMBERS), _window)
 
 
 def fit(
@@ -113,7 +98,7 @@ def fit(
 
     def missed(x: np.ndarray) -> np.ndarray:
         numbers = held | dict(zip(free, (x * scale).tolist(), strict=True))
-        return (residual(numbers, lugre, run) / WEIGHTS).ravel()
+        return (residual(numbers, lugre, run, law=LAW) / WEIGHTS).ravel()
 
     begin = np.clip(np.array([held[k] for k in free]) / scale, low / scale + 1e-6, high / scale - 1e-6)
     found = least_squares(missed, begin, bounds=(low / scale, high / scale), diff_step=1e-3, max_nfev=60)
@@ -132,10 +117,10 @@ def compare(A: rf.Recording, B: rf.Recording) -> dict:
                 bare = found | {"offset": 0.0, "bias": 0.0}
                 own = found if key == learnt else fit(run, ("offset",), lugre, bare)
                 judged[key] = {
-                    "no_offset": rms(bare, lugre, run),
-                    "own_offset": rms(own, lugre, run),
+                    "no_offset": rms(bare, lugre, run, law=LAW),
+                    "own_offset": rms(own, lugre, run, law=LAW),
                     "offset": own["offset"],
-                    "whole": rms(own, lugre, run, run.N),
+                    "whole": rms(own, lugre, run, run.N, LAW),
                 }
                 errors = " | ".join(
                     " / ".join(f"{e:.2f}" for e in judged[key][k])

@@ -7,7 +7,7 @@ from rotflex_jax.fleet import kept
 from rotflex_jax.fleet.figures import errors, tally
 from rotflex_jax.fleet.result import Fleet, Row
 from rotflex_jax.report.page import template
-from rotflex_jax.report.style import data_address
+from rotflex_jax.report.style import on_page
 from rotflex_jax.report.wording import (
     AT_NOISE,
     effect_label,
@@ -59,13 +59,7 @@ def content(fleet: Fleet) -> dict[str, Any]:
         "unlisted_failed": max(0, len(fleet.failed) - LISTED),
         "windows": ", ".join(sorted({f"{r.window_seconds:g} s" for r in good if r.window_seconds})),
         "pictures": [
-            {
-                "title": title,
-                "address": data_address(figure),
-                "width": round(10 * figure.get_figwidth()),
-                "caption": caption,
-                "alt": alt,
-            }
+            {"title": title, **on_page(figure, caption, alt)}
             for title, figure, caption, alt in pictures
             if figure is not None
         ],

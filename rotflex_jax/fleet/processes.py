@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fleet.task import Record, Task, carry_out, prepare, record
+from rotflex_jax.fastloops import quicken
+from rotflex_jax.fleet.task import Record, Task, carry_out, record
 
 # Times a recording may end its process before it is given up.
 TRIES = 3
@@ -128,7 +129,7 @@ class _Lane:
 def _serve(line: Any, room: float) -> None:
     """The life of a worker process, until there is nothing more to do or it has grown too large."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; who started this one ends it
-    prepare()
+    quicken()
     line.send(None)
     with contextlib.suppress(EOFError):
         line.send(carry_out(line.recv()))

@@ -16,7 +16,7 @@ from rotflex_jax.choices import imported
 from rotflex_jax.data import load
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
-from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
+from rotflex_jax.fastloops import quicken
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
@@ -48,12 +48,6 @@ class Task:
     places: tuple[str, ...] = ()
 
 
-def prepare() -> None:
-    """Make the process a quick one, before it computes: fast loops, compiled code kept on disk."""
-    enable_fast_loops()
-    enable_compilation_cache()
-
-
 def carry_out(task: Task) -> Record:
     """Search one recording; whatever goes wrong becomes one sentence."""
     with _TURN:
@@ -74,7 +68,7 @@ def record(state: str, reason: str = "") -> Record:
 
 def prepared(task: Task) -> Record:
     """`carry_out` in a process that nobody has prepared."""
-    prepare()
+    quicken()
     return carry_out(task)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from rotflex_jax.compare.table import Comparison, Row
 from rotflex_jax.report.comparison_figures import horizons, looks, overlays, ranks, spectra
 from rotflex_jax.report.page import save, template
-from rotflex_jax.report.style import data_address
+from rotflex_jax.report.style import on_page
 from rotflex_jax.report.wording import plain_number, readable, together
 
 # An error within this factor of the least of its column is marked.
@@ -145,13 +145,4 @@ def _pictures(comparison: Comparison) -> list[dict[str, Any]]:
             "Spectral density of the held-out error, with the level of white sensor noise.",
         ),
     )
-    return [
-        {
-            "title": title,
-            "address": data_address(figure),
-            "width": round(10 * figure.get_figwidth()),
-            "caption": caption,
-            "alt": alt,
-        }
-        for title, figure, caption, alt in drawn
-    ]
+    return [{"title": title, **on_page(figure, caption, alt)} for title, figure, caption, alt in drawn]

@@ -14,7 +14,7 @@ from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.report.runs import shown
-from rotflex_jax.report.style import data_address, stage_colours
+from rotflex_jax.report.style import on_page, stage_colours
 from rotflex_jax.report.tables import (
     channel_headings,
     error_rows,
@@ -62,12 +62,7 @@ def content(
         "noise": noise_row(discovery),
         "at_noise": f"{AT_NOISE:g}",
         "pictures": {
-            name: {
-                "address": data_address(p.figure),
-                "width": round(10 * p.figure.get_figwidth()),
-                "caption": p.caption,
-                "alt": p.description,
-            }
+            name: on_page(p.figure, p.caption, p.description)
             for name, p in pictures(discovery, lacking, learned).items()
         },
         "places": _places(discovery.where),

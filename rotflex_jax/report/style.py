@@ -132,3 +132,9 @@ def data_address(figure: Figure) -> str:
     with matplotlib.rc_context(_LOOK):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def on_page(figure: Figure, caption: str, alt: str) -> dict[str, Any]:
+    """What a template needs to show a figure: its address, width [1/10 inch], and both texts."""
+    width = round(10 * figure.get_figwidth())
+    return {"address": data_address(figure), "width": width, "caption": caption, "alt": alt}

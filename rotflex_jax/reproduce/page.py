@@ -9,7 +9,7 @@ from typing import Any
 
 from rotflex_jax.report.figures import Picture
 from rotflex_jax.report.page import save, template
-from rotflex_jax.report.style import data_address
+from rotflex_jax.report.style import on_page
 from rotflex_jax.reproduce import wording
 from rotflex_jax.reproduce.experiment import Reproduction
 from rotflex_jax.reproduce.figures import pictures
@@ -59,15 +59,7 @@ def content(result: Reproduction, drawn: dict[str, Picture]) -> dict[str, Any]:
         "measured": records.measured,
         "kernels": "" if result.bridge is None else str(result.bridge),
         "settings": [_setting(row) for row in result.setting_rows()],
-        "pictures": {
-            name: {
-                "address": data_address(p.figure),
-                "width": round(10 * p.figure.get_figwidth()),
-                "caption": p.caption,
-                "alt": p.description,
-            }
-            for name, p in drawn.items()
-        },
+        "pictures": {name: on_page(p.figure, p.caption, p.description) for name, p in drawn.items()},
         "source": ", ".join(sources) if records.measured else f"simulated, {s.scenario}",
         "date": datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         "elapsed": number(result.elapsed_s, 2),
