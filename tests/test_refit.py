@@ -7,8 +7,10 @@ import pytest
 import small_bench as sb
 from scipy.optimize import least_squares
 
+from rotflex_jax.discover import refit as refit_module
 from rotflex_jax.discover.refit import (
     LONGEST,
+    MORE,
     _grid,
     choose_process_noise,
     levenberg_marquardt,
@@ -222,3 +224,32 @@ def test_a_start_from_which_nothing_is_finite_is_left_alone(rough):
     one, other = levenberg_marquardt(rough, [good, bad])
     assert np.isfinite(one.log_likelihood)
     assert other.log_likelihood == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("gains", "turns", "taken"),
+    [
+        ([40, 0.5, 99], 3, 2),  # settled
+        ([300, 200, 100, 80, 60, 5, 99], 3, 6),  # far from settled after three: goes on while it gains much
+        ([300, 200, 3, 99], 3, 3),  # a little left after three
+        ([99], 0, 0),
+        ([50] * 40, 1, 1 + MORE),  # not for ever
+    ],
+)
+def test_a_refit_is_not_stopped_on_its_way(monkeypatch, plain, gains, turns, taken):
+    """Scripted turns: which of them are taken."""
+    judge, h = plain
+    left = iter(gains)
+    begun = dataclasses.replace(h, densities=np.zeros(1))
+    calls = []
+
+    def fitted(_, hypotheses):
+        calls.append(1)
+        more = next(left) if len(calls) > 1 else 0.0
+        return [dataclasses.replace(x, densities=x.densities + more) for x in hypotheses]
+
+    monkeypatch.setattr(refit_module, "levenberg_marquardt", fitted)
+    monkeypatch.setattr(refit_module, "choose_process_noise", lambda judge, h, wide: h)
+    end = refit(judge, [begun], turns=turns)[0]
+    assert len(calls) - 1 == taken
+    assert end.log_likelihood == sum(gains[:taken])

@@ -16,6 +16,8 @@ from rotflex_jax.mechanism.assembly import Layout
 NATS = 0.3
 # Largest step of an unconstrained coordinate: a factor e of a positive parameter.
 LONGEST = 1.0
+# Turns of a refit beyond the usual number, and what such a turn has to gain [nat].
+MORE, MUCH = 5, 10.0
 # Largest process torque, as a share of the intensity that a torque as large as the motor's, drawn anew
 # at each sample, would have.
 HORIZON = 1e-3
@@ -202,10 +204,14 @@ def _likeliest(judge: Judge, h: Hypothesis, trials: list[dict[str, float]]) -> H
 
 
 def refit(judge: Judge, hypotheses: list[Hypothesis], wide: bool = False, turns: int = 3) -> list[Hypothesis]:
-    """Alternate parameters and process noise until the likelihood settles."""
+    """Alternate parameters and process noise until the likelihood settles.
+
+    A little is left after so many turns; what still gains much goes on, `MORE` turns at most: stopped on
+    its way, the right effect may look worse than a wrong one that has arrived.
+    """
     now = levenberg_marquardt(judge, hypotheses)
     settled = [False] * len(now)
-    for turn in range(turns):
+    for turn in range(turns + MORE if turns else 0):
         moving = [i for i in range(len(now)) if not settled[i]]
         if not moving:
             break
@@ -215,5 +221,5 @@ def refit(judge: Judge, hypotheses: list[Hypothesis], wide: bool = False, turns:
             gain = h.log_likelihood - now[i].log_likelihood
             # The whitener may trade a little likelihood between turns; keep the better of the two.
             now[i] = h if gain > 0 else now[i]
-            settled[i] = gain < 1.0
+            settled[i] = gain < (1.0 if turn + 1 < turns else MUCH)
     return now
