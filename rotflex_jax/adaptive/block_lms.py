@@ -10,9 +10,9 @@ from jaxtyping import Array
 
 from rotflex_jax.adaptive.lms import LMS
 from rotflex_jax.adaptive.ranges import per_weight
-from rotflex_jax.adaptive.rebuilt import Square
+from rotflex_jax.adaptive.square import Square
 
-LENGTH = 16
+LENGTH = 32
 """Samples of a block: enough for matrix products, few enough for their own products to be cheap."""
 
 

@@ -5,16 +5,17 @@ import itertools
 import numpy as np
 
 from rotflex_jax.adaptive.block_lms import Blocks
+from rotflex_jax.adaptive.block_rls import RootBlocks
 from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.lms import LMS
-from rotflex_jax.adaptive.rebuilt import Rebuilt, Square
+from rotflex_jax.adaptive.rebuilt import Rebuilt
+from rotflex_jax.adaptive.rls import RLS
+from rotflex_jax.adaptive.square import Square
 from rotflex_jax.basis import Basis, Delays, Volterra
 from rotflex_jax.basis.monomials import indices
 
-SQUARE = 5
-"""Delays from which the matrix form of LMS is quicker than products one by one."""
 BLOCKS = 40
-"""Delays from which blocks of samples are quicker still."""
+"""Delays from which LMS is quicker in blocks of samples than in pairs."""
 
 
 def quickest(filter: AdaptiveFilter, basis: Basis, whole: bool) -> Rebuilt | None:
@@ -29,12 +30,14 @@ def quickest(filter: AdaptiveFilter, basis: Basis, whole: bool) -> Rebuilt | Non
         return None
     M, degrees = basis.bank.memory, basis.chosen
     second = 2 in degrees and degrees[-1] == 2 and basis.layout == "triangular"
-    if not (type(filter) is LMS and second and M >= SQUARE):
+    if type(filter) is RLS:
+        return RootBlocks(M, degrees, basis.layout)
+    if not (type(filter) is LMS and second):
         return Rebuilt(M, degrees, basis.layout)
     leaks = bool(np.any(np.asarray(filter.leakage) != 0))
     mu = np.broadcast_to(np.asarray(filter.mu, float), basis.size)
     counts = np.cumsum([0, *(len(indices(M, d, basis.layout)) for d in degrees)])
     alike = all(np.ptp(mu[a:b]) == 0 for a, b in itertools.pairwise(counts))
     if M >= BLOCKS and alike and whole and not leaks:
-        return Blocks(M, degrees, basis.layout)
-    return Square(M, degrees, basis.layout, leaks)
+        return Blocks(M, degrees, basis.layout, alike)
+    return Square(M, degrees, basis.layout, alike, leaks)

@@ -70,7 +70,8 @@ def _swept(points: Array, data: Blocks, made: Any, objective: Objective, leaks: 
         filter = made(point)[0]
         return per_weight("mu", filter.mu, P, data.phi.dtype), jnp.asarray(filter.leakage, data.phi.dtype)
 
-    some = min(lanes(P), K)
+    parts = -(-K // lanes(P))
+    some = min(K, -(-K // (8 * parts)) * 8)
     padded = jnp.concatenate([points, jnp.broadcast_to(points[-1:], (-K % some, points.shape[1]))])
 
     def at(points: Array) -> Array:

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from rotflex_jax.adaptive.filter import AdaptiveFilter, in_dtype, regressor_size, scan
+from rotflex_jax.adaptive.filter import AdaptiveFilter, regressor_size, scan
 from rotflex_jax.adaptive.forms import quickest
 from rotflex_jax.adaptive.rebuilt import Rebuilt
+from rotflex_jax.adaptive.samples import as_samples, finite, stretch
 from rotflex_jax.basis import Basis, Volterra
 from rotflex_jax.basis.bank import require_basis, signal
 from rotflex_jax.errors import InputError
@@ -88,7 +89,7 @@ def run(
     """
     if basis is not None:
         return _over_basis(filter, basis, phi, y, state, _chunk(keep_every))
-    phi, y = _samples(filter, phi, y)
+    phi, y = as_samples(filter, phi, y)
     return _run_on(filter, None, phi, y, state, _chunk(keep_every))
 
 
@@ -108,41 +109,53 @@ def _over_basis(filter: AdaptiveFilter, basis: Basis, u: Any, y: Any, state: Any
         )
     form = None if y.dtype.kind == "c" else quickest(filter, basis, not every)
     if form is None:
-        phi, y = _samples(filter, basis.regressors(u)[before:], y)
+        phi, y = as_samples(filter, basis.regressors(u)[before:], y)
         return _run_on(filter, None, phi, y, state, every)
     assert isinstance(basis, Volterra)
-    # The newest delay comes first; what is longer ago than the record is zero.
-    reach = form.memory + basis.bank.first
-    line = np.concatenate([np.zeros(max(0, reach - before), u.dtype), u[max(0, before - reach) :]])
-    x, y = _finite(line[: len(line) - basis.bank.first], y)
-    return _run_on(filter, form, x, y, state, every)
+    start = before - basis.bank.first  # of what meets the first output
+    x, y = finite(stretch(u, start, start + len(y)), y)
+    lags = stretch(u, start - form.memory, start).astype(x.dtype)
+    return _run_on(filter, form, x, y, state, every, lags)
 
 
 def _run_on(
-    filter: AdaptiveFilter, form: Rebuilt | None, phi: np.ndarray, y: np.ndarray, state: Any, every: int
+    filter: AdaptiveFilter,
+    form: Rebuilt | None,
+    phi: np.ndarray,
+    y: np.ndarray,
+    state: Any,
+    every: int,
+    lags: np.ndarray | None = None,
 ) -> Run:
     size = regressor_size(phi) if form is None else form.size
     with working_precision(np.real(phi)):
         # Settings of one kind whatever they were given as, so that only shapes decide what is compiled.
-        filter = in_dtype(filter, phi.dtype)
+        real = jnp.finfo(phi.dtype).dtype
+        filter = jax.tree.map(lambda leaf: np.asarray(leaf).astype(real), filter)
         start = None if state is None else _resumed(filter, size, phi.dtype, state)
-        result = _run(filter, jnp.asarray(phi), jnp.asarray(y), start, form, every)
+        result = _run(filter, lags, phi, y, start, form, every)
         end, errors, path, weights = jax.device_get(result)
     errors, status = _judged(errors, y)
     return Run(errors, weights, path, np.arange(len(path)) * every, end, status)
 
 
-@functools.partial(jax.jit, static_argnums=(4, 5))
+@functools.partial(jax.jit, static_argnums=(5, 6))
 def _run(
-    filter: AdaptiveFilter, phi: Array, y: Array, state: Any, form: Rebuilt | None, every: int
+    filter: AdaptiveFilter,
+    lags: Array | None,
+    phi: Array,
+    y: Array,
+    state: Any,
+    form: Rebuilt | None,
+    every: int,
 ) -> tuple[Any, Array, Array, Array]:
     size = regressor_size(phi) if form is None else form.size
     state = filter.init(size, phi.dtype) if state is None else state
     step: Any = lambda state, phi, y: scan(filter, phi, y, state)  # noqa: E731
     close: Any = lambda state: state  # noqa: E731
     if form is not None:
-        lags, phi = phi[: form.memory][::-1], phi[form.memory :]
-        state = form.begin(filter, state, lags)
+        assert lags is not None
+        state = form.begin(filter, state, lags[::-1])
         step, close = functools.partial(form.scan, filter), functools.partial(form.end, filter)
     weights = lambda state: filter.weights(close(state))  # noqa: E731
     if not every:
@@ -171,39 +184,6 @@ def _chunk(keep_every: Any) -> int:
             "give 0 to keep only the last weights."
         )
     return int(keep_every)
-
-
-def _samples(filter: AdaptiveFilter, phi: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Both as finite arrays of one floating dtype."""
-    phi, y = np.asarray(phi), np.asarray(y)
-    dimensions, wanted, advice = (
-        (1, "(N,)", "the input itself") if filter.from_input else (2, "(N, P)", "a row of regressors")
-    )
-    if phi.ndim != dimensions or y.shape != phi.shape[:1] or not phi.size:
-        raise InputError(
-            f"Arguments `phi` and `y` of {type(filter).__name__} must have the shapes {wanted} and (N,), "
-            f"but have {phi.shape} and {y.shape}; give {advice} for every output sample."
-        )
-    return _finite(phi, y)
-
-
-def _finite(phi: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both in the finer of their precisions."""
-    named = (("phi", phi), ("y", y))
-    for name, x in named:
-        if x.dtype.kind not in "iufc":
-            raise InputError(
-                f"Argument `{name}` must hold numbers, but holds {x.dtype.name}; convert it first."
-            )
-        good = np.isfinite(x)
-        if not good.all():
-            k = int(np.argmin(good.reshape(len(x), -1).all(axis=1)))
-            raise InputError(
-                f"Argument `{name}` must be finite, but is not at sample {k}; cut or repair the data."
-            )
-    floats = [x.dtype for _, x in named if x.dtype.kind in "fc"]
-    dtype = np.result_type(*floats, np.float32) if floats else np.dtype(np.float64)
-    return phi.astype(dtype, copy=False), y.astype(dtype, copy=False)
 
 
 def _resumed(filter: AdaptiveFilter, size: int, dtype: Any, state: Any) -> Any:

@@ -6,17 +6,19 @@ from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.objectives import Blocks, Objective
 
-ROOM = 8192
-"""Weights of all settings that are carried at a time; more than this leave the fast memory."""
+ROOM = 2640
+"""Weights of all settings that are carried at a time; more than this leave the fastest memory."""
+LEAST = 32
+"""Settings side by side even so, for fewer do not keep a processor busy."""
 
 
 def lanes(P: int) -> int:
-    """Settings that run side by side, for P weights each.
+    """Most settings that run side by side, for P weights each.
 
-    >>> lanes(21), lanes(1326)
-    (384, 8)
+    >>> lanes(21), lanes(66), lanes(1326)
+    (120, 40, 32)
     """
-    return max(8, ROOM // P // 8 * 8)
+    return max(LEAST, ROOM // P // 8 * 8)
 
 
 def sweep(
@@ -42,7 +44,7 @@ def sweep(
     def turn(carry: tuple[Array, Array], sample: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
         w, total = carry
         phi, target = sample
-        e = target - jnp.sum(w * phi[:, None], axis=0)
+        e = target - jnp.matmul(phi, w, precision=jax.lax.Precision.HIGHEST)
         kept = w if keep is None else w * keep
         return (kept + (step * e[None]) * phi[:, None], total + e * e), None
 

@@ -98,7 +98,9 @@ def require_basis(basis: Any) -> None:
     Raises:
         InputError: A bank was given, or anything else.
     """
-    if not all(hasattr(basis, name) for name in ("names", "degrees", "regressors", "units", "kernels")):
+    wanted = ("names", "degrees", "regressors", "units", "kernels")
+    # The class is asked first: working out all names takes longer than a filter over a short record.
+    if not all(hasattr(type(basis), name) or hasattr(basis, name) for name in wanted):
         raise InputError(
             f"A basis such as Volterra(Delays(5)) is needed, but {type(basis).__name__} was given; wrap a "
             "bank in a Volterra series, of order 1 for a linear model."
@@ -126,12 +128,18 @@ def signal(u: Any, name: str = "u") -> np.ndarray:
             f"Argument `{name}` must be real numbers of shape (N,), one per sample, but is "
             f"{u.dtype.name} of shape {u.shape}; give one signal."
         )
-    if not np.isfinite(u).all():
+    if not all_finite(u):
         k = int(np.argmin(np.isfinite(u)))
         raise InputError(
             f"Argument `{name}` must be finite, but is {u[k]} at sample {k}; cut the signal there."
         )
     return u.astype(np.float32 if u.dtype in (np.float16, np.float32) else np.float64, copy=False)
+
+
+def all_finite(x: np.ndarray) -> bool:
+    """Whether no number is infinite or missing, mostly without an array of answers."""
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(np.sum(x)) or np.isfinite(x).all())
 
 
 def whole(value: Any, name: str, least: int) -> int:

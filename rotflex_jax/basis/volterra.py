@@ -98,12 +98,13 @@ class Volterra(eqx.Module):
     @property
     def size(self) -> int:
         """Number of regressors."""
-        return len(self.indices)
+        return sum(len(indices(self.bank.size, d, self.layout)) for d in self.chosen)
 
     @property
     def names(self) -> tuple[str, ...]:
         """`1`, `u[t]`, `u[t]^2`, `u[t] * u[t-1]`, ..."""
-        return tuple(title(i, self.bank.names) for i in self.indices)
+        names = self.bank.names
+        return tuple(title(i, names) for i in self.indices)
 
     @property
     def degrees(self) -> Int[np.ndarray, " P"]:
