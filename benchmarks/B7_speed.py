@@ -142,10 +142,9 @@ def _starts(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
 
 
 def _cold(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
-    from speed import fits
+    from speed.processes import cold
 
-    first, *warm = fits.cold(_seconds(chosen))
-    return {"facts": {"whole process, first [s]": first, "whole process, warm cache [s]": min(warm)}}
+    return {"facts": cold(_seconds(chosen))}
 
 
 def _growth(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:

@@ -218,6 +218,44 @@ def emps_published() -> str:
     return f"{p['polynomial NARX']['pulses']:g} and {p['dynoNet']['pulses']:g}"
 
 
+def _millimetres(pair: list[float]) -> str:
+    """Two errors [m] in millimetres."""
+    return " and ".join(f"{1e3 * e:.{1 if e > 1e-3 else 2}f}" for e in pair)
+
+
+@named
+def emps_unequal() -> str:
+    """By how much the damping is stronger backwards than forwards [N s/m]."""
+    found = _last_effect("emps")["predictor estimates"]["axis.viscous_asymmetric.asymmetry"]
+    return f"{-2 * found['value']:.0f}"
+
+
+@named
+def emps_candidates() -> str:
+    """Candidates of the first round of free runs."""
+    return str(len(results("B3.json")["emps"]["free-run rounds"][0]["tried"]))
+
+
+@named
+def emps_before_drift() -> str:
+    """Errors of free runs over the two held-out parts before an effect was added [mm]."""
+    return _millimetres(results("B3.json")["emps"]["free-run rounds"][0]["held_out"])
+
+
+@named
+def emps_with_drift() -> str:
+    """The same with the effect that was taken [mm]."""
+    found = results("B3.json")["emps"]["free-run rounds"][0]
+    return _millimetres(found["tried"][found["taken"]])
+
+
+@named
+def emps_runner_up() -> str:
+    """The same with the effect whose larger error is the least of the others [mm]."""
+    found = results("B3.json")["emps"]["free-run rounds"][0]
+    return _millimetres(min((e for name, e in found["tried"].items() if name != found["taken"]), key=max))
+
+
 # -- every method -------------------------------------------------------------------------------------------
 
 
@@ -242,3 +280,68 @@ def next_ratio() -> str:
                 total[i["input"] == "design"] = max(total[i["input"] == "design"], worth)
             ratios.append(total[True] / total[False])
     return f"{min(ratios):.0f} to {max(ratios):.0f}"
+
+
+# -- speed --------------------------------------------------------------------------------------------------
+
+# Name -> row of B7.json and the row of the same table that it is set beside.
+BESIDE = {
+    "lms_5": ("LMS M=5: rotflex_jax", "LMS M=5: C -O3"),
+    "lms_10": ("LMS M=10: rotflex_jax", "LMS M=10: C -O3"),
+    "lms_20": ("LMS M=20: rotflex_jax", "LMS M=20: C -O3"),
+    "lms_50": ("LMS M=50: rotflex_jax", "LMS M=50: C -O3"),
+    "padasip": ("LMS M=5: rotflex_jax", "LMS M=5: padasip"),
+    "pairs": ("100 pairs: rotflex_jax, the sweep alone", "100 pairs: C -O3 over lanes"),
+    "pair_slopes": ("1 pair: rotflex_jax value and gradient", "1 pair: rotflex_jax value"),
+    "rls_21": ("RLS 21 weights: rotflex_jax", "RLS 21 weights: C -O3"),
+    "rls_66": ("RLS 66 weights: rotflex_jax", "RLS 66 weights: C -O3"),
+    "rls_231": ("RLS 231 weights: rotflex_jax", "RLS 231 weights: C -O3"),
+    "order_4": ("smooth friction with current, order 4: value", "C -O3, RK4 without current"),
+    "order_2": ("smooth friction with current, order 2: value", "C -O3, RK4 without current"),
+    "dry": ("dry friction with current, order 2: value", "C -O3, RK4 without current"),
+    "linear": ("linear, blocks: value", "C -O3, RK4 without current"),
+    "linear_control": ("linear, blocks: value", "python-control, linear"),
+    "solve_ivp": (
+        "smooth friction with current, order 2: value",
+        "solve_ivp RK45, default tolerance",
+    ),
+    "diffrax": ("smooth friction with current, order 2: value", "diffrax, Tsit5, a step per sample"),
+    "casadi": ("smooth friction with current, order 2: value", "CasADi, RK4 by mapaccum"),
+    "jacobian": (
+        "smooth, order 2: value and Jacobian by 8, carried",
+        "smooth, order 2: value inside JAX",
+    ),
+    "jacobian_stored": ("smooth, order 2: Jacobian by 8, stored", "smooth, order 2: value inside JAX"),
+    "jacobian_dry": (
+        "dry, order 2: value and Jacobian by 8, carried",
+        "dry, order 2: value inside JAX",
+    ),
+    "sums": (
+        "smooth, order 2: J'J and J'e by 8 and 4 first states",
+        "smooth, order 2: value inside JAX",
+    ),
+    "fit_scipy": ("one fit: rotflex_jax", "one fit: scipy + numba"),
+    "fit_optimistix": ("one fit: rotflex_jax", "one fit: optimistix"),
+    "fit_solve_ivp": ("one fit: rotflex_jax", "one fit: scipy + solve_ivp"),
+    "fit_intervals": ("one fit: rotflex_jax fit, with intervals", "one fit: scipy + numba"),
+    "recordings": ("16 recordings: rotflex_jax", "16 recordings: scipy + numba"),
+    "starts": ("64 starts, staged: rotflex_jax", "64 starts, staged: scipy + numba"),
+}
+
+
+def _cost(row: str) -> float:
+    """Processor time of a row of the table of speed, in the unit of its table."""
+    groups = [g for part in results("B7.json").values() for g in part.get("groups", [])]
+    return next(r["cpu"] for g in groups for r in g["rows"] if r["name"] == row)
+
+
+def _digits(value: float) -> str:
+    """Three digits, without a power of ten."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+for _name, (_row_name, _base) in BESIDE.items():
+    NAMED[f"{_name}_time"] = lambda row=_row_name: _digits(_cost(row))
+    NAMED[f"{_name}_beside"] = lambda base=_base: _digits(_cost(base))
+    NAMED[f"{_name}_ratio"] = lambda row=_row_name, base=_base: f"{_cost(row) / _cost(base):.2g}"
+    NAMED[f"{_name}_gain"] = lambda row=_row_name, base=_base: _digits(_cost(base) / _cost(row))

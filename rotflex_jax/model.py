@@ -22,12 +22,18 @@ from rotflex_jax.mechanism import (
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.initial import initial_states
 from rotflex_jax.mechanism.movable import check_movable
+from rotflex_jax.mechanism.programs import Program, kept
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 
-_free = jax.jit(free_run, static_argnums=(0, 1))
-_free_many = jax.jit(jax.vmap(free_run, in_axes=(None, None, None, None, 0, 0, None)), static_argnums=(0, 1))
-_predict = jax.jit(predictor_run, static_argnums=(0, 1))
+_free, _predict = Program(free_run, static=2), Program(predictor_run, static=2)
+
+
+@kept(static=2)
+def _free_many(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN202 - as `free_run`, many starts
+    return jax.vmap(free_run, in_axes=(None, None, None, None, 0, 0, None))(
+        structure, solver, values, gates, x0, u, Ts
+    )
 
 
 @dataclasses.dataclass(frozen=True)

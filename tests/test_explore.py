@@ -76,11 +76,11 @@ def test_a_moved_number_is_that_of_the_model(explorer: Explorer, recording: rf.R
 
 def test_nothing_is_compiled_anew(explorer: Explorer) -> None:
     explorer.switches[SPRING].value = True
-    compiled = _free_many._cache_size()
+    compiled = len(_free_many)
     explorer.switches[FRICTION].value = False
     explorer.parameter.value = "hub.inertia.inertia"
     explorer.factor.value = 0.8
-    assert _free_many._cache_size() == compiled
+    assert len(_free_many) == compiled
 
 
 def test_the_picture_is_one(explorer: Explorer) -> None:

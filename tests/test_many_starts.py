@@ -11,10 +11,11 @@ from arena.records import make_record
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.many_starts import many_starts
 from rotflex_jax.fit.marquardt import descend
-from rotflex_jax.fit.normal_equations import normal_equations
+from rotflex_jax.fit.normal_equations import moved_by, normal_equations, whole_state
 from rotflex_jax.fit.residuals import first_states, sensor_noise
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate
+from rotflex_jax.mechanism.absent import Numbers, Samples
 from rotflex_jax.model import Model
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
@@ -47,12 +48,14 @@ def test_one_pass_has_the_sums_that_differences_of_runs_have(effect) -> None:
     J = np.stack([(error(h * way) - error(-h * way)) / (2 * h) for way in np.eye(7)], axis=1)
     e = error(np.zeros(7))
     with double_precision():
-        ways = np.eye(len(joint.values))[moved] * joint.values
-        given = [jnp.asarray(a) for a in (joint.values, ways, x0)]
-        samples = tuple(jnp.asarray(a) for a in (u, y, seen, Ts))
+        structure = joint.structure
+        start = whole_state(structure, jnp.asarray(x0))
+        numbers = Numbers(jnp.asarray(joint.values), jnp.ones(len(joint.effects)), start, None)
+        ways = moved_by(structure, jnp.asarray(joint.values), jnp.asarray(moved), 4)
+        samples = Samples(*(jnp.asarray(a) for a in (u, y, seen, Ts)))
         sums = jax.jit(normal_equations, static_argnums=(0, 1))
-        got = jax.device_get(sums(joint.structure, Exponential(), *given, samples, jnp.asarray(scale)))
-    np.testing.assert_allclose(got.cost, e @ e / 2, rtol=1e-10)
+        got = jax.device_get(sums(structure, Exponential(), numbers, ways, samples, jnp.asarray(scale)))
+    np.testing.assert_allclose(got.cost.sum(), e @ e / 2, rtol=1e-10)
     # A difference across the instant at which friction lets go is not quite a slope.
     np.testing.assert_allclose(got.g, J.T @ e, rtol=1e-4, atol=1e-4 * np.abs(J.T @ e).max())
     np.testing.assert_allclose(got.H, J.T @ J, rtol=1e-4, atol=1e-4 * np.diag(J.T @ J).min())

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import functools
-import subprocess
-import sys
-import time
 from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from rotflex_jax import Recording, many_starts
+from rotflex_jax import Recording, fit, many_starts
 from speed import c_reference
 from speed.machine import MOVED, TRUE, Ts, smooth, voltage
 from speed.rounds import Case
 
+BRIEF, SHOTS = 0.1, 3
+"""Of the fit with solve_ivp: seconds of the recording, and most steps."""
 SHORT, KEPT = 1.5, 8
 """Of a staged search: seconds that all starts are fitted to, and how many go on."""
 
@@ -40,13 +39,13 @@ def start(spread: float, seed: int) -> np.ndarray:
 def _numba_joint() -> Any:
     import numba
 
-    @numba.njit(fastmath=True)
+    @numba.njit(fastmath=True, error_model="numpy")
     def flow(a: float, b: float, c: float, d: float, v: float, p: np.ndarray) -> tuple:
         spring = p[2] * b + p[7] * b * b * b + p[6] * d
         faster = (p[3] * v - (p[4] + p[5]) * c - p[8] * np.tanh(c / p[9]) + spring) / p[0]
         return c, d, faster, -spring / p[1] - faster
 
-    @numba.njit(fastmath=True)
+    @numba.njit(fastmath=True, error_model="numpy")
     def run(u: np.ndarray, p: np.ndarray, h: float) -> np.ndarray:
         out = np.empty((len(u), 2))
         a = b = c = d = 0.0
@@ -79,6 +78,20 @@ def scipy_fit(recordings: list[Recording], p0: np.ndarray) -> Any:
         return np.nan_to_num(np.concatenate(e), nan=1e6, posinf=1e6, neginf=-1e6)
 
     return least_squares(errors, np.log(p0[list(MOVED)]), method="lm")
+
+
+def solve_ivp_fit(r: Recording, p0: np.ndarray) -> Any:
+    """The usual recipe: scipy's least squares, each run by solve_ivp, with steps no longer than a sample."""
+    from speed.motion import solve_ivp_run
+
+    scale = 0.01 * np.std(r.y, axis=0)
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        p = p0.copy()
+        p[list(MOVED)] = np.exp(x)
+        return ((solve_ivp_run(r.u, p, max_step=Ts) - r.y) / scale).ravel()
+
+    return least_squares(errors, np.log(p0[list(MOVED)]), method="trf", max_nfev=SHOTS)
 
 
 def scipy_staged(r: Recording, starts: int, spread: float) -> np.ndarray:
@@ -151,7 +164,15 @@ def one_start(seconds: float) -> list[Case]:
             note="and four first states",
         ),
         Case("one fit: scipy + numba", lambda: scipy_fit([r], p0), 1e-3),
+        Case("one fit: rotflex_jax fit, with intervals", lambda: fit(joint, r), 1e-3, note="in stages"),
         Case("one fit: optimistix", lambda: optimistix_fit(r, p0), 1e-3, note="with fast loops"),
+        Case(
+            "one fit: scipy + solve_ivp",
+            lambda: solve_ivp_fit(r.slice(0, round(BRIEF / Ts)), p0),
+            1e-3 * BRIEF / seconds,
+            once=True,
+            note=f"measured on {BRIEF:g} s, time in proportion; {SHOTS} steps of which it needs more",
+        ),
     ]
 
 
@@ -198,21 +219,3 @@ def quality(seconds: float, starts: int = 8) -> dict[str, float]:
         many_starts(smooth(p=start(0.3, k)), r, starts=1, short_seconds=None).cost for k in range(starts)
     ]
     return {"largest excess over the least cost": float(max(costs) / min(costs) - 1)}
-
-
-COLD = """
-import time; begin = time.perf_counter()
-import rotflex_jax as rf; rf.enable_fast_loops(); rf.enable_compilation_cache()
-from speed.fits import recording, start, smooth
-many = rf.many_starts(smooth(p=start(0.3, 1)), recording({seconds}), starts=1, short_seconds=None)
-"""
-
-
-def cold(seconds: float) -> list[float]:
-    """Whole processes, from start to fitted; the first may have to fill the cache of compiled code."""
-    found = []
-    for _ in range(3):
-        begin = time.perf_counter()
-        subprocess.run([sys.executable, "-c", COLD.format(seconds=seconds)], check=True)
-        found.append(time.perf_counter() - begin)
-    return found

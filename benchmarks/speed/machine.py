@@ -62,6 +62,12 @@ def voltage(N: int, seed: int = 0) -> np.ndarray:
     return np.repeat(rng.uniform(-6, 6, -(-N // 50)), 50)[:N]
 
 
+def multisine(N: int) -> np.ndarray:
+    """Five sines below 8 Hz, 3 V at most or so: the hub turns round slowly."""
+    t = np.arange(N) * Ts
+    return 3 / 2.2 * np.sum([np.sin(2 * np.pi * f * t + f * f) for f in (0.5, 1.3, 2.9, 4.7, 7.1)], axis=0)
+
+
 def linear(current: bool = False) -> Any:
     """The joint without friction and cubic spring."""
     return rf.joints.paper(

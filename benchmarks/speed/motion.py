@@ -9,16 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from rotflex_jax.fit.normal_equations import normal_equations
+from rotflex_jax.fit.normal_equations import moved_by, normal_equations
 from rotflex_jax.mechanism import Exponential, free_run, simulate
+from rotflex_jax.mechanism.absent import Numbers, Samples
+from rotflex_jax.mechanism.tangents import outputs_with_slopes
 from rotflex_jax.precision import double_precision
-from speed import c_reference
-from speed.machine import MOTOR, TRUE, Ts, dry, linear, smooth, voltage
+from speed import c_reference, peers
+from speed.machine import MOTOR, TRUE, Ts, dry, linear, multisine, smooth, voltage
 from speed.rounds import Case
 
 NANO = 1e-9
 FEW = 200
 """Samples for solve_ivp."""
+PYTHON_LOOP = 2000
+"""Samples for what works expression by expression."""
 
 
 def cases(N: int) -> list[Case]:
@@ -26,7 +30,6 @@ def cases(N: int) -> list[Case]:
     u = voltage(N)
     one = N * NANO
     models = {
-        "linear": (linear(), Exponential()),
         "smooth friction with current, order 4": (smooth(True), Exponential(order=4)),
         "smooth friction with current, order 2": (smooth(True), Exponential()),
         "dry friction with current, order 2": (dry(True), Exponential()),
@@ -34,12 +37,32 @@ def cases(N: int) -> list[Case]:
     found = [Case("C -O3, RK4 without current", lambda: c_reference.joint(u, TRUE, Ts), one)]
     for name, (joint, solver) in models.items():
         found.append(Case(f"{name}: value", lambda j=joint, s=solver: simulate(j, u, Ts, solver=s), one))
-    joint, solver = models["smooth friction with current, order 2"]
-    run, jacobian, sums = _slopes(joint, solver, u)
+    long, straight = voltage(5 * N), linear()
+    found.append(
+        Case(
+            "linear, blocks: value", lambda: simulate(straight, long, Ts), 5 * one, note=f"{5 * N:,} samples"
+        )
+    )
+    names = {"smooth": "smooth friction with current, order 2", "dry": "dry friction with current, order 2"}
+    for short, name in names.items():
+        run, carried, stored, sums = _slopes(*models[name], u)
+        found += [
+            Case(f"{short}, order 2: value inside JAX", run, one),
+            Case(f"{short}, order 2: value and Jacobian by 8, carried", carried, one),
+            Case(f"{short}, order 2: J'J and J'e by 8 and 4 first states", sums, one),
+        ]
+        if short == "smooth":
+            found.append(Case(f"{short}, order 2: Jacobian by 8, stored", stored, one))
     found += [
-        Case("smooth, order 2: value inside JAX", run, one),
-        Case("smooth, order 2: Jacobian by 8, stored", jacobian, one),
-        Case("smooth, order 2: J'J and J'e by 8 and 4 first states", sums, one),
+        Case(
+            "diffrax, Tsit5, a step per sample", peers.diffrax_joint(u, TRUE, Ts), one, note="without current"
+        ),
+        Case(
+            "CasADi, RK4 by mapaccum",
+            peers.casadi_joint(u[:PYTHON_LOOP], TRUE, Ts),
+            PYTHON_LOOP * NANO,
+            note="without current",
+        ),
         Case(
             "solve_ivp RK45, default tolerance",
             lambda: solve_ivp_run(u[:FEW], TRUE),
@@ -67,26 +90,33 @@ def _control(u: np.ndarray) -> list[Case]:
     return [Case("python-control, linear", lambda: control.forced_response(system, t, u), len(u) * NANO)]
 
 
-def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any]:
-    """The run, its stored Jacobian and its normal equations, each compiled."""
-    free = np.array([joint.parameter_names.index(n) for n in joint.free_names])
+def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any, Any]:
+    """The run, with its Jacobian carried and stored, and its normal equations, each compiled."""
+    names = joint.parameter_names
+    eight = np.array([names.index(n) for n in names if n in joint.free_names][-8:])
+    structure = joint.structure
     with double_precision():
         values, U, T = jnp.asarray(joint.values), jnp.asarray(u), jnp.asarray(Ts)
         gates, x0 = jnp.ones(len(joint.effects)), jnp.zeros(5)
-        ways = jnp.eye(len(values))[free]
-        recording = (U, jnp.zeros((len(u), 2)), jnp.ones(len(u)), T)
+        samples = Samples(U, jnp.zeros((len(u), 2)), jnp.ones(len(u)), T)
+        one = jnp.ones(len(values))
 
         def out(z: jax.Array) -> jax.Array:
-            return free_run(joint.structure, solver, values.at[free].set(z), gates, x0, U, T)[1]
+            return free_run(structure, solver, values.at[eight].set(z), gates, x0, U, T)[1]
+
+        def carried(values: jax.Array) -> Any:
+            ways = moved_by(structure, one, jnp.asarray(eight), 0)
+            return outputs_with_slopes(structure, solver, Numbers(values, gates, x0, None), ways, samples)
 
         def sums(values: jax.Array) -> Any:
-            return normal_equations(
-                joint.structure, solver, values, ways, x0[:4], recording, jnp.asarray([0.1, 0.01])
-            )
+            ways, scale = moved_by(structure, one, jnp.asarray(eight), 4), jnp.asarray([0.1, 0.01])
+            numbers = Numbers(values, gates, x0, None)
+            return normal_equations(structure, solver, numbers, ways, samples, scale)
 
         calls = [
-            (jax.jit(out), values[free]),
-            (jax.jit(jax.jacfwd(out)), values[free]),
+            (jax.jit(out), values[eight]),
+            (jax.jit(carried), values),
+            (jax.jit(jax.jacfwd(out)), values[eight]),
             (jax.jit(sums), values),
         ]
 
@@ -97,8 +127,8 @@ def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any]:
 
         return call
 
-    first, second, third = (called(f, x) for f, x in calls)
-    return first, second, third
+    first, second, third, fourth = (called(f, x) for f, x in calls)
+    return first, second, third, fourth
 
 
 def solve_ivp_run(u: np.ndarray, p: np.ndarray, **options: Any) -> np.ndarray:
@@ -123,20 +153,32 @@ def solve_ivp_run(u: np.ndarray, p: np.ndarray, **options: Any) -> np.ndarray:
 
 def errors() -> dict[str, float]:
     """Relative error of the deflection against many small steps, each with its own physics."""
+    found: dict[str, float] = {}
+    for name, u in {"steps of 6 V": voltage(4000), "multisine of 3 V": multisine(4000)}.items():
+        found |= {f"{name}: {what}": error for what, error in _errors(u).items()}
     u = voltage(4000)
+    found["solve_ivp, default tolerance, against its own limit"] = _off(
+        solve_ivp_run(u, TRUE)[:, 1], c_reference.joint(u, TRUE, Ts, 100)[:, 1]
+    )
+    sticking = lambda n: simulate(dry(True), u, Ts, solver=Exponential(substeps=n))[:, 1]  # noqa: E731
+    found["dry friction with current, order 2, 1 per sample, against 64"] = _off(sticking(1), sticking(64))
+    return found
+
+
+def _off(got: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((got - truth) ** 2) / np.mean(truth**2)))
+
+
+def _errors(u: np.ndarray) -> dict[str, float]:
     fine = c_reference.joint_current(u, TRUE, MOTOR, Ts, 200)[:, 1]
     without = c_reference.joint(u, TRUE, Ts, 100)[:, 1]
-    off = lambda got, ref: float(np.sqrt(np.mean((got - ref) ** 2) / np.mean(ref**2)))  # noqa: E731
     found = {}
     for order in (2, 4):
         for substeps in (1, 2):
             got = simulate(smooth(True), u, Ts, solver=Exponential(order=order, substeps=substeps))[:, 1]
-            found[f"smooth friction with current, order {order}, {substeps} per sample"] = off(got, fine)
-    found["C RK4 without current, 1 per sample, against its own limit"] = off(
+            found[f"smooth friction with current, order {order}, {substeps} per sample"] = _off(got, fine)
+    found["C RK4 without current, 1 per sample, against its own limit"] = _off(
         c_reference.joint(u, TRUE, Ts)[:, 1], without
     )
-    found["leaving the current out"] = off(without, fine)
-    found["solve_ivp, default tolerance, against its own limit"] = off(solve_ivp_run(u, TRUE)[:, 1], without)
-    sticking = lambda n: simulate(dry(True), u, Ts, solver=Exponential(substeps=n))[:, 1]  # noqa: E731
-    found["dry friction with current, order 2, 1 per sample, against 64"] = off(sticking(1), sticking(64))
+    found["leaving the current out"] = _off(without, fine)
     return found

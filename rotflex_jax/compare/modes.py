@@ -4,9 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Complex, Float
-from scipy.signal import lfilter
 
 from rotflex_jax.compare.linear_system import LinearSystem
 from rotflex_jax.recording import Recording
@@ -106,7 +105,10 @@ class Modes:
 
     def _free(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
         return np.vstack(
-            [np.stack([lfilter([1], [1, -p], np.eye(1, r.N)[0]) for p in self.p], axis=1) for r in recordings]
+            [
+                np.stack([scipy.signal.lfilter([1], [1, -p], np.eye(1, r.N)[0]) for p in self.p], axis=1)
+                for r in recordings
+            ]
         )
 
     def _states(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
@@ -155,7 +157,9 @@ class Modes:
 
 def _filtered(p: np.ndarray, u: np.ndarray) -> Complex[np.ndarray, "N n"]:
     u = np.broadcast_to(u, (len(u), len(p)))
-    return np.stack([lfilter([0, 1], [1, -pole], x) for pole, x in zip(p, u.T, strict=True)], axis=1)
+    return np.stack(
+        [scipy.signal.lfilter([0, 1], [1, -pole], x) for pole, x in zip(p, u.T, strict=True)], axis=1
+    )
 
 
 def _pair(x: Complex[np.ndarray, "N n"]) -> Float[np.ndarray, "N 2n"]:

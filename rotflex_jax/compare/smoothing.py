@@ -1,8 +1,7 @@
 """Speeds and accelerations by smoothed differentiation, and the input as the same smoothing would show it."""
 
 import numpy as np
-import scipy.interpolate
-import scipy.signal
+import scipy
 from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
@@ -69,7 +68,7 @@ def _window(width: float, N: int) -> int:
     return min(int(width) // 2 * 2 + 1, (N - 1) // 2 * 2 + 1)
 
 
-def _spline(x: np.ndarray, width: float) -> scipy.interpolate.BSpline:
+def _spline(x: np.ndarray, width: float) -> "scipy.interpolate.BSpline":
     """The smoother of a random walk of the acceleration's integral: its cutoff is the width."""
     t = np.arange(len(x), dtype=float)
     return scipy.interpolate.make_smoothing_spline(t, x, lam=(width / (2 * np.pi)) ** 4)

@@ -77,6 +77,8 @@ def load(
             f"{table.label}: the column {u_name!r} was given as input and as output, but it can be "
             "only one; correct input= or outputs=."
         )
+    stamps = [] if Ts is not None and time is None else [(time or "t", "time=")]
+    table.check([(u_name, "input="), *((name, "outputs=") for name in chosen.values()), *stamps])
     u = _column(table, u_name, "input=", {"mv": "volts"})
     y = {}
     for channel, name in chosen.items():
@@ -150,7 +152,8 @@ def _column(table: Table, name: str, argument: str, wrong: Mapping[str, str]) ->
     label = f"{table.label}: column {name!r}"
     for unit in _words(name) & set(wrong):
         raise InputError(
-            f"{label} is in {unit} by its name, but {wrong[unit]} are needed; convert and rename it."
+            f"{label} is in {unit} by its name, but {wrong[unit]} are needed; convert and rename it"
+            f"{', or leave it out and give Ts=' if unit == 'ms' else ''}."
         )
     numbers = real_numbers(values, label, table.where, table.first)
     finite(numbers, label, table.where, table.first)

@@ -37,12 +37,29 @@ class Table:
         """
         if isinstance(name, str) and name in self.columns:
             return self.columns[name]
+        raise self._lacks(f"column {name!r}", f"name the right one with {what}")
+
+    def check(self, wanted: Sequence[tuple[str, str]]) -> None:
+        """Refuse at once all columns that are not there, where they are more than one.
+
+        Args:
+            wanted: columns, each with the argument by which a user could name another.
+
+        Raises:
+            InputError: several are missing; the error lists those that are there.
+        """
+        missing = [(n, what) for n, what in wanted if isinstance(n, str) and n not in self.columns]
+        if len(missing) > 1:
+            names = ", ".join(repr(n) for n, _ in missing)
+            arguments = list(dict.fromkeys(what for _, what in missing))
+            told = ", ".join(arguments[:-1]) + " and " * (len(arguments) > 1) + arguments[-1]
+            raise self._lacks(f"columns {names}", f"name the right ones with {told}")
+
+    def _lacks(self, what: str, then: str) -> InputError:
         longer = [key for key, values in self.columns.items() if len(values) > 1]
         there = longer or list(self.columns)  # settings of one value are not worth offering
         names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
-        raise InputError(
-            f"{self.label} has no column {name!r}; it has {names or 'none'}: name the right one with {what}."
-        )
+        return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
 
 
 def distinct(names: Sequence[str], label: str) -> Sequence[str]:

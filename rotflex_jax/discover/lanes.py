@@ -14,6 +14,10 @@ import numpy as np
 from rotflex_jax.discover.supermodel import Part, SuperModel
 from rotflex_jax.fit.residuals import Data, predicted
 from rotflex_jax.mechanism import Mechanism, Solver
+from rotflex_jax.mechanism.absent import Numbers, Samples
+from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.programs import kept
+from rotflex_jax.mechanism.tangents import Ways, outputs_with_slopes
 from rotflex_jax.precision import double_precision
 
 # Lanes per call for values alone, where lanes come nearly free. Slopes run one lane a call: their
@@ -38,7 +42,7 @@ class Directions(NamedTuple):
     gates: Any  # (D, E)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def _innovations(structure: Mechanism, solver: Solver, lanes: Lane, data: Data) -> jax.Array:
     def one(lane: Lane) -> jax.Array:
         y_hat = predicted(structure, solver, lane.values, lane.x0, lane.gates, data, lane.K)
@@ -47,21 +51,26 @@ def _innovations(structure: Mechanism, solver: Solver, lanes: Lane, data: Data) 
     return jax.vmap(one)(lanes)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def _slopes(
     structure: Mechanism, solver: Solver, lane: Lane, along: Directions, data: Data
 ) -> tuple[jax.Array, jax.Array]:
-    def run(values: jax.Array, x0: jax.Array, gates: jax.Array) -> jax.Array:
-        return predicted(structure, solver, values, x0, gates, data, lane.K)
+    m = lane.x0.shape[1]
+    rest = jnp.asarray(rest_state(structure, np.float64))[m:]
 
-    def slope(dv: jax.Array, dx: jax.Array, dg: jax.Array) -> tuple[jax.Array, jax.Array]:
-        point = (lane.values, lane.x0, lane.gates)
-        return jax.jvp(run, point, (dv, jnp.broadcast_to(dx, lane.x0.shape), dg))
+    def one(recording: Any) -> tuple[jax.Array, jax.Array]:
+        values, x0, K, dvalues, samples = recording
+        numbers = Numbers(values, lane.gates, jnp.concatenate([x0, rest]), K)
+        ways = Ways(dvalues, along.gates, jnp.pad(along.x0, ((0, 0), (0, len(rest)))))
+        y_hat, J = outputs_with_slopes(structure, solver, numbers, ways, Samples(*samples))
+        return y_hat, jnp.moveaxis(J, -1, 0)
 
-    y_hat, J = jax.vmap(slope, out_axes=(None, 0))(*along)
+    each = (lane.values, lane.x0, lane.K, jnp.swapaxes(along.values, 0, 1), data)
+    y_hat, J = jax.lax.map(one, each)
     # Not a product: beyond its last sample a run may diverge.
     seen = data.seen[:, :, None] > 0
-    return jnp.where(seen, data.y - y_hat, 0.0), jnp.where(seen[None], -J, 0.0)
+    J = jnp.where(seen[None], -jnp.swapaxes(J, 0, 1), 0.0)
+    return jnp.where(seen, data.y - y_hat, 0.0), J
 
 
 def _stacked(parts: list[Lane]) -> Lane:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.signal import savgol_coeffs, savgol_filter
+import scipy
 
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.recording import Recording
@@ -64,7 +64,7 @@ def missing_acceleration(
     if not half:
         return np.zeros(len(error)), ~seen
     window = 2 * half + 1
-    smooth = savgol_filter(error, window, 2, deriv=order, delta=recording.Ts)
+    smooth = scipy.signal.savgol_filter(error, window, 2, deriv=order, delta=recording.Ts)
     for k in (0, *starts, len(error)):
         seen[max(0, k - half) : k + half + 1] = False
     return np.asarray(smooth), seen
@@ -93,7 +93,7 @@ def views(
     turning, bending = channels[0], channels[min(1, len(channels) - 1)]
     speed, error, unit = _speed(recording, turning, noise.get(turning, 0.0), mechanism)
     what = _subject(turning, mechanism)
-    position = np.asarray(savgol_filter(recording.channel(bending), 2 * half + 1, 2))
+    position = np.asarray(scipy.signal.savgol_filter(recording.channel(bending), 2 * half + 1, 2))
     place = "the deflection" if _subject(bending, mechanism) == "the joint" else bending
     found = (
         _sides("speed", speed, unit, error, _turning(what, unit)),
@@ -124,9 +124,9 @@ def _speed(
     known = dict(mechanism.outputs) if mechanism is not None else {}
     is_speed = known.get(channel, ("", ""))[1] == "speed" or unit.endswith("/s")
     order = 0 if is_speed else 1
-    weights = savgol_coeffs(window, 2, deriv=order, delta=recording.Ts)
+    weights = scipy.signal.savgol_coeffs(window, 2, deriv=order, delta=recording.Ts)
     y = recording.channel(channel).astype(float)
-    speed = np.asarray(savgol_filter(y, window, 2, deriv=order, delta=recording.Ts))
+    speed = np.asarray(scipy.signal.savgol_filter(y, window, 2, deriv=order, delta=recording.Ts))
     return speed, noise * float(np.linalg.norm(weights)), unit if is_speed else f"{unit}/s"
 
 

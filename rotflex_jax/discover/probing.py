@@ -1,6 +1,5 @@
 """Slopes of innovations along candidates that are switched off, whatever states these bring."""
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -14,10 +13,11 @@ from rotflex_jax.fit.residuals import Data, each_recording
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.absent import Numbers, Samples, absent_slopes, run_slopes
 from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.precision import double_precision
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def _run_slopes(structure: Mechanism, solver: Solver, lane: Lane, data: Data) -> jax.Array:
     def one(values: Any, x0: Any, K: Any, *samples: Any) -> Any:
         return run_slopes(structure, solver, Numbers(values, lane.gates, x0, K), Samples(*samples))
@@ -25,7 +25,7 @@ def _run_slopes(structure: Mechanism, solver: Solver, lane: Lane, data: Data) ->
     return each_recording(one, (0,) * 7)(lane.values, lane.x0, lane.K, *data)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def _probed(
     structure: Mechanism,
     solver: Solver,

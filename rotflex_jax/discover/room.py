@@ -4,6 +4,8 @@ from pathlib import Path
 
 import jax
 
+from rotflex_jax.mechanism import programs
+
 # Linux allows 65530 unless told otherwise; beyond that the compiler ends the process. One search may add
 # some 30000 where it tries many different structures.
 MOST = 30_000
@@ -21,5 +23,6 @@ def make_room(most: int = MOST) -> bool:
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") < most:
         return False
+    programs.forget()
     jax.clear_caches()
     return True

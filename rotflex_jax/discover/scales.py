@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import savgol_filter
+import scipy
 
 from rotflex_jax.effects.kinds import Linear, Scale
 from rotflex_jax.mechanism import Mechanism
@@ -26,8 +26,8 @@ def motion(
     width = max(2 * round(smooth / Ts / 2) + 1, 5)
     width = min(width, len(y) - 1 + len(y) % 2)
     C = rows[is_position, : layout.n]
-    position = np.asarray(savgol_filter(y[:, is_position], width, 3, axis=0))
-    speed = np.asarray(savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0))
+    position = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, axis=0))
+    speed = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0))
     back, out = np.linalg.pinv(C), {}
     for port, vector in mechanism.port_vectors.items():
         p = np.array(vector) @ back

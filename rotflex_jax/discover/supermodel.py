@@ -101,7 +101,7 @@ class SuperModel:
 
     def part(self, gates: np.ndarray) -> Part:
         """The super-model without the costly candidates whose gate (..., E) is zero."""
-        on = frozenset(i for i in self.costly if np.any(gates[..., i] != 0))
+        on = {int(i) for i in np.flatnonzero(np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0))}
         return self._without(self.costly - on)
 
     def probed(self, gates: np.ndarray, family: Iterable[Candidate]) -> Part:

@@ -3,8 +3,8 @@
 import dataclasses
 
 import numpy as np
+import scipy
 from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 # White innovations by default. An autoregression fitted to the innovations of an incomplete model also
 # takes away the slow error that the missing effect makes, and with it the power to name the effect.
@@ -30,7 +30,10 @@ class Whitener:
 
     def __call__(self, e: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Whitened signals (..., R, N, C); zero where not seen and in the first p samples."""
-        filtered = np.stack([lfilter(a, 1.0, e[..., c], axis=-1) for c, a in enumerate(self.a)], axis=-1)
+        filtered = e
+        if self.a.shape[1] > 1:
+            each = [scipy.signal.lfilter(a, 1.0, e[..., c], axis=-1) for c, a in enumerate(self.a)]
+            filtered = np.stack(each, axis=-1)
         mask = seen.copy()
         mask[:, : self.a.shape[1] - 1] = 0
         return (filtered @ self.L.T) * mask[..., None]

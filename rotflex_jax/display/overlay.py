@@ -4,8 +4,8 @@ import io
 from collections.abc import Mapping
 
 import numpy as np
+import scipy
 from matplotlib.figure import Figure
-from scipy.signal import savgol_filter
 
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.style import BASELINE, FINAL, MEASURED, blank, legend_above, styled, thinned
@@ -32,7 +32,7 @@ def _figure(
     axes = figure.subplots(count, 2, width_ratios=(1.9, 1.0), squeeze=False)
     scale, read = zip(*(readable(1.0, unit) for unit in units.values()), strict=True)
     window = 2 * max(2, round(SMOOTHING / recording.Ts)) + 1
-    speed = scale[0] * savgol_filter(y[:, 0], window, 2, deriv=1, delta=recording.Ts)
+    speed = scale[0] * scipy.signal.savgol_filter(y[:, 0], window, 2, deriv=1, delta=recording.Ts)
     against = scale[-1] * y[:, -1] if count > 1 else recording.t
     names = list(units)
     over = f"{names[-1]} [{read[-1]}]" if count > 1 else "time [s]"

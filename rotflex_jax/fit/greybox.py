@@ -1,62 +1,29 @@
 """The grey-box fit: parameters of the physics, first states and bounds, by Levenberg-Marquardt."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit.descent import Given, Moved, descend, residuals_and_slopes
 from rotflex_jax.fit.estimates import report
 from rotflex_jax.fit.fitted import Fit
-from rotflex_jax.fit.residuals import Coordinates, Data, first_states, predicted, sensor_noise, stack
+from rotflex_jax.fit.residuals import Coordinates, Data, first_states, sensor_noise, stack
 from rotflex_jax.fit.signs import check_signs
-from rotflex_jax.mechanism import Mechanism, Solver, kalman_gains
+from rotflex_jax.mechanism import Mechanism, kalman_gains
 from rotflex_jax.mechanism.assembly import equations
 from rotflex_jax.model import Model, window_starts
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 
+if TYPE_CHECKING:
+    from rotflex_jax.fit.compressed import Minimiser
+
 Progress = Callable[[str], None]
-
-# A step is the last when it lowers the negative log-likelihood by less than this [nat]. A relative
-# tolerance would stop a long recording many nats short of the optimum.
-NATS = 0.1
-# What optimistix says at length.
-UNSOLVED = "stopped: a step has no finite solution; the model diverges near these numbers"
-
-
-@dataclasses.dataclass(frozen=True)
-class _Problem:
-    """Scaled residuals as a function of the moved coordinates; hashable, so compiled once."""
-
-    coordinates: Coordinates
-    solver: Solver
-
-    def __call__(self, moved: jax.Array, args: Any) -> jax.Array:
-        flat, index, gates, data, K, scale = args
-        values, x0 = self.coordinates.split(flat.at[index].set(moved))
-        y_hat = predicted(self.coordinates.structure, self.solver, values, x0, gates, data, K)
-        e = (data.y - y_hat) * data.seen[:, :, None] / scale[None, None, :]
-        return e.ravel()
-
-
-@functools.partial(jax.jit, static_argnums=(0, 3))
-def _some_steps(problem: _Problem, moved: jax.Array, args: Any, count: int) -> Any:
-    """At most `count` Levenberg-Marquardt steps."""
-    solver = optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5)
-    sol = optx.least_squares(problem, solver, moved, args, max_steps=count, throw=False)
-    steps = sol.stats["num_steps"]
-    return sol.value, jnp.sum(problem(sol.value, args) ** 2) / 2, steps, sol.result
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _residuals_and_slopes(problem: _Problem, moved: jax.Array, args: Any) -> Any:
-    return problem(moved, args), jax.jacfwd(problem)(moved, args)
 
 
 def fit(
@@ -68,6 +35,7 @@ def fit(
     first: Literal["fitted", "measured"] = "fitted",
     window_seconds: float | None = None,
     max_steps: int = 60,
+    minimiser: "Minimiser | None" = None,
     progress: Progress | None = None,
     throw: bool = False,
 ) -> Fit:
@@ -91,6 +59,8 @@ def fit(
         window_seconds: Begin anew every so often [s], each time with a first state of its own and with
             memories at rest: the numbers with which free runs of that length are best.
         max_steps: Most iterations of each stage.
+        minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
+            `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
         progress: Called with a line of text now and then.
         throw: Raise instead of reporting a failure in `status`.
 
@@ -127,16 +97,12 @@ def fit(
     stages: list[Mapping[str, float] | None] = [everywhere(m, (0.03 * reach) ** 2)]
     stages.append(process_noise)
     flat = coordinates.flatten(m.values, first_states(model, listed))
-    free = [names.index(n) for n in m.free_names]
-    index = np.array(
-        [i for i in free if i not in indices]
-        + [coordinates.local_index(r, i) for r in range(coordinates.owning) for i in indices]
-        + [i for r in range(len(listed)) for i in coordinates.state_index(r) if first == "fitted"]
-    )
+    free = tuple(names.index(n) for n in m.free_names)
+    moved = Moved(coordinates, model.solver, free, first == "fitted")
     history, steps, status, scale = [], 0, "converged", noise
+    gates = np.ones(len(m.effects))
     with double_precision():
-        problem = _Problem(coordinates, model.solver)
-        args: Any = ()
+        given = Given(gates, data, None, scale)
         for number, stage in enumerate(stages):
             last = number == len(stages) - 1
             for _ in range(3 if last else 1):
@@ -147,21 +113,24 @@ def fit(
                         start = there._start(recording)
                         flat[coordinates.state_index(r)] = start[: coordinates.states]
                 K = np.stack([kalman_gains(now, [stage or {}], noise, float(Ts))[0] for Ts in data.Ts])
-                gates = jnp.ones(len(m.effects), jnp.float64)
-                args = jax.tree.map(jnp.asarray, (flat, index, gates, data, K, scale))
-                flat, cost, used, status = _levenberg_marquardt(problem, flat, args, max_steps, say)
+                given = Given(*jax.tree.map(jnp.asarray, (gates, data, K, scale)))
+                if minimiser is None:
+                    flat, squares, used, status = descend(moved, flat, given, max_steps, say)
+                else:
+                    from rotflex_jax.fit.compressed import minimise  # takes long to import
+
+                    flat, squares, used, status = minimise(minimiser, moved, flat, given, max_steps)
                 steps += used
-                history.append(cost)
-                new = _deviation(problem, flat, args, scale)
+                history.append(float(squares.sum()))
+                new = np.sqrt(2 * squares / np.sum(data.seen)) * scale
                 settled = np.all(np.abs(np.log(new / scale)) < 0.02)
                 scale = np.maximum(new, noise * 0.1)
                 if settled or status != "converged":
                     break
-        args = (*args[:-1], jnp.asarray(scale))
-        e, J = _residuals_and_slopes(problem, jnp.asarray(flat[index]), args)
+        e, J = residuals_and_slopes(moved, jnp.asarray(flat), given._replace(scale=jnp.asarray(scale)))
         if throw and status != "converged":
             raise RuntimeError(f"The fit did not converge: {status}.")
-        return report(model, coordinates, flat, index, data, scale, e, J, status, steps, history)
+        return report(model, coordinates, flat, moved.index, data, scale, e, J, status, steps, history)
 
 
 def _windows(recordings: list[Recording], seconds: float | None) -> tuple[list[Recording], tuple[int, ...]]:
@@ -199,46 +168,3 @@ def torque_scale(m: Mechanism, data: Data) -> float:
         push = np.linalg.solve(np.asarray(eq.inverse_mass), np.asarray(eq.B)[n : 2 * n])
     level = float(np.sqrt(np.sum(data.u**2 * data.seen) / np.sum(data.seen)))
     return max(float(np.max(np.abs(push))) * level, 1e-6)
-
-
-def _levenberg_marquardt(
-    problem: _Problem, flat: np.ndarray, args: Any, max_steps: int, say: Progress
-) -> tuple[np.ndarray, float, int, str]:
-    """Optimistix, a few steps at a time so that a long fit shows where it is and stops on nats.
-
-    Starting anew costs nothing: the damping it begins with is far below the curvature.
-    """
-    index = np.asarray(args[1])
-    moved = jnp.asarray(flat[index])
-    cost = float(jnp.sum(_whole(problem, moved, args) ** 2) / 2)
-    if not np.isfinite(cost):
-        return flat, cost, 0, "diverged: the model error at the start is not finite"
-    used, status = 0, f"stopped after {max_steps} steps"
-    while used < max_steps:
-        count = min(16, max_steps - used)
-        new, new_cost, steps, result = _some_steps(problem, moved, args, count)
-        used += int(steps)
-        gain = cost - float(new_cost)
-        if gain > 0:
-            moved, cost = new, float(new_cost)
-        say(f"fit: {used} steps, cost {cost:.1f}")
-        if not gain > NATS and count == 16:
-            bad = result not in (optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
-            status = UNSOLVED if bad else "converged"
-            break
-    out = flat.copy()
-    out[index] = np.asarray(moved)
-    return out, cost, used, status
-
-
-def _deviation(problem: _Problem, flat: np.ndarray, args: Any, scale: np.ndarray) -> np.ndarray:
-    """Root mean square residual of each channel."""
-    e = np.asarray(_whole(problem, jnp.asarray(flat[np.asarray(args[1])]), args))
-    data: Data = args[3]
-    e = e.reshape(data.y.shape) * scale
-    return np.sqrt(np.sum(e**2, axis=(0, 1)) / np.sum(np.asarray(data.seen)))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _whole(problem: _Problem, moved: jax.Array, args: Any) -> jax.Array:
-    return problem(moved, args)

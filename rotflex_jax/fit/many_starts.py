@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.marquardt import Problem, Reached, descend
+from rotflex_jax.fit.marquardt import ENOUGH, ROUGHLY, Problem, Reached, descend
 from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.model import Model
@@ -128,10 +128,14 @@ def many_starts(
     say = progress or (lambda _: None)
     short = _beginnings(listed, short_seconds)
     if short is not None:
-        found = _stage(model, z, x0, short, free, noise, max_steps, f"{starts} starts, beginnings", say)
+        found = _stage(
+            model, z, x0, short, free, noise, max_steps, ROUGHLY, f"{starts} starts, beginnings", say
+        )
         best = np.argsort(found.cost)[:keep]
         z, x0 = np.asarray(found.z[best]), np.asarray(found.x0[best])
-    found = _stage(model, z, x0, listed, free, noise, max_steps, f"{len(z)} starts, whole recordings", say)
+    found = _stage(
+        model, z, x0, listed, free, noise, max_steps, ENOUGH, f"{len(z)} starts, whole recordings", say
+    )
     order = np.argsort(found.cost)
     if not np.isfinite(found.cost[order[0]]):
         raise InputError(
@@ -172,6 +176,7 @@ def _stage(
     free: np.ndarray,
     noise: np.ndarray,
     most: int,
+    enough: float,
     title: str,
     say: Callable[[str], None],
 ) -> Reached:
@@ -190,6 +195,7 @@ def _stage(
                 jnp.asarray(x0[pick]),
                 problem,
                 most,
+                enough,
             )
             real = min(TOGETHER, len(z) - at)
             parts.append([np.asarray(part)[:real] for part in found])

@@ -7,15 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rotflex_jax.fit.normal_equations import Sums, normal_equations
+from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations, whole_state
 from rotflex_jax.fit.residuals import Data
 from rotflex_jax.mechanism import Mechanism, Solver
+from rotflex_jax.mechanism.absent import Numbers, Samples
 from rotflex_jax.parameters import Transform
 
 BOUND = 1.0
 """Most that one coordinate moves in a step; of a parameter with a bound, a factor of e."""
 ENOUGH = 1e-9
-"""A step that lowers the cost by less than this share of it is the last."""
+"""A step that would lower the cost by less than this share of it is not taken."""
+ROUGHLY = 1e-3
+"""The same where starts are only put in order."""
 
 
 class Problem(NamedTuple):
@@ -35,12 +38,16 @@ class Problem(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a start stands: free coordinates (K,), first states (R, m), their sums, and how it got there."""
+    """Where a start stands: free coordinates (K,), first states (R, m), their sums, and how it got there.
+
+    `step` is what comes next, of both, and `done` whether it is worth a run.
+    """
 
     z: Array
     x0: Array
     sums: Sums
     damping: Array
+    step: tuple[Array, Array]
     steps: Array
     done: Array
 
@@ -63,6 +70,7 @@ def descend(
     x0: Float[Array, "S R m"],
     problem: Problem,
     most: int,
+    enough: float = ENOUGH,
 ) -> Reached:
     """Where every start leads, one after the other.
 
@@ -75,6 +83,7 @@ def descend(
         x0: First positions and speeds at each start.
         problem: What they have in common.
         most: Most runs of each.
+        enough: Share of the cost below which there is nothing more to gain.
     """
     transform = Transform.of(structure.parameter_specifications)
 
@@ -84,44 +93,60 @@ def descend(
 
     def sums(z: Array, x0: Array) -> Sums:
         p, slopes = jax.jvp(values, (z,), (jnp.ones_like(z),))
-        ways = jnp.zeros((len(z), len(p)), p.dtype)
-        ways = ways.at[jnp.arange(len(z)), problem.free].set(slopes[problem.free])
-        run = functools.partial(normal_equations, structure, solver, p, ways)
-        return jax.lax.map(lambda r: run(r[0], r[1], problem.scale), (x0, tuple(problem.data)))
+        ways = moved_by(structure, slopes, problem.free, x0.shape[1])
+        gates = jnp.ones(len(structure.effects), p.dtype)
+
+        def run(r: Any) -> Sums:
+            numbers = Numbers(p, gates, whole_state(structure, r[0]), None)
+            return normal_equations(structure, solver, numbers, ways, Samples(*r[1]), problem.scale)
+
+        return jax.lax.map(run, (x0, tuple(problem.data)))
 
     def one(start: tuple[Array, Array]) -> Reached:
         z, x0 = start
-        first = Place(z, x0, sums(z, x0), jnp.asarray(1e-3), jnp.asarray(1), jnp.asarray(False))
-        end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < most), functools.partial(_turn, sums), first)
+        first = _there(z, x0, sums(z, x0), jnp.asarray(1e-3), jnp.asarray(1), enough)
+        turn = functools.partial(_turn, sums, enough)
+        end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < most), turn, first)
         return Reached(values(end.z), end.x0, jnp.sum(end.sums.cost), end.steps, end.z)
 
     return jax.lax.map(one, (z, x0))
 
 
-def _turn(sums: Any, place: Place) -> Place:
+def _turn(sums: Any, enough: float, place: Place) -> Place:
     """One step, taken where it lowers the cost."""
-    dz, dx = _step(place)
-    z, x0 = place.z + dz, place.x0 + dx
+    z, x0 = place.z + place.step[0], place.x0 + place.step[1]
     trial = sums(z, x0)
     before, after = jnp.sum(place.sums.cost), jnp.sum(trial.cost)
     better = after < before  # not where it is not a number
     keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
     damping = jnp.where(better, jnp.maximum(place.damping / 10, 1e-12), place.damping * 8)
-    done = (better & (before - after <= ENOUGH * after)) | (damping > 1e10)
     kept = Sums(*(keep(new, old) for new, old in zip(trial, place.sums, strict=True)))
-    return Place(keep(z, place.z), keep(x0, place.x0), kept, damping, place.steps + 1, done)
+    there = _there(keep(z, place.z), keep(x0, place.x0), kept, damping, place.steps + 1, enough)
+    return there._replace(done=there.done | (better & (before - after <= enough * after)))
 
 
-def _step(place: Place) -> tuple[Array, Array]:
+def _there(z: Array, x0: Array, sums: Sums, damping: Array, steps: Array, enough: float) -> Place:
+    """A place with the step that comes next; done where hardly anything is left to gain."""
+    step = _step(z, sums, damping)
+    d = jnp.concatenate([jnp.broadcast_to(step[0], (len(x0), len(z))), step[1]], axis=1)
+    expected = -jnp.sum(d * sums.g) - jnp.einsum("ri,rij,rj->", d, sums.H, d) / 2
+    cost = jnp.sum(sums.cost)
+    # A step that was held short says nothing of what is left to gain.
+    whole = (damping <= 1e-3) & jnp.all(jnp.abs(step[0]) < BOUND)
+    done = whole & (expected <= enough * cost) | (damping > 1e10) | ~jnp.isfinite(cost)
+    return Place(z, x0, sums, damping, step, steps, done)
+
+
+def _step(z: Array, sums: Sums, damping: Array) -> tuple[Array, Array]:
     """Damped Gauss-Newton; the first state of a recording is eliminated, for it meets only its own samples.
 
     A step of a parameter is bounded: far from the answer the linear picture is wrong about where it ends,
     and without the bound two starts in three from a wide box end elsewhere than at the least cost.
     """
-    K = len(place.z)
-    g, H = place.sums.g, place.sums.H
+    K = len(z)
+    g, H = sums.g, sums.H
     tiny = 1e-14 * jnp.max(jnp.abs(jnp.diagonal(H, axis1=1, axis2=2)))
-    damped = lambda m: m + jnp.diag(place.damping * jnp.diag(m) + tiny)  # noqa: E731
+    damped = lambda m: m + jnp.diag(damping * jnp.diag(m) + tiny)  # noqa: E731
     A, B, C = damped(jnp.sum(H[:, :K, :K], axis=0)), H[:, :K, K:], jax.vmap(damped)(H[:, K:, K:])
     # What the first states would do by themselves, and what they do with the parameters.
     inner = jnp.linalg.solve(C, jnp.concatenate([jnp.swapaxes(B, 1, 2), g[:, K:, None]], axis=2))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
-from scipy.signal import welch
+import scipy
 
 from rotflex_jax.effects.kinds import Linear
 from rotflex_jax.errors import InputError
@@ -140,7 +140,7 @@ class LatentTorque:
         """Frequencies [Hz] and amplitude density [N m/sqrt(Hz)] of a torque, over the longest recording."""
         number = int(np.argmax(np.bincount(self.recording)))
         own = self.torque[self.recording == number, self._index(port)]
-        f, density = welch(own, 1 / self.Ts[number], nperseg=min(4096, max(16, len(own) // 5)))
+        f, density = scipy.signal.welch(own, 1 / self.Ts[number], nperseg=min(4096, max(16, len(own) // 5)))
         return f[1:], np.sqrt(density[1:])
 
     def plot(self, after: Self | None = None) -> "Figure":

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rotflex_jax.mechanism.combine import beside
+
 
 class Contact(NamedTuple):
     """What contacts do over a step; one entry per contact.
@@ -76,15 +78,16 @@ def solve_masked(matrix: jax.Array, mask: jax.Array, rhs: jax.Array, other: jax.
     """Solve `matrix[m, :] f = rhs[m]` for the masked rows m, with `f = other` in the rest.
 
     Elimination is unrolled: a handful of contacts, no library call inside a scan. A ridge of 1e-10 keeps
-    contacts solvable that share one direction of motion. `matrix` is (k, k), the others (k, ...).
+    contacts solvable that share one direction of motion. `matrix` is (k, k) or (k, k, ...), the others
+    (k, ...).
     """
-    k, batch = matrix.shape[0], rhs.ndim - 1
+    k = matrix.shape[0]
+    matrix = beside(matrix, rhs[None])
     if k == 1:
-        return jnp.where(mask, rhs / matrix[0, 0], other)
-    eye = jnp.eye(k, dtype=matrix.dtype)
-    ridge = 1e-10 * jnp.max(jnp.abs(matrix))
-    wide = lambda m: m.reshape(m.shape + (1,) * batch)  # noqa: E731
-    full = jnp.where(mask[:, None], wide(matrix + ridge * eye), wide(eye))
+        return jnp.where(mask, rhs / matrix[0], other)
+    eye = beside(jnp.eye(k, dtype=matrix.dtype), matrix)
+    ridge = 1e-10 * jnp.max(jnp.abs(matrix), axis=(0, 1), keepdims=True)
+    full = jnp.where(mask[:, None], matrix + ridge * eye, eye)
     full = jnp.concatenate([full, jnp.where(mask, rhs, other)[:, None]], axis=1)
     rows = [full[i] for i in range(k)]
     for i in range(k):  # Gauss-Jordan
@@ -110,18 +113,18 @@ def contacts(
     Args:
         v0: Port speeds at the start (k, ...) [rad/s].
         free: Port speeds at the end without friction (k, ...) [rad/s].
-        stop: Speed that a unit torque at one contact gives another in one step (k, k).
+        stop: Speed that a unit torque at one contact gives another in one step (k, k), or (k, k, ...).
         up: Levels against positive motion (k, ...) [N m].
         down: Levels against negative motion (k, ...) [N m].
         passes: One more than contacts if None.
     """
     k = v0.shape[0]
-    wide = lambda m: m.reshape(m.shape + (1,) * (v0.ndim - 1))  # noqa: E731
-    own = wide(jnp.stack([stop[i, i] for i in range(k)]))
+    own = beside(jnp.stack([stop[i, i] for i in range(k)]), v0)
     if k == 1:
         return contact(v0, free, own, up, down)
-    eye = wide(jnp.eye(k, dtype=stop.dtype))
-    full = jnp.concatenate([jnp.broadcast_to(wide(stop), (k, *v0.shape)), free[:, None]], axis=1)
+    eye = beside(jnp.eye(k, dtype=stop.dtype), v0[None])
+    stop = jnp.broadcast_to(beside(stop, v0[None]), (k, *v0.shape))
+    full = jnp.concatenate([stop, free[:, None]], axis=1)
     slack = 1 + 1e3 * jnp.finfo(v0.dtype).eps
     # One without a level holds nothing.
     held = at_rest(v0, free, own, up, down) & (up + down > 0)

@@ -27,9 +27,9 @@ from rotflex_jax.mechanism.assembly import (
     effects_of,
     from_equations,
 )
+from rotflex_jax.mechanism.combine import apply
 from rotflex_jax.mechanism.exponential import integrals
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.torques import apply
 
 # Polynomial of degree two on [0, 1] with given moments of order 0, 1, 2: inverse of the Hilbert matrix.
 POLYNOMIAL = np.array([[9.0, -36.0, 30.0], [-36.0, 192.0, -180.0], [30.0, -180.0, 180.0]])

@@ -9,6 +9,7 @@ import scipy.linalg
 
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.simulate import Solver, free_run
 from rotflex_jax.precision import double_precision
 
@@ -44,7 +45,7 @@ def _stepwise(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> np.ndarray:
     return x
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def _refine(structure, solver, values, gates, guess, hidden, u, y, Ts):  # noqa: ANN001, ANN202
     """Damped Gauss-Newton on all stretches at once.
 

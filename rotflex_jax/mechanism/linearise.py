@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from rotflex_jax.mechanism.assembly import Layout, equations
+from rotflex_jax.mechanism.assembly import Equations, Layout, equations
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.precision import double_precision
 
 
@@ -29,17 +30,16 @@ class StateSpace(NamedTuple):
         return big[:n, :n], big[:n, n]
 
 
-_equations = jax.jit(
-    lambda structure, values, gates: equations(structure.with_values(values), gates),
-    static_argnums=0,
-)
+@kept(static=1)
+def _equations(structure: Mechanism, values: jax.Array, gates: jax.Array) -> tuple[jax.Array, ...]:
+    return tuple(equations(structure.with_values(values), gates))
 
 
 def _linear_part(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`A`, `B` and the inverse mass matrix."""
     with double_precision():
         gates = jnp.ones(len(mechanism.effects))
-        eq = _equations(mechanism.structure, jnp.asarray(mechanism.values), gates)
+        eq = Equations(*_equations(mechanism.structure, jnp.asarray(mechanism.values), gates))
         return np.asarray(eq.A), np.asarray(eq.B), np.asarray(eq.inverse_mass)
 
 

@@ -16,12 +16,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from rotflex_jax.mechanism.blocks import WORTH, linear_outputs
+
 StepFunction = Callable[[jax.Array, Any, Any], jax.Array]
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def states(step: StepFunction, x0: jax.Array, inputs: Any, constants: Any) -> jax.Array:
     """States (N, n) at the samples: row 0 is `x0`, row k + 1 is `step(row k, inputs[k], constants)`.
+
+    A step that says it is `linear` goes through long runs in blocks.
 
     Args:
         step: Pure function; hashable, so that equal structures share one compilation. It takes one state
@@ -30,6 +33,14 @@ def states(step: StepFunction, x0: jax.Array, inputs: Any, constants: Any) -> ja
         inputs: Pytree of arrays with leading length N.
         constants: Pytree that every step sees.
     """
+    if getattr(step, "linear", False) and len(inputs) >= WORTH:
+        return linear_outputs(step, x0, inputs, constants, jnp.eye(len(x0), dtype=x0.dtype))
+    return _stepped(step, x0, inputs, constants)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _stepped(step: StepFunction, x0: jax.Array, inputs: Any, constants: Any) -> jax.Array:
+    """One by one."""
 
     def body(x: jax.Array, w: Any) -> tuple[jax.Array, jax.Array]:
         return step(x, w, constants), x
@@ -97,11 +108,11 @@ def recursion(A: jax.Array, b: jax.Array, dx0: jax.Array) -> jax.Array:
     return jax.lax.scan(body, dx0, (A, b))[1]
 
 
-@states.defjvp
+@_stepped.defjvp
 def _states_jvp(step: StepFunction, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     x0, inputs, constants = primals
     dx0, dinputs, dconstants = tangents
-    X = states(step, x0, inputs, constants)
+    X = _stepped(step, x0, inputs, constants)
     A = slopes(step, X, inputs, constants)
     b = forcing(step, X, inputs, dinputs, constants, dconstants)
     return X, recursion(A, b, dx0)

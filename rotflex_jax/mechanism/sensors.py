@@ -2,26 +2,23 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rotflex_jax.effects.kinds import Sensing
 from rotflex_jax.mechanism.assembly import Layout, effects_of
+from rotflex_jax.mechanism.combine import combined, in_each
 from rotflex_jax.mechanism.mechanism import Mechanism
 
 
 def true_outputs(structure: Mechanism, x: jax.Array) -> jax.Array:
     """What perfect sensors would read (C, ...) at states (n, ...)."""
-    layout = Layout.of(structure)
-    C = jnp.asarray(np.array(layout.output_rows), x.dtype)
-    C = C.reshape(C.shape + (1,) * (x.ndim - 1))
-    return jnp.sum(C * x[None, : 2 * layout.n], axis=1)
+    return combined(Layout.of(structure).output_rows, x)
 
 
 def sensed(mechanism: Mechanism, gates: jax.Array, y: jax.Array) -> jax.Array:
     """Sensor readings (C, ...) of true outputs (C, ...)."""
     for i, effect in effects_of(mechanism, Sensing):
         c = mechanism.channels.index(effect.at)
-        read = y[c] + gates[i] * (effect.measure(y[c]) - y[c])
+        read = y[c] + gates[i] * (in_each(effect, lambda e, true: e.measure(true), y[c]) - y[c])
         y = jnp.concatenate([y[:c], read[None], y[c + 1 :]])
     return y
 

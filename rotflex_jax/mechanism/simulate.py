@@ -1,19 +1,22 @@
 """Free run and prediction on arrays; everything is pure, jitted once per structure and differentiable."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rotflex_jax.mechanism.assembly import driven_voltage, rest_state
+from rotflex_jax.effects.kinds import Gear
+from rotflex_jax.mechanism.assembly import Layout, driven_voltage, effects_of, rest_state
+from rotflex_jax.mechanism.blocks import WORTH, linear_outputs
+from rotflex_jax.mechanism.combine import apply
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import states
-from rotflex_jax.mechanism.sensors import read_outputs, read_with_sign
+from rotflex_jax.mechanism.sensors import read_outputs, read_with_sign, sensed
 from rotflex_jax.mechanism.smooth import SmoothRK4
 from rotflex_jax.mechanism.step import Exponential
-from rotflex_jax.mechanism.torques import apply
 from rotflex_jax.precision import working_precision
 
 Solver = Exponential | SmoothRK4
@@ -25,6 +28,12 @@ class FreeStep:
 
     structure: Mechanism
     solver: Solver
+
+    @property
+    def linear(self) -> bool:
+        """Whether the state after the step is linear in state and voltage."""
+        rough = Layout.of(self.structure).torque_ports or effects_of(self.structure, Gear)
+        return isinstance(self.solver, Exponential) and not rough
 
     def __call__(self, x: jax.Array, v: jax.Array, c: Any) -> jax.Array:
         """State one sample later under the voltage `v`."""
@@ -108,7 +117,31 @@ def predictor_run(
     return X, read_outputs(mechanism, gates, X.T).T
 
 
-_free_run = jax.jit(free_run, static_argnums=(0, 1))
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _free_states(structure: Mechanism, solver: Solver, *given: jax.Array) -> jax.Array:
+    return free_run(structure, solver, *given)[0]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _free_outputs(
+    structure: Mechanism,
+    solver: Solver,
+    values: jax.Array,
+    gates: jax.Array,
+    x0: jax.Array,
+    u: jax.Array,
+    Ts: jax.Array,
+) -> jax.Array:
+    """Outputs (N, C) alone: no state is kept. Arguments as in `free_run`."""
+    mechanism, step = structure.with_values(values), FreeStep(structure, solver)
+    c = solver.prepare(structure, values, gates, Ts)
+    v = solver.inputs(driven_voltage(mechanism, gates, u, Ts))
+    if step.linear and len(u) >= WORTH:
+        rows = jnp.asarray(Layout.of(structure).output_rows, x0.dtype)
+        rows = jnp.pad(rows, ((0, 0), (0, len(x0) - rows.shape[1])))
+        return sensed(mechanism, gates, linear_outputs(step, x0, v, c, rows).T).T
+    body = lambda x, w: (step(x, w, c), read_outputs(mechanism, gates, x))  # noqa: E731
+    return jax.lax.scan(body, x0, v)[1]
 
 
 def simulate(
@@ -127,7 +160,7 @@ def simulate(
         x0: First state, or only its positions and speeds.
         solver: Integration rule; `Exponential()` if None.
     """
-    return _simulated(mechanism, u, Ts, x0, solver)[1]
+    return _simulated(_free_outputs, mechanism, u, Ts, x0, solver)
 
 
 def simulate_states(
@@ -138,23 +171,16 @@ def simulate_states(
     solver: Solver | None = None,
 ) -> np.ndarray:
     """States (N, n) of a free run: positions, speeds, then states of motor and memories."""
-    return _simulated(mechanism, u, Ts, x0, solver)[0]
+    return _simulated(_free_states, mechanism, u, Ts, x0, solver)
 
 
-def _simulated(mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typed in the two callers
+def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typed in the two callers
     u = np.asarray(u)
     u = u if u.dtype in (np.float32, np.float64) else u.astype(np.float64)
     start = rest_state(mechanism.structure, u.dtype)
     if x0 is not None:
         start[: len(x0)] = x0
     with working_precision(u):
-        X, y = _free_run(
-            mechanism.structure,
-            solver or Exponential(),
-            jnp.asarray(mechanism.values.astype(u.dtype)),
-            jnp.ones(len(mechanism.effects), u.dtype),
-            jnp.asarray(start),
-            jnp.asarray(u),
-            jnp.asarray(Ts, u.dtype),
-        )
-        return np.asarray(X), np.asarray(y)
+        gates = np.ones(len(mechanism.effects), u.dtype)
+        numbers = (mechanism.values.astype(u.dtype), gates, start, u, np.asarray(Ts, u.dtype))
+        return np.asarray(run(mechanism.structure, solver or Exponential(), *numbers))

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from rotflex_jax.effects.kinds import DryFriction, Gear
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Equations, Layout, effects_of, equations
+from rotflex_jax.mechanism.combine import along, apply
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.step import along
-from rotflex_jax.mechanism.torques import apply, flows, port_motion, torques
+from rotflex_jax.mechanism.torques import flows, port_motion, torques
 
 
 class SmoothConstants(NamedTuple):

@@ -14,15 +14,11 @@ import jax.numpy as jnp
 from rotflex_jax.effects.kinds import DryFriction, Force, Memory
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of
 from rotflex_jax.mechanism.between import Between, smoothed
+from rotflex_jax.mechanism.combine import along, apply, beside, in_each
 from rotflex_jax.mechanism.friction import contacts, solve_masked, within
 from rotflex_jax.mechanism.gear import apart, geared_step
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.torques import apply, port_motion, remember, torques
-
-
-def along(a: jax.Array, v: jax.Array) -> jax.Array:
-    """The vector `a` (n,) times the scalar field `v` (...): shape (n, ...)."""
-    return a.reshape(a.shape + (1,) * v.ndim) * v[None]
+from rotflex_jax.mechanism.torques import port_motion, remember, torques
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,31 +92,33 @@ def _advance(
         return _brake(mechanism, L, start, c, solver.passes)
     f0 = torques(mechanism, L, z, v, c.gates)
     guess = start + apply(c.hold, f0)
-    brake = _brake_guess(mechanism, L, guess, c)
-    end = guess + apply(c.hold, brake)
+    brake = _brake_guess(mechanism, L, guess, c) if layout.contacts else None
+    end = guess if brake is None else guess + apply(c.hold, brake)
     z1 = remember(mechanism, z, (L + end) / 2, v, c.gates, c.h)
     if solver.order == 2:
         final = guess + apply(c.ramp, torques(mechanism, end, z1, v, c.gates) - f0)
     else:
-        final = start + _fourth_order(mechanism, L, z, z1, v, f0, brake, c)
+        own = end if extra is None else end - extra
+        final = guess + _fourth_order(mechanism, L, z, z1, v, f0, brake, own, c)
     final = _brake(mechanism, L, final, c, solver.passes)
     return jnp.concatenate([final, z1]) if z.shape[0] else final
 
 
-def _fourth_order(mechanism, L, z, z1, v, f0, brake, c):  # noqa: ANN001, ANN202 - shapes as in `_advance`
-    """Contribution of the smooth torques over the step, ETDRK4."""
+def _fourth_order(mechanism, L, z, z1, v, f0, brake, end, c):  # noqa: ANN001, ANN202 - as in `_advance`
+    """What comes to the state as the torques do not stay `f0`, ETDRK4; `end` is where that would lead."""
+    held = (lambda f: f) if brake is None else lambda f: f + brake
     half = apply(c.half_E, L) + along(c.half_input, v)
-    a = half + apply(c.half_hold, f0 + brake)
+    a = half + apply(c.half_hold, held(f0))
     zh = remember(mechanism, z, (L + a) / 2, v, c.gates, c.h / 2)
     fa = torques(mechanism, a, zh, v, c.gates)
-    b = half + apply(c.half_hold, fa + brake)
+    b = half + apply(c.half_hold, held(fa))
     fb = torques(mechanism, b, zh, v, c.gates)
-    e = apply(c.half_E, a) + along(c.half_input, v) + apply(c.half_hold, 2 * fb - f0 + brake)
+    # Two half steps make a whole one: half_E half_hold + half_hold = hold, and so for the rest.
+    e = end + apply(c.half_hold, 2 * (fb - f0))
     fe = torques(mechanism, e, z1, v, c.gates)
-    first = c.hold - 3 * c.ramp + 4 * c.rise
-    middle = 2 * c.ramp - 4 * c.rise
-    last = 4 * c.rise - c.ramp
-    return apply(first, f0) + apply(middle, fa + fb) + apply(last, fe)
+    middle = fa + fb
+    slope, bend = 2 * middle - 3 * f0 - fe, 4 * (f0 - middle + fe)
+    return apply(c.ramp, slope) + apply(c.rise, bend)
 
 
 def _levels(
@@ -134,8 +132,9 @@ def _levels(
     down = list(up)
     for i, e in effects_of(mechanism, DryFriction):
         k = layout.torque_ports.index(e.at)
-        up[k] = up[k] + gates[i] * e.limit(position[k], speed[k], 1.0)
-        down[k] = down[k] + gates[i] * e.limit(position[k], speed[k], -1.0)
+        for levels, way in ((up, 1.0), (down, -1.0)):
+            level = in_each(e, lambda e, q, s, way=way: e.limit(q, s, way), position[k], speed[k])
+            levels[k] = levels[k] + gates[i] * level
     return jnp.stack(up), jnp.stack(down)
 
 
@@ -143,11 +142,10 @@ def _brake_guess(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constant
     """Friction torques good enough for the stages: exact where a port slides, contacts uncoupled."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
-    if not k:
-        return jnp.zeros((len(layout.torque_ports), *x.shape[1:]), x.dtype)
     up, down = _levels(mechanism, x, end, c.gates)
     own = jnp.stack([1 / c.stop[i, i] for i in range(k)])
-    needed = -port_motion(layout, end)[1][:k] * own.reshape((k,) + (1,) * (x.ndim - 1))
+    needed = -port_motion(layout, end)[1][:k]
+    needed = needed * beside(own, needed)
     none = jnp.zeros((len(layout.torque_ports) - k, *x.shape[1:]), x.dtype)
     return jnp.concatenate([within(needed, up, down), none])
 
@@ -170,11 +168,12 @@ def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants, pas
     q1, v1 = (m[:k] for m in port_motion(layout, end))
     # A held torque takes the speed from v0 to v1 on a line; in truth it reaches zero after t h. A port
     # that holds moves by nothing at all, not even by the curvature of that line.
-    late = c.h / 2 * (found.t * v0 + (1 - found.t) * v1 - v0 - v1)
-    curved = c.h / 2 * (v0 + v1) - (q1 - q0)
+    half = beside(c.h[None], v0) / 2
+    late = half * (found.t * v0 + (1 - found.t) * v1 - v0 - v1)
+    curved = half * (v0 + v1) - (q1 - q0)
     shift = late + (1 - found.t) * found.holds * curved
     # A contact that is off has nothing to correct; what it would do if it came in, it would do alone.
-    own = jnp.stack([c.mobility[i, i] for i in range(k)]).reshape((k,) + (1,) * (shift.ndim - 1))
+    own = beside(jnp.stack([c.mobility[i, i] for i in range(k)]), shift)
     alone = jnp.where(found.crossed, shift / own, 0.0)
     works = found.crossed & (levels[0] + levels[1] > 0)
     impulse = solve_masked(c.mobility[:k, :k], works, shift, alone)

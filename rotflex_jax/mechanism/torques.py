@@ -2,22 +2,17 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rotflex_jax.effects.kinds import Force, Linear, Memory
 from rotflex_jax.mechanism.assembly import Layout, effects_of
+from rotflex_jax.mechanism.combine import beside, combined, in_each
 from rotflex_jax.mechanism.mechanism import Mechanism
-
-
-def apply(A: jax.Array, x: jax.Array) -> jax.Array:
-    """`A @ x` for `x` of shape (n, ...) as multiply and add, which the compiler fuses into the loop."""
-    return jnp.sum(A.reshape(A.shape + (1,) * (x.ndim - 1)) * x[None], axis=1)
 
 
 def port_motion(layout: Layout, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Positions and speeds of the torque ports."""
-    P = jnp.asarray(np.array(layout.port_matrix), x.dtype)
-    return apply(P, x[: layout.n]), apply(P, x[layout.n : 2 * layout.n])
+    P, n = layout.port_matrix, layout.n
+    return combined(P, x[:n]), combined(P, x[n : 2 * n])
 
 
 def motor_torque(mechanism: Mechanism, at: str, x: jax.Array, v: jax.Array, gates: jax.Array) -> jax.Array:
@@ -27,7 +22,7 @@ def motor_torque(mechanism: Mechanism, at: str, x: jax.Array, v: jax.Array, gate
     ends of a step tell nothing of its mean.
     """
     layout = Layout.of(mechanism.structure)
-    speed = apply(jnp.asarray([mechanism.port_vectors[at]], x.dtype), x[layout.n : 2 * layout.n])[0]
+    speed = combined((mechanism.port_vectors[at],), x[layout.n : 2 * layout.n])[0]
     total = jnp.zeros_like(speed)
     for i, e in effects_of(mechanism, Linear):
         if not (e.motor and e.at == at):
@@ -63,13 +58,14 @@ def torques(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gate
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
+    law = lambda e, *motion: e.force(*motion)  # noqa: E731
     for i, e in effects_of(mechanism, Force):
         k = layout.torque_ports.index(e.at)
-        total[k] = total[k] + gates[i] * e.force(position[k], speed[k], v)
+        total[k] = total[k] + gates[i] * in_each(e, law, position[k], speed[k], v)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
         drive = _drive(mechanism, e, x, v, gates)
-        total[k] = total[k] + gates[i] * e.force(z[m], position[k], speed[k], drive)
+        total[k] = total[k] + gates[i] * in_each(e, law, z[m], position[k], speed[k], drive)
     return jnp.stack(total)
 
 
@@ -77,11 +73,11 @@ def flows(mechanism: Mechanism, x: jax.Array, z: jax.Array, v: jax.Array, gates:
     """Time derivatives (m, ...) of the memories; arguments as for `torques`."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
-    rates = []
+    rates, law = [], lambda e, *motion: e.flow(*motion)
     for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
         drive = _drive(mechanism, e, x, v, gates)
-        rates.append(jnp.asarray(e.flow(z[m], position[k], speed[k], drive)))
+        rates.append(jnp.asarray(in_each(e, law, z[m], position[k], speed[k], drive)))
     return jnp.stack(rates)
 
 
@@ -94,6 +90,7 @@ def remember(
     law = lambda s: flows(mechanism, x, s, v, gates)  # noqa: E731
     # Each flow depends on its own state only, so one direction tells all slopes.
     rate, slope = jax.jvp(law, (z,), (jnp.ones_like(z),))
+    h = beside(h[None], z)
     a = slope * h
     small = jnp.abs(a) < 1e-6
     phi = jnp.where(small, 1 + a / 2, jnp.expm1(a) / jnp.where(small, 1.0, a))

@@ -1,0 +1,203 @@
+"""Levenberg-Marquardt of a fit: runs with their normal equations are compiled, the steps between are not."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+from rotflex_jax.fit.marquardt import BOUND
+from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations, whole_state
+from rotflex_jax.fit.residuals import Coordinates, Data
+from rotflex_jax.mechanism import Solver
+from rotflex_jax.mechanism.absent import Numbers, Samples
+from rotflex_jax.mechanism.tangents import Ways, outputs_with_slopes
+
+# A step that would lower the negative log-likelihood by less than this is not taken [nat]. A relative
+# tolerance would stop a long recording many nats short of the optimum.
+NATS = 1e-3
+# Nor does it go on where that many steps lowered it by less than that: along a bend, or towards a bound.
+FEW, LITTLE = 8, 0.1
+# Damping from which a step is held short.
+SHORT = 1e-3
+# Where no step lowers the cost, however short.
+STUCK = 1e10
+UNSOLVED = "stopped: a step has no finite solution; the model diverges near these numbers"
+
+
+@dataclasses.dataclass(frozen=True)
+class Moved:
+    """Which of the coordinates a fit moves; hashable, so it can be static.
+
+    Attributes:
+        coordinates: All of them.
+        solver: Integration rule.
+        free: Places of the free parameters.
+        states: Whether first states are moved.
+    """
+
+    coordinates: Coordinates
+    solver: Solver
+    free: tuple[int, ...]
+    states: bool
+
+    @functools.cached_property
+    def columns(self) -> np.ndarray:
+        """Places in the flat vector of the directions of each recording (R, D)."""
+        c = self.coordinates
+        owned = lambda r, i: c.local_index(r, i) if i in c.local else i  # noqa: E731
+        rows = [
+            [owned(c.owners[r], i) for i in self.free] + (c.state_index(r).tolist() if self.states else [])
+            for r in range(c.recordings)
+        ]
+        return np.array(rows)
+
+    @functools.cached_property
+    def index(self) -> np.ndarray:
+        """Places in the flat vector of what is moved (M,): common parameters, local ones, states."""
+        return np.unique(self.columns)
+
+    @functools.cached_property
+    def places(self) -> np.ndarray:
+        """Places of the directions of each recording among the moved (R, D)."""
+        return np.searchsorted(self.index, self.columns)
+
+    @functools.cached_property
+    def bounds(self) -> np.ndarray:
+        """Most that a step moves each (M,): a parameter with a bound by a factor of e, others freely."""
+        specs = self.coordinates.structure.parameter_specifications
+        most = np.full(len(self.index), np.inf)
+        for column, i in enumerate(self.free):
+            if np.isfinite(specs[i].lower) or np.isfinite(specs[i].upper):
+                most[self.places[:, column]] = BOUND
+        return most
+
+    def each(self, flat: jax.Array, gates: jax.Array, K: jax.Array) -> tuple[Numbers, Ways]:
+        """Numbers and directions of each recording, along a leading axis."""
+        structure, c = self.coordinates.structure, self.coordinates
+        (values, x0), (slopes, _) = jax.jvp(c.split, (flat,), (jnp.ones_like(flat),))
+        start = jax.vmap(functools.partial(whole_state, structure))(x0)
+        moved = c.states if self.states else 0
+        ways = jax.vmap(lambda s: moved_by(structure, s, jnp.array(self.free), moved))(slopes)
+        return Numbers(values, jnp.broadcast_to(gates, (len(values), *gates.shape)), start, K), ways
+
+
+class Given(NamedTuple):
+    """What a descent holds: gates (E,), recordings, gains (R, n, C), size of each channel's error (C,)."""
+
+    gates: Any
+    data: Data
+    K: Any
+    scale: Any
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
+    """Sums of each recording, along a leading axis."""
+
+    def one(r: Any) -> Sums:
+        numbers, ways, samples = r
+        structure = moved.coordinates.structure
+        return normal_equations(structure, moved.solver, numbers, ways, Samples(*samples), given.scale)
+
+    return jax.lax.map(one, (*moved.each(flat, given.gates, given.K), tuple(given.data)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def residuals_and_slopes(moved: Moved, flat: jax.Array, given: Given) -> tuple[jax.Array, jax.Array]:
+    """Scaled errors (R, N, C) and their slopes by the moved coordinates (R, N, C, M)."""
+
+    def one(r: Any) -> tuple[jax.Array, jax.Array]:
+        numbers, ways, samples, places = r
+        structure = moved.coordinates.structure
+        y_hat, J = outputs_with_slopes(structure, moved.solver, numbers, ways, Samples(*samples))
+        seen = samples[2][:, None] > 0
+        e = jnp.where(seen, (samples[1] - y_hat) / given.scale[None], 0.0)
+        J = jnp.where(seen[..., None], -J / given.scale[None, :, None], 0.0)
+        return e, jnp.zeros((*e.shape, len(moved.index)), e.dtype).at[:, :, places].set(J)
+
+    arguments = (*moved.each(flat, given.gates, given.K), tuple(given.data), jnp.asarray(moved.places))
+    return jax.lax.map(one, arguments)
+
+
+class Reached(NamedTuple):
+    """Where a descent ended: flat vector, half the squared error of each channel, steps, and how."""
+
+    flat: np.ndarray
+    cost: np.ndarray
+    steps: int
+    status: str
+
+
+def descend(
+    moved: Moved, flat: np.ndarray, given: Given, max_steps: int, say: Callable[[str], None]
+) -> Reached:
+    """The least squared error near a place, in float64."""
+    M = len(moved.index)
+
+    def run(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        found = jax.device_get(sums(moved, flat, given))
+        g, H = np.zeros(M), np.zeros((M, M))
+        np.add.at(g, moved.places, found.g)
+        np.add.at(H, (moved.places[:, :, None], moved.places[:, None, :]), found.H)
+        return found.cost.sum(axis=0), g, H
+
+    cost, g, H = run(flat)
+    if not np.isfinite(cost).all():
+        return Reached(flat, cost, 0, "diverged: the model error at the start is not finite")
+    damping, used, before = SHORT, 0, float("inf")
+    while used < max_steps:
+        step = _step(g, H, damping, moved.bounds)
+        if step is None:
+            return Reached(flat, cost, used, UNSOLVED)
+        expected = -(g @ step + step @ H @ step / 2)
+        if expected < NATS and damping <= SHORT:
+            return Reached(flat, cost, used, "converged")
+        there = flat.copy()
+        there[moved.index] += step
+        trial = run(there)
+        used += 1
+        gain = float(cost.sum() - trial[0].sum())
+        if gain > 0:
+            flat, (cost, g, H) = there, trial
+            damping = max(damping / 10, 1e-12)
+        else:  # also where it is not a number
+            damping *= 8
+        say(f"fit: {used} steps, cost {cost.sum():.1f}")
+        slow = False
+        if used % FEW == 0:
+            before, slow = cost.sum(), before - cost.sum() < LITTLE
+        # A step that was held short says nothing of what is left to gain.
+        if slow or (0 < gain < NATS and damping <= SHORT) or damping > STUCK:
+            return Reached(flat, cost, used, "converged")
+    return Reached(flat, cost, used, f"stopped after {max_steps} steps")
+
+
+def _step(g: np.ndarray, H: np.ndarray, damping: float, bounds: np.ndarray) -> np.ndarray | None:
+    """Damped Gauss-Newton step within the bounds; None where there is none.
+
+    Where an entry meets its bound, the others are the best for that.
+    """
+    if not (np.isfinite(g).all() and np.isfinite(H).all()):
+        return None
+    size = np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
+    A, b = H / np.outer(size, size) + (damping + 1e-14) * np.eye(len(H)), -g / size
+    step, free = np.zeros(len(g)), np.ones(len(g), bool)
+    while free.any():
+        within = np.ix_(free, free)
+        right = b[free] - A[free][:, ~free] @ (step * size)[~free]
+        try:
+            found = scipy.linalg.cho_solve(scipy.linalg.cho_factor(A[within]), right)
+        except np.linalg.LinAlgError:
+            found = np.linalg.pinv(A[within], rcond=1e-12, hermitian=True) @ right
+        step[free] = found / size[free]
+        over = free & (np.abs(step) > bounds)
+        if not over.any():
+            break
+        step[over] = np.sign(step[over]) * bounds[over]
+        free &= ~over
+    return step

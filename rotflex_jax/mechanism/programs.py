@@ -1,0 +1,196 @@
+"""Traced programs that outlive the process: the next one need not trace them again.
+
+JAX's own cache on disk spares the compiler, but only once a program has been traced anew, and where a
+mechanism has thirty effects that takes longer than to run it. So the traced program is kept as well, under a
+name made of all that tracing depends on: the function, structure and solver, the shapes and types of the
+arrays, the source of this package, the version and the settings of JAX. Whatever differs gives another name.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import importlib.util
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+from jax.core import Tracer
+
+_PACKAGE, _SOURCES = __name__.partition(".")[0], sorted(Path(__file__).parents[1].rglob("*.py"))
+# This process has loaded what lies there now; nothing is kept where a file changed about then or later.
+_LOADED, _ABOUT = time.time(), 10.0
+_SOURCE = hashlib.sha256(b"".join(file.read_bytes() for file in _SOURCES)).hexdigest()
+# Versions of the source whose programs stay on disk: one to work on, one installed, one to compare with.
+_VERSIONS = 3
+# Settings that a program is traced with and that a context may change.
+_SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
+# What `jax.export` writes its files with.
+_WRITES = importlib.util.find_spec("flatbuffers") is not None
+# With these JAX does more at each call than to run a program.
+_WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
+_programs: list["Program"] = []
+
+
+class Program:
+    """`jax.jit` of a pure function whose first arguments are static, kept on disk beside JAX's own cache.
+
+    Do not differentiate it or map over it: write the function that is to be traced inside of it. Where no
+    folder is set (`enable_compilation_cache`), and on other devices than a CPU, it is `jax.jit` and nothing
+    else.
+
+    Args:
+        function: Pure; a function of a module of this package that returns an array or a tuple of them.
+        static: How many of the first arguments are static.
+    """
+
+    def __init__(self, function: Callable[..., Any], static: int) -> None:
+        self.jitted = jax.jit(function, static_argnums=tuple(range(static)))
+        self._static = static
+        self._name = f"{function.__module__}.{function.__qualname__}"
+        self._held: dict[Any, Callable[..., Any]] = {}
+        _programs.append(self)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """What the function returns."""
+        known, leaves = arguments[: self._static], jax.tree.leaves(arguments[self._static :])
+        if not _keeps() or any(isinstance(leaf, Tracer) for leaf in leaves):
+            return self.jitted(*arguments)
+        tree = jax.tree.structure(arguments[self._static :])
+        kinds = tuple(jax.typeof(leaf) for leaf in leaves)
+        settings = tuple(getattr(jax.config, s) for s in _SETTINGS)
+        key = (known, tree, kinds, settings)
+        if key not in self._held:
+            texts = [written(x) for x in known]
+            lasting = all(texts) and _unchanged()
+            name = f"{self._name}{texts}{tree}{kinds}{settings}" if lasting else ""
+            self._held[key] = self._made(known, tree, leaves, name)
+        return self._held[key](*leaves)
+
+    def __len__(self) -> int:
+        """How many programs the process holds: one per structure and shapes of the arguments."""
+        return len(self._held) + self.jitted._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+
+    def forget(self) -> None:
+        """Let go of the programs in memory."""
+        self._held.clear()
+
+    def _made(self, known: tuple[Any, ...], tree: Any, leaves: list[Any], name: str) -> Callable[..., Any]:
+        """The program for arguments like these as a function of their leaves; on disk if it has a name."""
+
+        def flat(*leaves: Any) -> Any:
+            return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
+
+        if not name:
+            return jax.jit(flat)
+        file = _folder() / hashlib.sha256(name.encode()).hexdigest()
+        program = _read(file)
+        if program is None:
+            program = export.export(jax.jit(flat))(*leaves)
+            _write(program.serialize(), file)
+        # Also where it has just been made: the compiler's cache is to meet the same program again.
+        return jax.jit(program.call)
+
+
+def kept(static: int) -> Callable[[Callable[..., Any]], Program]:
+    """Decorator: the function as a `Program`, its first `static` arguments static."""
+    return lambda function: Program(function, static)
+
+
+def forget() -> None:
+    """Let go of all programs in memory; those on disk stay."""
+    for program in _programs:
+        program.forget()
+
+
+def written(value: Any) -> str:
+    """A text that tells a static value from all others; empty where there is none.
+
+    There is one for what is made of numbers, names and this package's own classes. The law of an effect
+    that a user wrote may change with no sign of it, so nothing is kept of it.
+
+    >>> from rotflex_jax.mechanism import Exponential
+    >>> written(Exponential(order=4))[:48]
+    'rotflex_jax.mechanism.step.Exponential(4,1,None,'
+    """
+    parts = list(_parts(value))
+    return "" if None in parts else "".join(map(str, parts))
+
+
+def _parts(value: Any) -> Iterator[str | None]:
+    kind = type(value)
+    if value is None or kind in (str, int, float, bool):
+        yield repr(value)
+    elif kind is tuple:
+        yield "("
+        for item in value:
+            yield from _parts(item)
+            yield ","
+        yield ")"
+    elif kind is frozenset:
+        yield from _parts(tuple(sorted(value)))
+    elif not kind.__module__.startswith(f"{_PACKAGE}."):
+        yield None
+    else:
+        yield f"{kind.__module__}.{kind.__qualname__}"
+        fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+        yield from _parts(tuple(getattr(value, f.name) for f in fields))
+
+
+def _keeps() -> bool:
+    """Whether programs are kept: where JAX keeps what it compiles, on a CPU."""
+    known = jax.config.values
+    folder = known["jax_compilation_cache_dir"]
+    usual = known["jax_enable_compilation_cache"] and not any(getattr(jax.config, w) for w in _WATCHED)
+    return bool(_WRITES and usual and folder and "://" not in folder and jax.default_backend() == "cpu")
+
+
+def _folder() -> Path:
+    """Where the programs of this source lie."""
+    return Path(jax.config.values["jax_compilation_cache_dir"]) / "programs" / _surroundings()
+
+
+@functools.cache
+def _surroundings() -> str:
+    """Name for what all programs depend on."""
+    values = {n: v for n, v in jax.config.values.items() if "cache" not in n and n not in _SETTINGS}
+    return hashlib.sha256(f"{_SOURCE}{jax.__version__}{sorted(values.items())}".encode()).hexdigest()[:32]
+
+
+def _unchanged() -> bool:
+    """Whether the source on disk is what this process has loaded."""
+    return all(file.exists() and file.stat().st_mtime < _LOADED - _ABOUT for file in _SOURCES)
+
+
+def _read(file: Path) -> export.Exported | None:
+    """The program in a file; None where there is none, or none that can be used."""
+    try:
+        return export.deserialize(bytearray(file.read_bytes()))
+    except Exception:  # absent or torn: it is traced anew
+        return None
+
+
+def _write(data: bytearray, file: Path) -> None:
+    """Keep a program; where that cannot be done, the next process traces it again."""
+    try:
+        if not file.parent.exists():
+            _clear(file.parent.parent)
+            file.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=file.parent)
+        with os.fdopen(handle, "wb") as out:
+            out.write(data)
+        os.replace(name, file)  # whole or not at all, however many processes write it
+    except OSError:
+        return
+
+
+def _clear(folder: Path) -> None:
+    """Make room for one more version of the source."""
+    found = sorted(folder.glob("*/"), key=lambda f: f.stat().st_mtime, reverse=True)
+    for old in found[_VERSIONS - 1 :]:
+        shutil.rmtree(old, ignore_errors=True)

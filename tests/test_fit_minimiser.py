@@ -1,0 +1,32 @@
+"""The toolkit's own Levenberg-Marquardt beside the solvers of optimistix."""
+
+import optimistix as optx
+import pytest
+
+import rotflex_jax as rf
+from arena.records import make_record
+
+
+@pytest.fixture(scope="module")
+def recording():
+    r = make_record([("coulomb", "hub")], seed=31, seconds=2.0, fs=250.0)
+    return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], accept=("units",))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return rf.joints.paper() + rf.effects.Coulomb(at="hub", level=0.01)
+
+
+@pytest.fixture(scope="module")
+def own(model, recording):
+    return rf.fit(model, recording)
+
+
+@pytest.mark.parametrize("kind", [optx.LevenbergMarquardt, optx.Dogleg])
+def test_solvers_of_optimistix_end_where_the_own_one_does(kind, model, recording, own):
+    found = rf.fit(model, recording, minimiser=kind(rtol=1e-7, atol=1e-7))
+    assert found.status == own.status == "converged"
+    assert found.cost == pytest.approx(own.cost, rel=1e-6)
+    for name in own.free_names:  # the own one stops at 1e-3 nats, which are 0.045 standard deviations
+        assert abs(found[name].value - own[name].value) < 0.05 * own[name].std, name
