@@ -7,17 +7,23 @@ carry the outputs, so that figures show where the project is read on the web.
     python notebooks/build.py 00_first_look   # only this one
     python notebooks/build.py --text          # take over text that changed, where no code did
     python notebooks/build.py --check         # exit status 1 where a notebook is missing or stale
+    python notebooks/build.py --run           # run, two at a time, and write nothing; 1 where one fails
 """
 
 import argparse
+import re
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jupytext
 import nbformat
 from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
 
 FOLDER = Path(__file__).resolve().parent
+LOGGED = re.compile(r"[EWI]\d{4} [\d:.]+ +\d+ \w+\.cc:")
 
 
 def scripts(names: list[str]) -> list[Path]:
@@ -35,8 +41,8 @@ def cells(notebook: nbformat.NotebookNode) -> list[tuple[str, str]]:
     return [(cell.cell_type, cell.source.strip()) for cell in notebook.cells if cell.source.strip()]
 
 
-def build(script: Path, timeout: float) -> None:
-    """Run one script as a notebook and write it with its outputs."""
+def executed(script: Path, timeout: float) -> nbformat.NotebookNode:
+    """One script as a notebook, run from its first cell to its last in a process of its own."""
     notebook = jupytext.read(script)
     notebook.metadata["kernelspec"] = {
         "display_name": "Python 3",
@@ -50,10 +56,29 @@ def build(script: Path, timeout: float) -> None:
         coalesce_streams=True,
         resources={"metadata": {"path": str(FOLDER)}},
     ).execute()
+    return notebook
+
+
+def trial(script: Path, timeout: float) -> str:
+    """Run one script and write nothing; says what went wrong, if anything did."""
+    began = time.perf_counter()
+    try:
+        executed(script, timeout)
+    except (CellExecutionError, TimeoutError) as error:
+        return f"{script.stem}: {error}"
+    print(f"{script.stem}: ok ({time.perf_counter() - began:.0f} s)", flush=True)
+    return ""
+
+
+def build(script: Path, timeout: float) -> None:
+    """Run one script as a notebook and write it with its outputs."""
+    notebook = executed(script, timeout)
     for number, cell in enumerate(notebook.cells):
         # Fixed names and no times: a rebuilt notebook differs only where its content does.
         cell["id"] = f"cell-{number}"
         cell.metadata.pop("execution", None)
+        if cell.cell_type == "code":  # what the compiler logs is not said by the notebook
+            cell.outputs = [o for o in cell.outputs if not LOGGED.match(o.get("text", ""))]
     notebook.metadata.pop("jupytext", None)
     nbformat.write(notebook, script.with_suffix(".ipynb"))
 
@@ -100,10 +125,16 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="scripts without .py; all unless given")
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
     parser.add_argument("--text", action="store_true", help="run nothing, take over text")
+    parser.add_argument("--run", action="store_true", help="run, write nothing")
     parser.add_argument("--timeout", type=float, default=600.0, help="limit per cell [s]")
     arguments = parser.parse_args()
+    chosen = scripts(arguments.names)
+    if arguments.run:
+        with ThreadPoolExecutor(2) as pool:  # each thread waits for a process
+            told = list(pool.map(lambda script: trial(script, arguments.timeout), chosen))
+        sys.exit("\n\n".join(filter(None, told)) or 0)
     stale = False
-    for script in scripts(arguments.names):
+    for script in chosen:
         if arguments.text:
             print(f"{script.stem}: {retext(script) or 'ok'}")
             continue

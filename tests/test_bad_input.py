@@ -72,7 +72,11 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "no alpha": (text(alpha=None), {}, r"no column 'alpha'; it has t, voltage, theta: .*outputs="),
     "no voltage": (text(voltage=None), {}, r"no column 'voltage'; it has .* with input="),
     "no time": (text(t=None), {}, r"no column 't'.* or give the sampling period with Ts="),
-    "one line": (b"t,voltage\n0,1\n", {}, "no column 'theta'; it has t, voltage: name"),
+    "one line": (
+        b"t,voltage\n0,1\n",
+        {},
+        "no columns 'theta', 'alpha'; it has t, voltage: name the right ones",
+    ),
     "no such column": (text(), {"input": "u"}, r"no column 'u'; it has t, voltage, theta, alpha"),
     "no such time": (text(), {"time": "clock"}, "no column 'clock'"),
     "column twice": (
@@ -255,7 +259,7 @@ FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "matrix": (
         "run.npz",
         lambda path: np.savez(path, theta=np.ones((N, 2)), voltage=GOOD["voltage"]),
-        r"no column 'theta'; it has theta\[0\], theta\[1\], voltage",
+        r"no columns 'theta', .*; it has theta\[0\], theta\[1\], voltage",
     ),
 }
 

@@ -223,7 +223,8 @@ def test_discovered_chooses_within_the_training_data(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.slow
 def test_discovered_finds_what_the_grey_box_lacks() -> None:
-    table = rf.compare(recorded(8.0), ["grey_box", "discovered"])
+    # 70 % of it, which the search gets, are 3500 samples as in other tests: they share what is compiled.
+    table = rf.compare(recorded(10.0), ["grey_box", "discovered"])
     assert table.best is table["discovered"]
     assert "at hub" in table["discovered"].note
     for channel, noise in table.noise_floor.items():

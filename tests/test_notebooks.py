@@ -51,3 +51,13 @@ def test_text_is_taken_over_without_a_run_and_code_is_not(build, tmp_path: Path)
     assert build.retext(script) == "" and build.faults(script) == []
     script.write_text(source.replace("blocks = 0.1, 8", "blocks = 0.1, 9"), encoding="utf-8")
     assert build.retext(script) == "has other code"
+
+
+def test_a_claim_that_does_not_hold_is_told(build, tmp_path: Path, capsys) -> None:
+    good, bad = tmp_path / "00_good.py", tmp_path / "01_bad.py"
+    good.write_text("# %%\nassert 1 + 1 == 2\n", encoding="utf-8")
+    bad.write_text("# %%\nx = 2\n\n# %%\nassert 1 + 1 == x + 1\n", encoding="utf-8")
+    assert build.trial(good, timeout=60.0) == "" and "00_good: ok" in capsys.readouterr().out
+    told = build.trial(bad, timeout=60.0)
+    assert told.startswith("01_bad: ") and "AssertionError" in told
+    assert sorted(tmp_path.iterdir()) == [good, bad]

@@ -91,11 +91,25 @@ def test_a_mark_that_leads_nowhere_says_so(source: str) -> None:
         quoted.quoted(source)
 
 
-# Pages whose tables stand in the text as a benchmark printed them, and the files that hold their numbers.
+# Pages whose tables stand in the text as a benchmark printed them, and the files that hold their numbers. The
+# decimal numbers between the tables must be there too, or be known settings and readings.
 TABLES = {
     "compare.md": sorted(f"B5/{file.name}" for file in (claims.RESULTS / "B5").glob("*.json")),
     "measured_joint.md": ["B1.json"],
     "next_experiment.md": ["B4.json"],
+    "public_recordings.md": ["B3.json"],
+    "seed_paper.md": ["B2.json"],
+}
+KNOWN = {
+    "measured_joint.md": {"-27.60": "reading of the sensor at rest [deg]"},
+    "public_recordings.md": {"-3.16": "published [N]", "2405.10779": "name of a preprint"},
+    "seed_paper.md": {
+        "-34.8": "a pole of the paper's joint, in tests/paper_numbers.json",
+        "-8.99": "the other two, in tests/paper_numbers.json",
+        "0.0531": "printed by `rotflex reproduce`",
+        "0.126": "printed by `rotflex reproduce --data rotflex`",
+        "0.413": "printed by `rotflex reproduce --data rotflex`",
+    },
 }
 
 
@@ -114,10 +128,9 @@ def leaves(found: Any) -> Iterator[float]:
 
 
 def untraced(text: str, values: list[float]) -> list[str]:
-    """Decimal numbers in tables that no value gives in its own unit, degrees, thousandths or %."""
-    rows = [line for line in text.splitlines() if line.startswith("|")]
+    """Decimal numbers that no value gives in its own unit, degrees, thousandths or %."""
     loose = []
-    for number in re.findall(r"(?<![\w.])[-−+]?\d+\.\d+(?![\w.])", "\n".join(rows)):
+    for number in re.findall(r"(?<![\w.])[-−+]?\d+\.\d+(?![\w.])", text):
         digits, value = len(number.partition(".")[2]), float(number.replace("−", "-"))
         scaled = (scale * v for v in values for scale in (1, -1, 1.96, 180 / math.pi, 100, 1e3))
         if not any(abs(round(x, digits) - value) < 1e-9 for x in scaled):
@@ -126,9 +139,9 @@ def untraced(text: str, values: list[float]) -> list[str]:
 
 
 @pytest.mark.parametrize("page", TABLES)
-def test_tables_of_results_hold_what_the_results_hold(page: str) -> None:
+def test_pages_of_results_hold_what_the_results_hold(page: str) -> None:
     values = [v for file in TABLES[page] for v in leaves(claims.results(file))]
-    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    assert untraced(text, values) == []
+    text = prose((ROOT / "docs" / page).read_text(encoding="utf-8"))
+    assert [n for n in untraced(text, values) if n not in KNOWN.get(page, ())] == []
     # A number that is nowhere is noticed.
     assert untraced("| error | 0.123456 |", values) == ["0.123456"]

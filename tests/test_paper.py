@@ -73,4 +73,4 @@ def test_the_text_can_be_set(monkeypatch) -> None:
     assert "Figure 1" in typst and "autoref" not in typst and "<!--" not in typst
     assert typst.count("#figure(") == 3
     # Every reference was resolved.
-    assert "@ljung2019" not in typst and "Schoukens" in typst
+    assert "@schoukens2019" not in typst and "Schoukens" in typst

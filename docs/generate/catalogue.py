@@ -47,9 +47,8 @@ def shown() -> list[type[Effect]]:
 
 
 def pages() -> dict[str, str]:
-    """File name -> text: an overview, and for each effect a page and a figure."""
-    assert set(KINDS) == set(KIND_LABELS.values()), "a kind of effect lacks its line in KINDS"
-    written = {"index.md": _overview()}
+    """File name -> text: for each effect a page and a figure."""
+    written = {}
     for cls in shown():
         written[f"{cls.name}.rst"] = _page(cls)
         picture = io.StringIO()
@@ -58,29 +57,35 @@ def pages() -> dict[str, str]:
     return written
 
 
-def _overview() -> str:
+def overview(on_site: bool = False) -> str:
+    """The list of all effects, `docs/catalogue.md`; its links lead to the code, on the site to the pages."""
+    assert set(KINDS) == set(KIND_LABELS.values()), "a kind of effect lacks its line in KINDS"
     lines = [
-        "# Effects",
+        "# Catalogue of effects",
         "",
-        "Every effect that a model can have, from the list that the search reads: equation, parameters,",
-        "bounds, where it is looked for, and a picture of its law. `rotflex effects` prints the same on a",
-        "terminal, and [an effect of your own](../add_effect.md) takes part in everything from the moment it",
-        "is registered.",
+        "Every effect that a model can have, from the list that the search reads. `rotflex effects` prints",
+        "it on a terminal with all parameters" + ("." if on_site else "; the documentation site"),
+        *([] if on_site else ["([how to build it](../CONTRIBUTING.md)) has a page with a drawing for each."]),
+        "[An effect of your own](add_effect.md) takes part in everything from the moment it is registered.",
         "",
         "A law gives the torque *on* its port in the port's positive direction; only the level of dry",
         "friction is a positive number that opposes motion. The places are those of the flexible joint; on",
-        "[another machine](../own_machine.md) they are read by what acts there.",
+        "[another machine](own_machine.md) they are read by what acts there.",
         "",
     ]
     for kind, meaning in KINDS.items():
-        lines += [f"## {kind.capitalize()}", "", meaning, "", "| effect | what it is | searched at |"]
-        lines += ["|---|---|---|"]
+        lines += [f"## {kind.capitalize()}", "", meaning, ""]
+        lines += ["| effect | what it is | law | searched at |", "|---|---|---|---|"]
         for cls in (c for c in shown() if c.kind() == kind):
             where = ", ".join(f"`{place}`" for place in cls.searched) or "no"
-            lines.append(f"| [`{cls.name}`]({cls.name}.rst) | {cls.title} | {where} |")
+            file = f"../{cls.__module__.replace('.', '/')}.py"
+            link = f"effects/{cls.name}.rst" if on_site else file
+            law = cls.equation.replace("|", r"\|")
+            lines.append(f"| [`{cls.name}`]({link}) | {cls.title} | `{law}` | {where} |")
         lines.append("")
-    entries = [cls.name for cls in shown()]
-    return "\n".join([*lines, "```{toctree}", ":hidden:", "", *entries, "```", ""])
+    if on_site:
+        lines += ["```{toctree}", ":hidden:", "", *(f"effects/{cls.name}" for cls in shown()), "```", ""]
+    return "\n".join(lines)
 
 
 def _page(cls: type[Effect]) -> str:

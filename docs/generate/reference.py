@@ -134,7 +134,7 @@ def _index(written: dict[str, str]) -> str:
             "Every public name, from its docstring. In a program, `import rotflex_jax as rf` gives the first",
             "page and the packages `rf.data`, `rf.effects`, `rf.joints`, `rf.metrics`, `rf.basis`,",
             "`rf.adaptive`, `rf.kernels` and `rf.export`. The effects themselves are in the",
-            "[catalogue](../effects/index.md).",
+            "[catalogue](../catalogue.md).",
             "",
             "```{toctree}",
             ":maxdepth: 1",
