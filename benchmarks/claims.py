@@ -100,14 +100,20 @@ def joint_theta_fall() -> str:
 # -- the arena ----------------------------------------------------------------------------------------------
 
 
-def records(*, outside: bool = False, hidden: bool = True) -> list[dict[str, Any]]:
-    """Records of the arena: of one effect that the search knows, of others, or of nothing it could find."""
+def records(
+    *, outside: bool = False, hidden: bool = True, effects: int = 1, size: float = 1.0
+) -> list[dict[str, Any]]:
+    """Records of the arena: of effects that the search knows, of others, or of nothing it could find.
+
+    Of known effects so many at once, of that share of the usual size, seen by both sensors.
+    """
     ran = [r for r in results("B0.json")["records"].values() if "error" not in r]
     if outside:
         return [r for r in ran if r["outside"]]
     if not hidden:
         return [r for r in ran if not r["outside"] and not r["wanted"]]
-    return [r for r in ran if not r["outside"] and len(r["wanted"]) == 1 and r.get("size", 1.0) == 1.0]
+    found = [r for r in ran if not r["outside"] and len(r["wanted"]) == effects and len(r["channels"]) == 2]
+    return [r for r in found if len(r["effects"]) == effects and r.get("size", 1.0) == size]
 
 
 @named
@@ -120,6 +126,36 @@ def arena_hidden() -> str:
 def arena_first() -> str:
     """How many of them named it first."""
     return str(sum(bool(r["first"]) for r in records()))
+
+
+@named
+def arena_small() -> str:
+    """Records with one effect of a fifth of its usual size."""
+    return str(len(records(size=0.2)))
+
+
+@named
+def arena_small_first() -> str:
+    """How many of them named it first."""
+    return str(sum(bool(r["first"]) for r in records(size=0.2)))
+
+
+@named
+def arena_pairs() -> str:
+    """Records with two effects to be found."""
+    return str(len(records(effects=2)))
+
+
+@named
+def arena_pairs_both() -> str:
+    """In how many of them both are found or in a set that was reported."""
+    return str(sum(r["hits"] == 2 for r in records(effects=2)))
+
+
+@named
+def arena_pairs_one() -> str:
+    """In how many of them at least one is."""
+    return str(sum(r["hits"] >= 1 for r in records(effects=2)))
 
 
 @named

@@ -18,7 +18,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, linearise, simulate, simulate_states
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.mechanism.simulate import _free_run
+from rotflex_jax.mechanism.simulate import _free_outputs
 from rotflex_jax.mechanism.torques import remember
 from rotflex_jax.precision import double_precision
 
@@ -363,18 +363,17 @@ NEW += [fx.Delay(time=0.0051), fx.Lag(time=0.006), fx.SensorCubic("alpha", 6.0),
 def test_off_it_is_absent_and_other_numbers_need_no_new_program(effect):
     joint, u = paper() + effect, voltage()
     bare, on = simulate(paper(), u, Ts), simulate(joint, u, Ts)
-    programs = _free_run._cache_size()
+    programs = _free_outputs._cache_size()
     moved = {n: v * 1.07 + 1e-4 for n, v in zip(joint.parameter_names, joint.values, strict=True)}
     other = simulate(joint.with_values(moved), 0.5 * u, 1.3 * Ts, x0=np.array([0.1, 0.01, 0.0, 0.0]))
     assert np.abs(on - bare).max() > 1e-4 and np.isfinite(other).all()
+    numbers = (rest_state(joint.structure, u.dtype), u, np.asarray(Ts, u.dtype))
+    gates = np.ones((2, len(joint.effects)))
+    gates[:, -1] = 0.0, 0.5
     with double_precision():
-        gates, start = jnp.ones(len(joint.effects)), jnp.asarray(rest_state(joint.structure, u.dtype))
-        run = functools.partial(_free_run, joint.structure, Exponential(), jnp.asarray(joint.values))
-        off, half = (
-            np.asarray(run(gates.at[-1].set(gate), start, jnp.asarray(u), jnp.asarray(Ts, u.dtype))[1])
-            for gate in (0.0, 0.5)
-        )
-    assert _free_run._cache_size() == programs
+        run = functools.partial(_free_outputs, joint.structure, Exponential(), joint.values)
+        off, half = (np.asarray(run(each, *numbers)) for each in gates)
+    assert _free_outputs._cache_size() == programs
     np.testing.assert_allclose(off, bare, rtol=0, atol=1e-13)
     assert np.abs(half - bare).max() > 1e-5
 

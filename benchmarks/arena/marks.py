@@ -48,11 +48,9 @@ def good(records: list[Row]) -> list[Row]:
 
 def group(row: Row) -> str:
     """Which part of the benchmark a record belongs to."""
+    count = ["nothing hidden", "one effect", "two effects", "three effects"][len(row["effects"])]
     if row.get("outside"):
-        return "effect without a name"
-    if not row["effects"]:
-        return "nothing hidden"
-    count = {1: "one effect", 2: "two effects", 3: "three effects"}[len(row["effects"])]
+        count = "effect without a name"
     size, channels = row.get("size", 1.0), row.get("channels", ["theta", "alpha"])
     return ", ".join(
         [count, *([f"size {size:g}"] if size != 1 else []), *([f"{channels[0]} only"] * (len(channels) == 1))]

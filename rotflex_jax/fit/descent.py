@@ -134,9 +134,14 @@ class Reached(NamedTuple):
 
 
 def descend(
-    moved: Moved, flat: np.ndarray, given: Given, max_steps: int, say: Callable[[str], None]
+    moved: Moved,
+    flat: np.ndarray,
+    given: Given,
+    max_steps: int,
+    say: Callable[[str], None],
+    enough: float = NATS,
 ) -> Reached:
-    """The least squared error near a place, in float64."""
+    """The least squared error near a place, in float64, as far as steps gain `enough` [nat]."""
     M = len(moved.index)
 
     def run(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -155,7 +160,7 @@ def descend(
         if step is None:
             return Reached(flat, cost, used, UNSOLVED)
         expected = -(g @ step + step @ H @ step / 2)
-        if expected < NATS and damping <= SHORT:
+        if expected < enough and damping <= SHORT:
             return Reached(flat, cost, used, "converged")
         there = flat.copy()
         there[moved.index] += step
@@ -172,7 +177,7 @@ def descend(
         if used % FEW == 0:
             before, slow = cost.sum(), before - cost.sum() < LITTLE
         # A step that was held short says nothing of what is left to gain.
-        if slow or (0 < gain < NATS and damping <= SHORT) or damping > STUCK:
+        if slow or (0 < gain < enough and damping <= SHORT) or damping > STUCK:
             return Reached(flat, cost, used, "converged")
     return Reached(flat, cost, used, f"stopped after {max_steps} steps")
 

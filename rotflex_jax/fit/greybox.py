@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.descent import Given, Moved, descend, residuals_and_slopes
+from rotflex_jax.fit.descent import NATS, Given, Moved, descend, residuals_and_slopes
 from rotflex_jax.fit.estimates import report
 from rotflex_jax.fit.fitted import Fit
 from rotflex_jax.fit.residuals import Coordinates, Data, first_states, sensor_noise, stack
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from rotflex_jax.fit.compressed import Minimiser
 
 Progress = Callable[[str], None]
+
+# A stage that only leads to the next one ends where steps gain less than this [nat].
+NEAR = 1.0
 
 
 def fit(
@@ -115,7 +118,9 @@ def fit(
                 K = np.stack([kalman_gains(now, [stage or {}], noise, float(Ts))[0] for Ts in data.Ts])
                 given = Given(*jax.tree.map(jnp.asarray, (gates, data, K, scale)))
                 if minimiser is None:
-                    flat, squares, used, status = descend(moved, flat, given, max_steps, say)
+                    flat, squares, used, status = descend(
+                        moved, flat, given, max_steps, say, NATS if last else NEAR
+                    )
                 else:
                     from rotflex_jax.fit.compressed import minimise  # takes long to import
 
