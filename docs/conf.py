@@ -60,6 +60,6 @@ copybutton_exclude = ".linenos, .gp, .go"
 # Types of other packages, and of annotations that are no names: there is nothing here to link to.
 nitpick_ignore_regex = [
     ("py:.*", r"(numpy|jax|jaxlib|jaxtyping|collections|pathlib|os|rich|matplotlib|typing|pandas)\b.*"),
-    ("py:.*", r"ndarray|Figure|dict.*|tuple.*"),
+    ("py:.*", r"ndarray|Figure|Minimiser|dict.*|tuple.*"),
     ("py:class", r"'[A-Za-z0-9 -]*'|[A-Z]( [A-Z])*"),  # sizes of arrays
 ]
