@@ -11,11 +11,12 @@ from arena.records import make_record
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.many_starts import many_starts
 from rotflex_jax.fit.marquardt import descend
-from rotflex_jax.fit.normal_equations import moved_by, normal_equations, whole_state
+from rotflex_jax.fit.normal_equations import moved_by, normal_equations
 from rotflex_jax.fit.residuals import first_states, sensor_noise
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate
 from rotflex_jax.mechanism.absent import Numbers, Samples
+from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.model import Model
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording

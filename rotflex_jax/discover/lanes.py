@@ -15,7 +15,7 @@ from rotflex_jax.discover.supermodel import Part, SuperModel
 from rotflex_jax.fit.residuals import Data, predicted
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.absent import Numbers, Samples
-from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.tangents import Ways, outputs_with_slopes
 from rotflex_jax.precision import double_precision
@@ -55,17 +55,17 @@ def _innovations(structure: Mechanism, solver: Solver, lanes: Lane, data: Data) 
 def _slopes(
     structure: Mechanism, solver: Solver, lane: Lane, along: Directions, data: Data
 ) -> tuple[jax.Array, jax.Array]:
-    m = lane.x0.shape[1]
-    rest = jnp.asarray(rest_state(structure, np.float64))[m:]
+    starts = whole_state(structure, lane.x0)
+    x0_ways = jnp.pad(along.x0, ((0, 0), (0, starts.shape[1] - lane.x0.shape[1])))
 
     def one(recording: Any) -> tuple[jax.Array, jax.Array]:
         values, x0, K, dvalues, samples = recording
-        numbers = Numbers(values, lane.gates, jnp.concatenate([x0, rest]), K)
-        ways = Ways(dvalues, along.gates, jnp.pad(along.x0, ((0, 0), (0, len(rest)))))
+        numbers = Numbers(values, lane.gates, x0, K)
+        ways = Ways(dvalues, along.gates, x0_ways)
         y_hat, J = outputs_with_slopes(structure, solver, numbers, ways, Samples(*samples))
         return y_hat, jnp.moveaxis(J, -1, 0)
 
-    each = (lane.values, lane.x0, lane.K, jnp.swapaxes(along.values, 0, 1), data)
+    each = (lane.values, starts, lane.K, jnp.swapaxes(along.values, 0, 1), data)
     y_hat, J = jax.lax.map(one, each)
     # Not a product: beyond its last sample a run may diverge.
     seen = data.seen[:, :, None] > 0

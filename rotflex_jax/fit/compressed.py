@@ -37,7 +37,7 @@ def minimise(minimiser: Minimiser, moved: Moved, flat: np.ndarray, given: Given,
     end, steps, result = _solved(minimiser, moved, start, (jnp.asarray(flat), given), max_steps)
     there = flat.copy()
     there[moved.index] = np.asarray(end)
-    cost = np.asarray(sums(moved, jnp.asarray(there), given).cost).sum(axis=0)
+    cost = np.asarray(sums(moved, jnp.asarray(there), given).cost)
     status = UNSOLVED
     if result == optx.RESULTS.successful:
         status = "converged"
@@ -67,13 +67,11 @@ def _slopes(moved: Moved, at: Any, way: Any) -> tuple[Array, Array]:
 def _compressed(moved: Moved, z: Float[Array, " M"], held: Any) -> tuple[Array, Array]:
     """`r`, and the rows of `J` that are not zero."""
     flat, given = held
-    found, places, M = sums(moved, flat.at[moved.index].set(z), given), jnp.asarray(moved.places), len(z)
-    g = jnp.zeros(M, z.dtype).at[places].add(found.g)
-    H = jnp.zeros((M, M), z.dtype).at[places[:, :, None], places[:, None, :]].add(found.H)
+    cost, g, H = sums(moved, flat.at[moved.index].set(z), given)
     # Scaled to a unit diagonal first: coordinates may differ by many orders of size.
     diagonal = jnp.diagonal(H)
     size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-    L = jnp.linalg.cholesky(H / jnp.outer(size, size) + 1e-14 * M * jnp.eye(M, dtype=z.dtype))
+    L = jnp.linalg.cholesky(H / jnp.outer(size, size) + 1e-14 * len(z) * jnp.eye(len(z), dtype=z.dtype))
     a = jax.scipy.linalg.solve_triangular(L, g / size, lower=True)
-    rest = jnp.maximum(2 * jnp.sum(found.cost) - a @ a, 0.0)
+    rest = jnp.maximum(2 * jnp.sum(cost) - a @ a, 0.0)
     return jnp.append(a, jnp.sqrt(rest)), (L * size[:, None]).T

@@ -11,10 +11,11 @@ import numpy as np
 import scipy.linalg
 
 from rotflex_jax.fit.marquardt import BOUND
-from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations, whole_state
+from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations
 from rotflex_jax.fit.residuals import Coordinates, Data
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.mechanism.absent import Numbers, Samples
+from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.tangents import Ways, outputs_with_slopes
 
 # A step that would lower the negative log-likelihood by less than this is not taken [nat]. A relative
@@ -80,10 +81,11 @@ class Moved:
         """Numbers and directions of each recording, along a leading axis."""
         structure, c = self.coordinates.structure, self.coordinates
         (values, x0), (slopes, _) = jax.jvp(c.split, (flat,), (jnp.ones_like(flat),))
-        start = jax.vmap(functools.partial(whole_state, structure))(x0)
         moved = c.states if self.states else 0
         ways = jax.vmap(lambda s: moved_by(structure, s, jnp.array(self.free), moved))(slopes)
-        return Numbers(values, jnp.broadcast_to(gates, (len(values), *gates.shape)), start, K), ways
+        return Numbers(
+            values, jnp.broadcast_to(gates, (len(values), *gates.shape)), whole_state(structure, x0), K
+        ), ways
 
 
 class Given(NamedTuple):
@@ -97,14 +99,18 @@ class Given(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=0)
 def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
-    """Sums of each recording, along a leading axis."""
+    """Sums over all recordings, by the M moved coordinates."""
 
     def one(r: Any) -> Sums:
         numbers, ways, samples = r
         structure = moved.coordinates.structure
         return normal_equations(structure, moved.solver, numbers, ways, Samples(*samples), given.scale)
 
-    return jax.lax.map(one, (*moved.each(flat, given.gates, given.K), tuple(given.data)))
+    found = jax.lax.map(one, (*moved.each(flat, given.gates, given.K), tuple(given.data)))
+    M, places = len(moved.index), jnp.asarray(moved.places)
+    g = jnp.zeros(M, flat.dtype).at[places].add(found.g)
+    H = jnp.zeros((M, M), flat.dtype).at[places[:, :, None], places[:, None, :]].add(found.H)
+    return Sums(jnp.sum(found.cost, axis=0), g, H)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -142,15 +148,7 @@ def descend(
     enough: float = NATS,
 ) -> Reached:
     """The least squared error near a place, in float64, as far as steps gain `enough` [nat]."""
-    M = len(moved.index)
-
-    def run(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        found = jax.device_get(sums(moved, flat, given))
-        g, H = np.zeros(M), np.zeros((M, M))
-        np.add.at(g, moved.places, found.g)
-        np.add.at(H, (moved.places[:, :, None], moved.places[:, None, :]), found.H)
-        return found.cost.sum(axis=0), g, H
-
+    run = lambda flat: jax.device_get(sums(moved, flat, given))  # noqa: E731
     cost, g, H = run(flat)
     if not np.isfinite(cost).all():
         return Reached(flat, cost, 0, "diverged: the model error at the start is not finite")
@@ -166,7 +164,7 @@ def descend(
         there[moved.index] += step
         trial = run(there)
         used += 1
-        gain = float(cost.sum() - trial[0].sum())
+        gain = float(cost.sum() - trial.cost.sum())
         if gain > 0:
             flat, (cost, g, H) = there, trial
             damping = max(damping / 10, 1e-12)

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations, whole_state
+from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations
 from rotflex_jax.fit.residuals import Data
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.absent import Numbers, Samples
+from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.parameters import Transform
 
 BOUND = 1.0

@@ -65,12 +65,6 @@ def normal_equations(
     return fold_outputs(structure, solver, numbers, ways, samples, fold, none)[0]
 
 
-def whole_state(structure: Mechanism, x0: Float[Array, " m"]) -> Float[Array, " n"]:
-    """First state from positions and speeds; what follows these is at rest."""
-    rest = jnp.asarray(rest_state(structure, np.float64), x0.dtype)
-    return jnp.concatenate([x0, rest[len(x0) :]])
-
-
 def moved_by(structure: Mechanism, slopes: Float[Array, " P"], free: Float[Array, " K"], states: int) -> Ways:
     """Directions of the coordinates of some parameters, then of that many positions and speeds.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
-from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.initial import rough_state
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Transform
@@ -146,11 +146,9 @@ def predicted(
         data: The recordings.
         K: Gains (R, n, C).
     """
-    rest = jnp.asarray(rest_state(structure, np.float64))[x0.shape[1] :]
-    start = jnp.concatenate([x0, jnp.broadcast_to(rest, (len(x0), len(rest)))], axis=1)
     run = functools.partial(predictor_run, structure, solver)
     return each_recording(run, in_axes=(0, None, 0, 0, 0, 0, 0, 0))(
-        values, gates, start, data.u, data.y, data.seen, K, data.Ts
+        values, gates, whole_state(structure, x0), data.u, data.y, data.seen, K, data.Ts
     )[1]
 
 

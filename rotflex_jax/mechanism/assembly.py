@@ -229,3 +229,9 @@ def rest_state(structure: Mechanism, dtype: DTypeLike) -> np.ndarray:
     layout = Layout.of(structure)
     memory = [e.initial() for _, e in effects_of(structure, Memory)]
     return np.array([0.0] * layout.linear + memory, dtype=dtype)
+
+
+def whole_state(structure: Mechanism, x0: jax.Array) -> jax.Array:
+    """States (..., n) from their first entries (..., m), such as positions and speeds; the rest at rest."""
+    rest = jnp.asarray(rest_state(structure, np.float64), x0.dtype)[x0.shape[-1] :]
+    return jnp.concatenate([x0, jnp.broadcast_to(rest, (*x0.shape[:-1], len(rest)))], axis=-1)
