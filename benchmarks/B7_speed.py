@@ -23,7 +23,7 @@ from typing import Any
 import rotflex_jax
 
 HERE = Path(__file__).resolve().parent / "results"
-SUBSETS = ("lms", "rls", "pairs", "motion", "fit", "joint", "starts", "cold", "growth")
+SUBSETS = ("lms", "rls", "pairs", "motion", "fit", "joint", "starts", "cold", "search", "growth")
 
 
 def main() -> None:
@@ -147,6 +147,12 @@ def _cold(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     return {"facts": cold(_seconds(chosen))}
 
 
+def _search(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed.search import searches
+
+    return {"facts": searches(6.0 if chosen.quick else 20.0)}
+
+
 def _growth(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     from speed.growth import WORK, grown
 
@@ -171,6 +177,7 @@ SUBSET: dict[str, Callable[[argparse.Namespace, Any], dict[str, Any]]] = {
     "joint": _joint,
     "starts": _starts,
     "cold": _cold,
+    "search": _search,
     "growth": _growth,
 }
 

@@ -3,13 +3,13 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rotflex_jax.effects.kinds import Effect
+from rotflex_jax.effects.kinds import Actuation, Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import (
     Exponential,
@@ -19,7 +19,7 @@ from rotflex_jax.mechanism import (
     kalman_gains,
     predictor_run,
 )
-from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.assembly import driven_voltage, effects_of, rest_state
 from rotflex_jax.mechanism.initial import initial_states
 from rotflex_jax.mechanism.movable import check_movable
 from rotflex_jax.mechanism.programs import Program, kept
@@ -34,6 +34,11 @@ def _free_many(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, AN
     return jax.vmap(free_run, in_axes=(None, None, None, None, 0, 0, None))(
         structure, solver, values, gates, x0, u, Ts
     )
+
+
+@kept(static=1)
+def _driven(structure: Mechanism, values: jax.Array, gates: jax.Array, u: jax.Array, Ts: jax.Array) -> Any:
+    return driven_voltage(structure.with_values(values), gates, u, Ts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +94,18 @@ class Model:
 
     def _switches(self) -> np.ndarray:
         return np.ones(len(self.mechanism.effects)) if self.gates is None else np.array(self.gates)
+
+    def _behind_actuation(self, recording: Recording) -> tuple[np.ndarray, "Model"]:
+        """The voltage (N,) [V] that reaches the motor, and the model with nothing left between."""
+        u, acting = recording.u.astype(float), effects_of(self.mechanism, Actuation)
+        if not acting:
+            return u, self
+        gates = self._switches()
+        with double_precision():
+            numbers = map(jnp.asarray, (self.mechanism.values, gates, u, float(recording.Ts)))
+            v = np.asarray(_driven(self.mechanism.structure, *numbers))
+        gates[[i for i, _ in acting]] = 0.0
+        return v, dataclasses.replace(self, gates=tuple(gates.tolist()))
 
     def _starts(
         self, u: np.ndarray, y: np.ndarray, Ts: float, hidden: np.ndarray | None = None
@@ -147,14 +164,16 @@ class Model:
 
         Each starts from the positions and speeds that the first `n_init` samples of its window tell.
         What no sensor shows (memories, motor current) is as a free run from the beginning has it by
-        then. The servo angle integrates every small torque error, so one long run hides where the
+        then, and the voltage is what effects of actuation (a delay, a drift) make of the whole recording.
+        The servo angle integrates every small torque error, so one long run hides where the
         error is made.
 
         Args:
             recording: Its voltage drives the model.
             seconds: Length of a window [s]; a rest shorter than twice `n_init` joins the last one.
         """
-        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        y = self.measured(recording).astype(float)
+        u, inner = self._behind_actuation(recording)
         starts, length = window_starts(recording, seconds)
         pick = starts[:, None] + np.arange(length)[None, :]
         inside = np.minimum(pick, len(u) - 1)
@@ -164,12 +183,12 @@ class Model:
         if len(rest_state(self.mechanism.structure, np.float64)) > moving:
             states = self._run(recording, self._start(recording))[0]
             hidden = states[starts, moving:]
-        x0 = self._starts(u[head], y[head], recording.Ts, hidden)
+        x0 = inner._starts(u[head], y[head], recording.Ts, hidden)
         with double_precision():
             run = _free_many(
-                self.mechanism.structure,
-                self.solver,
-                *self.numbers(),
+                inner.mechanism.structure,
+                inner.solver,
+                *inner.numbers(),
                 jnp.asarray(x0),
                 jnp.asarray(u[inside]),
                 jnp.asarray(float(recording.Ts)),

@@ -6,11 +6,11 @@ import pytest
 from adaptive_records import coloured, volterra
 
 from rotflex_jax.adaptive import LMS, NLMS, RLS, grid, identify, run
-from rotflex_jax.adaptive.block_lms import LENGTH, Blocks
+from rotflex_jax.adaptive.block_lms import LENGTH, SquareBlocks
 from rotflex_jax.adaptive.block_rls import at_once
 from rotflex_jax.adaptive.forms import quickest
 from rotflex_jax.adaptive.judged import values_at
-from rotflex_jax.adaptive.objectives import blocks, evaluate
+from rotflex_jax.adaptive.objectives import batch, evaluate
 from rotflex_jax.adaptive.running import _run
 from rotflex_jax.adaptive.square import Square
 from rotflex_jax.adaptive.sums import tree_sum
@@ -41,7 +41,7 @@ FORMS = [
     (3, 0.0, Square),
     (9, 0.0, Square),
     (9, 0.4, Square),
-    (41, 0.0, Blocks),
+    (41, 0.0, SquareBlocks),
     (41, 0.4, Square),
 ]
 
@@ -164,7 +164,7 @@ def test_a_sweep_is_each_setting_by_itself(objective, leakage) -> None:
 
     points = np.random.default_rng(0).uniform(1e-4, 1e-2, (11, 2))
     with double_precision():
-        data = blocks(basis, listed, "alpha", objective)
+        data = batch(basis, listed, "alpha", objective)
         swept = values_at(jnp.asarray(points), data, names=("a", "b"), build=build, objective=objective)
         each = [evaluate(data, objective, build({"a": a, "b": b})) for a, b in points]
     np.testing.assert_allclose(swept, each, rtol=1e-11)

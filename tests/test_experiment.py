@@ -252,10 +252,10 @@ def test_the_figure_names_units_and_both_effects(experiment):
 def test_new_numbers_need_no_new_program(contest):
     u = noise(400, Ts, seed=1)
     contest.meet(u)
-    before = imitation._with_slopes._cache_size()
+    before = len(imitation._with_slopes)
     other = Contest(pair(0.004), Ts, V)
     other.meet(2 * u)
-    assert imitation._with_slopes._cache_size() == before
+    assert len(imitation._with_slopes) == before
 
 
 def test_a_direction_that_nothing_shows_does_not_count():

@@ -9,7 +9,7 @@ import rotflex_jax.effects as fx
 from arena.plant import Plant
 from arena.records import make_record
 from rotflex_jax.joints import paper
-from rotflex_jax.mechanism import Exponential, simulate_states
+from rotflex_jax.mechanism import Exponential, simulate, simulate_states
 from rotflex_jax.mechanism.initial import initial_states, rough_state
 from rotflex_jax.model import Model, window_starts
 from rotflex_jax.recording import Recording
@@ -154,6 +154,22 @@ def test_each_window_looks_at_its_own_first_samples_only(truth):
     # A window is the free run of that part of the recording.
     part = model.simulate(record.slice(200, 400))
     np.testing.assert_allclose(run[200:400], part, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("effect", "driven"),
+    [
+        (fx.VoltageDrift(rate=0.5), lambda u: u + 0.5 * 0.004 * (np.arange(len(u)) + 0.5)),
+        (fx.Delay(time=0.1), lambda u: np.concatenate([np.full(25, u[0]), u[:-25]])),
+    ],
+    ids=["drift", "delay"],
+)
+def test_the_voltage_of_a_window_is_that_of_the_whole_recording(effect, driven):
+    """The bare joint under a voltage that was changed by hand is what every window has to repeat."""
+    u = np.random.default_rng(4).normal(size=600)
+    record = Recording(u=u, y=simulate(paper(), driven(u), 0.004), Ts=0.004, accept=("units",))
+    run = Model(paper() + effect).simulate_windows(record, 0.4)
+    np.testing.assert_allclose(run, record.y, rtol=0, atol=1e-6)
 
 
 def test_a_short_rest_joins_the_last_window(truth):

@@ -266,9 +266,9 @@ def test_two_recordings_are_one_after_the_other():
 def test_a_model_that_moves_is_not_compiled_anew():
     r, _ = recorded(seconds=2.0)
     latent_torque(paper(**TRUE), r)
-    counts = linear_model._cache_size(), package.intensity._likelihoods._cache_size()  # type: ignore
+    counts = len(linear_model), package.intensity._likelihoods._cache_size()  # type: ignore
     latent_torque(paper(hub_damping=0.01, joint_damping=0.004), r)
-    assert (linear_model._cache_size(), package.intensity._likelihoods._cache_size()) == counts  # type: ignore
+    assert (len(linear_model), package.intensity._likelihoods._cache_size()) == counts  # type: ignore
 
 
 # -- curves and words ----------------------------------------------------------------------------------

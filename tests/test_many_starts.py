@@ -105,10 +105,10 @@ def test_those_that_went_to_the_end_agree_and_are_in_order(found) -> None:
 
 def test_other_numbers_compile_nothing_anew(found) -> None:
     recordings, _, _ = found
-    before = descend._cache_size()
+    before = len(descend)
     other = paper(hub_inertia=0.0025, stiffness=1.9, hub_damping=0.004, joint_damping=0.001)
     many_starts(other, recordings, starts=10, spread=0.3, short_seconds=0.7, keep=3, seed=5, max_steps=3)
-    assert descend._cache_size() == before
+    assert len(descend) == before
 
 
 @pytest.mark.parametrize(

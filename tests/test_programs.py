@@ -8,10 +8,12 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
 import pytest
+from jax import export
 
 import rotflex_jax as rf
 from rotflex_jax.effects import Coulomb, LuGre
@@ -160,3 +162,34 @@ def test_a_simulation_in_a_second_process_is_the_same_and_traces_no_step(tmp_pat
         found.append(json.loads(run.stdout))
     (first, steps), (second, none) = found
     assert first == second and steps > 0 and none == 0
+
+
+class Pair(NamedTuple):
+    twice: jax.Array
+    left: jax.Array | None
+
+
+export.register_namedtuple_serialization(Pair, serialized_name="test_programs.Pair")
+
+
+def test_a_named_tuple_comes_back_from_disk_as_one(folder: Path) -> None:
+    def pair(x: jax.Array) -> Pair:
+        return Pair(2 * x, None)
+
+    x = np.arange(3, dtype=np.float32)
+    Program(pair, static=0)(x)
+    assert len(files(folder)) == 1
+    found = Program(pair, static=0)(x)
+    assert isinstance(found, Pair) and found.left is None
+    np.testing.assert_array_equal(found.twice, 2 * x)
+
+
+def test_a_compiler_without_the_older_emitters_compiles_as_it_likes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert programs._options() == programs._OLDER_EMITTERS  # this one has the choice
+    monkeypatch.setattr(programs, "_OLDER_EMITTERS", {"xla_no_such_option": False})
+    programs._options.cache_clear()
+    assert programs._options() == {}
+    np.testing.assert_array_equal(new()(2.0, np.ones(2, np.float32)), [2.0, 2.0])
+    programs._options.cache_clear()

@@ -15,8 +15,8 @@ from rotflex_jax.discover.refit import (
     choose_process_noise,
     levenberg_marquardt,
     moved,
-    normal_equations,
     refit,
+    whitened_sums,
 )
 from rotflex_jax.discover.score import _expanded
 from rotflex_jax.parameters import Transform
@@ -85,11 +85,11 @@ def test_slopes_are_those_of_the_innovations(rough):
         assert close.mean() > 0.98, k
 
 
-def test_normal_equations_are_those_of_the_whole_matrix(plain):
+def test_whitened_sums_are_those_of_the_whole_matrix(plain):
     _, h = plain
     rng = np.random.default_rng(0)
     w, W = rng.normal(size=(2, 30, 2)), rng.normal(size=(h.moved, 2, 30, 2))
-    H, g = normal_equations(h, w, W)
+    H, g = whitened_sums(h, w, W)
     rows = _expanded(h, W)
     shared, each = len(h.free), h.moved - len(h.free)
     # `_expanded` has recordings innermost, the normal equations outermost.

@@ -29,10 +29,10 @@ def recorded(u: float = 1, theta: float = 1, alpha: float = 1, kind: str = "nois
     ],
 )
 def test_a_sign_turned_round_is_named(signs: dict[str, float], sentence: str) -> None:
-    for run in (lambda r: check_signs(JOINT, [r]), lambda r: rf.fit(JOINT, r)):
-        with pytest.raises(rf.InputError, match=sentence):
-            run(recorded(**signs))
     good, bad = recorded(), recorded(**signs)
+    for run in (check_signs, rf.fit, rf.many_starts):
+        with pytest.raises(rf.InputError, match=sentence):
+            run(JOINT, [bad])
     with pytest.raises(rf.InputError, match=sentence):
         rf.discover(JOINT, good, bad)
 

@@ -12,7 +12,7 @@ from rotflex_jax.adaptive.grid import grid
 from rotflex_jax.adaptive.judged import sample_moments, values_at
 from rotflex_jax.adaptive.learning import learning_curve
 from rotflex_jax.adaptive.moments import Moments, ar1_covariance
-from rotflex_jax.adaptive.objectives import blocks
+from rotflex_jax.adaptive.objectives import batch
 from rotflex_jax.adaptive.penalty import Margin
 from rotflex_jax.adaptive.settings import Curve
 from rotflex_jax.adaptive.tune import loss_and_slopes, tune
@@ -102,7 +102,7 @@ def test_derivative_is_that_of_central_differences(
     joint: list[Recording], objective: str, guarded: bool
 ) -> None:
     with double_precision():
-        data = blocks(BASIS, joint[:4], "alpha", objective)
+        data = batch(BASIS, joint[:4], "alpha", objective)
         # A margin that these step sizes do not keep, so that the penalty takes part.
         guard = Margin(sample_moments(data.phi), 200.0) if guarded else None
         options = {"curve": BOTH, "build": two_steps, "objective": objective}
@@ -267,7 +267,7 @@ def test_other_numbers_compile_nothing_anew(short: list[Recording]) -> None:
             first = len(traces)
     assert len(traces) == first > 0
     with double_precision():
-        data = blocks(BASIS, short, "alpha", "final")
+        data = batch(BASIS, short, "alpha", "final")
         compiled = values_at._cache_size()
         for mu in (0.01, 0.02):
             values_at(jnp.array([[mu, mu]]), data, names=("mu1", "mu2"), build=build, objective="final")

@@ -12,7 +12,7 @@ import numpy as np
 from rotflex_jax import Recording
 from rotflex_jax.adaptive import LMS, RLS, grid, run
 from rotflex_jax.adaptive.judged import values_at
-from rotflex_jax.adaptive.objectives import blocks, evaluate
+from rotflex_jax.adaptive.objectives import batch, evaluate
 from rotflex_jax.adaptive.settings import Curve
 from rotflex_jax.adaptive.tune import loss_and_slopes
 from rotflex_jax.basis import Delays, Volterra
@@ -115,7 +115,7 @@ def pairs_cases(N: int) -> list[Case]:
     lanes = c_reference.LANES * N * NANO
     searched = lambda axes: grid(_build(5), axes, basis, [recording], "alpha", objective="mean_error")  # noqa: E731
     with double_precision():
-        data = blocks(basis, [recording], "alpha", "mean_error")
+        data = batch(basis, [recording], "alpha", "mean_error")
         curve = Curve(("linear", "quadratic"), ((0.0, float("inf")),) * 2)
         point = jnp.asarray(np.log([[1e-3, 1e-4]]))
 

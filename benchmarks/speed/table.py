@@ -13,6 +13,7 @@ TITLES = {
     "joint": "Joint fits [ms]",
     "starts": "Many starts [s]",
     "cold": "From a new process",
+    "search": "A search over the whole catalogue, 20 s at 500 Hz",
     "growth": "Growth",
 }
 

@@ -3,12 +3,12 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.ranges import Number, count, real_data, within
+from rotflex_jax.adaptive.sums import times
 
 
 class Window(NamedTuple):
@@ -58,7 +58,6 @@ class AffineProjection(AdaptiveFilter):
         """One step."""
         X = jnp.concatenate([phi[None], state.phi[:-1]])
         target = jnp.concatenate([y[None], state.y[:-1]])
-        times = lambda a, b: jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)  # noqa: E731
         e = target - times(X, state.w)
         # Only the products with the newest are new; the others move along, so nothing adds up.
         new = times(X, phi)

@@ -11,13 +11,14 @@ from jaxtyping import Array
 from rotflex_jax.adaptive.lms import LMS
 from rotflex_jax.adaptive.ranges import per_weight
 from rotflex_jax.adaptive.square import Square
+from rotflex_jax.adaptive.sums import times
 
 LENGTH = 32
 """Samples of a block: enough for matrix products, few enough for their own products to be cheap."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Blocks(Square):
+class SquareBlocks(Square):
     """LMS with one step size per degree, on blocks of samples.
 
         e = (I + tril(G, -1))^-1 (d - y_w),   G_ij = phi_i' diag(mu) phi_j
@@ -46,7 +47,6 @@ class Blocks(Square):
             w0, w1, W = carry
             at, d, real = block
             Z = jax.lax.dynamic_slice(line, (at,), (LENGTH + M,))[rows]
-            times = lambda a, b: jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)  # noqa: E731
             g, squares = times(Z, Z.T), Z * Z
             G = mu0 + mu1 * g + mu2 / 2 * (g * g + times(squares, squares.T))
             free = d - (w0 + jnp.sum((times(Z, W) + w1[None]) * Z, axis=1))

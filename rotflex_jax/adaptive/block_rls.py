@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rotflex_jax.adaptive.rebuilt import Rebuilt
+from rotflex_jax.adaptive.rebuilt import Rebuilt, in_blocks
 from rotflex_jax.adaptive.rls import RLS, Root
+from rotflex_jax.adaptive.sums import times
 
 FEW, MANY = 21, 80
 """Weights up to which four samples go together, and from which sixteen do; two between."""
@@ -42,39 +43,31 @@ class RootBlocks(Rebuilt):
 
     def scan(self, filter: RLS, carry: Any, x: Array, y: Array) -> tuple[Any, Array]:
         """State of the loop after the samples, and a-priori errors (N,)."""
-        length = at_once(self.size)
 
         def turn(carry: Any, sample: tuple[Array, Array]) -> tuple[Any, Array]:
             state, lags = carry
-            line = jnp.concatenate([sample[0][::-1], lags])
-            Z = jnp.stack([line[k : k + self.memory] for k in reversed(range(len(sample[0])))])
+            line, Z = self.newest(sample[0], lags)
             correct = _few if self.size < MANY else _many
             state, e = correct(state, self.regressors(Z), sample[1], jnp.asarray(filter.lam))
             return (state, line[: self.memory]), e
 
-        whole = len(y) // length * length
-        blocks = x[:whole].reshape(-1, length), y[:whole].reshape(-1, length)
-        carry, e = jax.lax.scan(turn, carry, blocks)
-        if whole == len(y):
-            return carry, e.reshape(-1)
-        carry, last = turn(carry, (x[whole:], y[whole:]))
-        return carry, jnp.concatenate([e.reshape(-1), last])
+        return in_blocks(turn, carry, x, y, at_once(self.size))
 
 
 def _many(state: Root, X: Float[Array, "B P"], y: Float[Array, " B"], lam: Array) -> tuple[Root, Array]:
     """A block of samples by matrix products, none with a transposed matrix in front: these are slow."""
     w, S = state
     D = lam ** jnp.arange(1, len(y) + 1, dtype=y.dtype)
-    V = _times(X, S)
-    L = jnp.linalg.cholesky(_times(V, V.T) + jnp.diag(D), symmetrize_input=False)
+    V = times(X, S)
+    L = jnp.linalg.cholesky(times(V, V.T) + jnp.diag(D), symmetrize_input=False)
     inverse, other = (
         jax.scipy.linalg.solve_triangular(each, jnp.eye(len(y), dtype=y.dtype), lower=True)
         for each in (L, L + jnp.diag(jnp.sqrt(D)))
     )
-    v = _times(inverse, y - _times(X, w))
-    K = _times(_times(S, V.T), inverse.T)
-    S = (S - _times(_times(K, other), V)) / jnp.sqrt(D[-1])
-    return Root(w + _times(K, v), S), jnp.diagonal(L) * v
+    v = times(inverse, y - times(X, w))
+    K = times(times(S, V.T), inverse.T)
+    S = (S - times(times(K, other), V)) / jnp.sqrt(D[-1])
+    return Root(w + times(K, v), S), jnp.diagonal(L) * v
 
 
 def _few(state: Root, X: Float[Array, "B P"], y: Float[Array, " B"], lam: Array) -> tuple[Root, Array]:
@@ -82,8 +75,8 @@ def _few(state: Root, X: Float[Array, "B P"], y: Float[Array, " B"], lam: Array)
     w, S = state
     D = [lam ** (k + 1) for k in range(len(y))]
     # Beyond some 21 weights the plain sum is too large for the loop to stay in one piece.
-    V = jnp.sum(X[:, :, None] * S[None], axis=1) if len(w) <= FEW else [_times(x, S) for x in X]
-    U = [_times(S, v) for v in V]
+    V = jnp.sum(X[:, :, None] * S[None], axis=1) if len(w) <= FEW else [times(x, S) for x in X]
+    U = [times(S, v) for v in V]
     A = [[jnp.sum(V[i] * V[j]) for j in range(i)] + [jnp.sum(V[i] * V[i]) + d] for i, d in enumerate(D)]
     L = _factor(A)
     # Rows of L^-1 (y - X w), of K' = L^-1 U', and of (L + sqrt D)^-1 V.
@@ -112,8 +105,3 @@ def _solved(L: Rows, b: list[Array]) -> list[Array]:
     for row, each in zip(L, b, strict=True):
         x.append((each - sum(a * known for a, known in zip(row, x, strict=False))) / row[-1])
     return x
-
-
-def _times(a: Array, b: Array) -> Array:
-    """Full products also where a device would round the factors first."""
-    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from rotflex_jax.adaptive.block_lms import Blocks
+from rotflex_jax.adaptive.block_lms import SquareBlocks
 from rotflex_jax.adaptive.block_rls import RootBlocks
 from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.lms import LMS
@@ -39,5 +39,5 @@ def quickest(filter: AdaptiveFilter, basis: Basis, whole: bool) -> Rebuilt | Non
     counts = np.cumsum([0, *(len(indices(M, d, basis.layout)) for d in degrees)])
     alike = all(np.ptp(mu[a:b]) == 0 for a, b in itertools.pairwise(counts))
     if M >= BLOCKS and alike and whole and not leaks:
-        return Blocks(M, degrees, basis.layout, alike)
+        return SquareBlocks(M, degrees, basis.layout, alike)
     return Square(M, degrees, basis.layout, alike, leaks)

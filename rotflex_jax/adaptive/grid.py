@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax.adaptive.judged import judged, values_at
-from rotflex_jax.adaptive.objectives import Objective, blocks
+from rotflex_jax.adaptive.objectives import Objective, batch
 from rotflex_jax.adaptive.settings import Build
 from rotflex_jax.adaptive.tuned import Tuned
 from rotflex_jax.basis import Basis
@@ -59,7 +59,7 @@ def grid(
         )
     points = np.array(list(itertools.product(*tried.values())))
     with double_precision():
-        data = blocks(basis, recordings, channel, objective)
+        data = batch(basis, recordings, channel, objective)
         mesh = mesh_of(devices)
         run = values_at(
             jnp.asarray(points), data, names=tuple(tried), build=build, objective=objective, mesh=mesh

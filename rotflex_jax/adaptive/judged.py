@@ -14,7 +14,7 @@ from rotflex_jax.adaptive.bounds import Stability, analyse
 from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.lms import LMS
 from rotflex_jax.adaptive.moments import Moments
-from rotflex_jax.adaptive.objectives import Blocks, Objective, blocks, evaluate, unit
+from rotflex_jax.adaptive.objectives import Batch, Objective, batch, evaluate, unit
 from rotflex_jax.adaptive.ranges import per_weight
 from rotflex_jax.adaptive.settings import Build, built
 from rotflex_jax.adaptive.sweep import lanes, sweep
@@ -35,7 +35,7 @@ ROWS = 20_000
 @functools.partial(jax.jit, static_argnames=("names", "build", "objective", "mesh"))
 def values_at(
     points: Float[Array, "K n"],
-    data: Blocks,
+    data: Batch,
     *,
     names: tuple[str, ...],
     build: Build,
@@ -48,7 +48,7 @@ def values_at(
 
 
 def _values(
-    points: Float[Array, "K n"], data: Blocks, *, names: tuple[str, ...], build: Build, objective: Objective
+    points: Float[Array, "K n"], data: Batch, *, names: tuple[str, ...], build: Build, objective: Objective
 ) -> Float[Array, " K"]:
     def made(point: Array) -> tuple[AdaptiveFilter, Basis | None]:
         return built(build, dict(zip(names, point, strict=True)))
@@ -62,7 +62,7 @@ def _values(
     return jax.lax.map(value, points, batch_size=min(LANES, len(points)))
 
 
-def _swept(points: Array, data: Blocks, made: Any, objective: Objective, leaks: bool) -> Float[Array, " K"]:
+def _swept(points: Array, data: Batch, made: Any, objective: Objective, leaks: bool) -> Float[Array, " K"]:
     """`values_at` for LMS on fixed regressors, as many points at a time as there is room for."""
     K, P = len(points), data.phi.shape[2]
 
@@ -93,7 +93,7 @@ def judged(
     basis: Basis,
     recordings: Sequence[Recording],
     channel: str,
-    data: Blocks,
+    data: Batch,
     *,
     objective: Objective,
     test: Sequence[Recording],
@@ -106,14 +106,14 @@ def judged(
         filter, changed = built(build, dict(settings))
         point = jnp.asarray([list(settings.values())])
 
-        def worth(data: Blocks) -> float:
+        def worth(data: Batch) -> float:
             return float(values_at(point, data, names=names, build=build, objective=objective)[0])
 
-        tested = worth(blocks(basis, test, channel, objective)) if test else float("nan")
+        tested = worth(batch(basis, test, channel, objective)) if test else float("nan")
         stability: Stability | None = None
         if isinstance(filter, LMS) and data.phi.shape[2] <= CHECKED:
             # Other poles are other regressors.
-            known = data if changed is None else blocks(changed, recordings, channel, objective)
+            known = data if changed is None else batch(changed, recordings, channel, objective)
             stability = analyse(sample_moments(known.phi), np.asarray(filter.mu))
         return Tuned(
             settings=dict(settings),

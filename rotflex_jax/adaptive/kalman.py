@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.ranges import Number, PerWeight, per_weight, real_data, within
+from rotflex_jax.adaptive.sums import times
 
 
 class Belief(NamedTuple):
@@ -54,7 +54,6 @@ class Kalman(AdaptiveFilter):
     def step(self, state: Belief, phi: Array, y: Array) -> tuple[Belief, Array]:
         """Correction by the sample, then the walk to the next one."""
         w, P = state
-        times = lambda a, b: jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)  # noqa: E731
         e = y - jnp.sum(w * phi)
         v = times(P, phi)
         g = v / (self.r + jnp.sum(v * phi))

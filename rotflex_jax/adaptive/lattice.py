@@ -12,6 +12,7 @@ from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.lattice_weights import Stage, direct_form, known_channels, monomials
 from rotflex_jax.adaptive.ranges import Number, count, real_data, within
 from rotflex_jax.adaptive.root import correct
+from rotflex_jax.adaptive.sums import times
 
 
 class Ladder(NamedTuple):
@@ -125,12 +126,12 @@ class VolterraLattice(AdaptiveFilter):
             f, b, gamma, e = carry
             old, known, joins = stage
             root_b, g, left = correct(old.root_b, b, self.lam, gamma)
-            e = e - _predicted(old.output, b)
+            e = e - times(b, old.output)
             own = jnp.where(known, f, 0)
             root_f, g_f, _ = correct(old.root_f, own, self.lam, old.gamma)
             # The next product joins those that leave, its own past being nothing yet.
-            above = old.b + jnp.where(joins, f, 0) - _predicted(old.backward, own)
-            f = f - _predicted(old.forward, old.b)
+            above = old.b + jnp.where(joins, f, 0) - times(own, old.backward)
+            f = f - times(old.b, old.forward)
             new = Stage(
                 b=b,
                 g=g,
@@ -161,8 +162,3 @@ class VolterraLattice(AdaptiveFilter):
         if not self.constant:
             return w[:, 0]
         return jnp.concatenate([state.level[None], w[:, 0] - state.level * w[:, 1]])
-
-
-def _predicted(K: Float[Array, "n T"], z: Float[Array, " n"]) -> Float[Array, " T"]:
-    """What a regression with coefficients K says for its targets."""
-    return jnp.matmul(z, K, precision=jax.lax.Precision.HIGHEST)

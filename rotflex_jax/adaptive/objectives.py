@@ -26,8 +26,8 @@ from rotflex_jax.recording import Recording
 Objective = Literal["final", "mean_error", "last_half"]
 
 
-class Blocks(eqx.Module):
-    """Recordings of one length, and what the best fixed weights make of them.
+class Batch(eqx.Module):
+    """Recordings of one length side by side, and what the best fixed weights make of them.
 
     The first `n_init` samples are left out: their regressors reach back to before the recording.
 
@@ -50,7 +50,7 @@ class Blocks(eqx.Module):
     smallest: Float[Array, " K"]
 
 
-def blocks(basis: Basis, recordings: Sequence[Recording], channel: str, objective: str) -> Blocks:
+def batch(basis: Basis, recordings: Sequence[Recording], channel: str, objective: str) -> Batch:
     """Recordings made ready for an objective.
 
     Args:
@@ -96,11 +96,11 @@ def blocks(basis: Basis, recordings: Sequence[Recording], channel: str, objectiv
         gram.append(X.T @ X / len(X))
         smallest.append(np.mean((Y - X @ w) ** 2))
     parts = (np.stack(best), np.stack(gram), np.array(smallest))
-    return Blocks(jnp.asarray(u), jnp.asarray(y), jnp.asarray(phi), skip, *(jnp.asarray(p) for p in parts))
+    return Batch(jnp.asarray(u), jnp.asarray(y), jnp.asarray(phi), skip, *(jnp.asarray(p) for p in parts))
 
 
 def evaluate(
-    data: Blocks, objective: Objective, filter: AdaptiveFilter, basis: Any = None
+    data: Batch, objective: Objective, filter: AdaptiveFilter, basis: Any = None
 ) -> Float[Array, ""]:
     """The objective, traced: settings of the filter and poles of the basis may carry derivatives.
 

@@ -6,6 +6,7 @@ errors to rounding.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.basis.monomials import indices
 
 Lags = Float[Array, " M"]
+Turn = Callable[[Any, tuple[Array, Array]], tuple[Any, Array]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Rebuilt:
         """Number of regressors."""
         return sum(len(indices(self.memory, d, self.layout)) for d in self.degrees)
 
-    def begin(self, filter: AdaptiveFilter, state: Any, lags: Lags) -> Any:
+    def begin(self, state: Any, lags: Lags) -> Any:
         """State of the loop, after the samples `lags`, the newest first."""
         return state, lags
 
@@ -59,9 +61,36 @@ class Rebuilt:
         factors = [np.array(each, int).reshape(len(each), d) for each, d in listed]
         return jnp.concatenate([_products(lags, f) for f in factors], axis=-1)
 
-    def end(self, filter: AdaptiveFilter, carry: Any) -> Any:
+    def newest(self, x: Float[Array, " B"], lags: Lags) -> tuple[Float[Array, " B+M"], Float[Array, "B M"]]:
+        """The input up to the end of a block, and the delays of each of its samples, all newest first."""
+        line = jnp.concatenate([x[::-1], lags])
+        return line, jnp.stack([line[k : k + self.memory] for k in reversed(range(len(x)))])
+
+    def end(self, carry: Any) -> Any:
         """The filter's state."""
         return carry[0]
+
+
+def in_blocks(turn: Turn, carry: Any, x: Array, y: Array, length: int) -> tuple[Any, Array]:
+    """A loop over blocks of samples; those that fill none are one more, shorter turn.
+
+    Args:
+        turn: from state and block (input, output) to the next state and the errors of the block.
+        carry: first state.
+        x: input (N,).
+        y: output (N,).
+        length: samples of a block.
+
+    Returns:
+        Last state, and errors (N,).
+    """
+    whole = len(y) // length * length
+    blocks = x[:whole].reshape(-1, length), y[:whole].reshape(-1, length)
+    carry, e = jax.lax.scan(turn, carry, blocks)
+    if whole == len(y):
+        return carry, e.reshape(-1)
+    carry, last = turn(carry, (x[whole:], y[whole:]))
+    return carry, jnp.concatenate([e.reshape(-1), last])
 
 
 def _products(lags: Float[Array, "*B M"], factors: np.ndarray) -> Float[Array, "*B K"]:

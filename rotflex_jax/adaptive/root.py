@@ -1,11 +1,10 @@
 """One more sample in the inverse of a Gram matrix, carried as a square root."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.ranges import Number
-from rotflex_jax.adaptive.sums import tree_sum
+from rotflex_jax.adaptive.sums import times, tree_sum
 
 
 def correct(
@@ -30,9 +29,8 @@ def correct(
         `lam / a`, which is gamma times the share of e that the correction leaves.
     """
     r = lam / gamma
-    # Full products also where a device would round the factors of a matrix product first.
-    v = jnp.matmul(phi, S, precision=jax.lax.Precision.HIGHEST)
+    v = times(phi, S)
     a = r + tree_sum(v * v)
-    g = jnp.matmul(S, v, precision=jax.lax.Precision.HIGHEST) / a
+    g = times(S, v) / a
     share = 1 / (1 + jnp.sqrt(r / a))
     return (S - (share * g)[:, None] * v[None, :]) / jnp.sqrt(lam), g, jnp.divide(lam, a)

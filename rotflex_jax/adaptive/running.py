@@ -155,8 +155,8 @@ def _run(
     close: Any = lambda state: state  # noqa: E731
     if form is not None:
         assert lags is not None
-        state = form.begin(filter, state, lags[::-1])
-        step, close = functools.partial(form.scan, filter), functools.partial(form.end, filter)
+        state = form.begin(state, lags[::-1])
+        step, close = functools.partial(form.scan, filter), form.end
     weights = lambda state: filter.weights(close(state))  # noqa: E731
     if not every:
         state, errors = step(state, phi, y)

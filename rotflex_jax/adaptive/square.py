@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,7 +10,7 @@ from jaxtyping import Array, Float
 from rotflex_jax.adaptive.filter import Weights
 from rotflex_jax.adaptive.lms import LMS
 from rotflex_jax.adaptive.ranges import per_weight
-from rotflex_jax.adaptive.rebuilt import Lags, Rebuilt
+from rotflex_jax.adaptive.rebuilt import Lags, Rebuilt, in_blocks
 from rotflex_jax.basis.monomials import counts, indices, positions
 
 Parts = tuple[Array, Array, Array]
@@ -41,7 +40,7 @@ class Square(Rebuilt):
     alike: bool = False
     leaks: bool = False
 
-    def begin(self, filter: LMS, state: Weights, lags: Lags) -> Any:
+    def begin(self, state: Weights, lags: Lags) -> Any:
         """State of the loop, after the samples `lags`, the newest first."""
         return *self.parts(state.w / self._counted(state.w.dtype)), lags
 
@@ -53,8 +52,7 @@ class Square(Rebuilt):
 
         def turn(carry: Any, sample: tuple[Array, Array]) -> tuple[Any, Array]:
             *w, lags = carry
-            line = jnp.concatenate([sample[0][::-1], lags])
-            Z = jnp.stack([line[k : k + self.memory] for k in reversed(range(len(sample[0])))])
+            line, Z = self.newest(sample[0], lags)
             moved = w[1][None] + jnp.sum(Z[:, :, None] * w[2][None], axis=1)
             e = sample[1] - (w[0] + jnp.sum(moved * Z, axis=1))
             if len(Z) == 2:
@@ -64,16 +62,9 @@ class Square(Rebuilt):
             W = W + H * jnp.sum(eZ[:, :, None] * Z[:, None, :], axis=0)
             return (w0 + mu0 * jnp.sum(e), w1 + mu1 * jnp.sum(eZ, axis=0), W, line[: self.memory]), e
 
-        length = 1 if self.leaks else 2
-        whole = len(y) // length * length
-        pairs = x[:whole].reshape(-1, length), y[:whole].reshape(-1, length)
-        carry, e = jax.lax.scan(turn, carry, pairs)
-        if whole == len(y):
-            return carry, e.reshape(-1)
-        carry, last = turn(carry, (x[whole:], y[whole:]))
-        return carry, jnp.concatenate([e.reshape(-1), last])
+        return in_blocks(turn, carry, x, y, length=1 if self.leaks else 2)
 
-    def end(self, filter: LMS, carry: Any) -> Weights:
+    def end(self, carry: Any) -> Weights:
         """The filter's state."""
         w0, w1, W, _ = carry
         i, j = np.triu_indices(self.memory)

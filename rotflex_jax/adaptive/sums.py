@@ -1,5 +1,6 @@
 """Sums of products that a processor can do side by side."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -21,3 +22,8 @@ def tree_sum(p: Inexact[Array, "P *lanes"]) -> Inexact[Array, "*lanes"]:
         paired = p[:half] + p[half : 2 * half]
         p = jnp.concatenate([paired, p[2 * half :]]) if len(p) % 2 else paired
     return p[0]
+
+
+def times(a: Array, b: Array) -> Array:
+    """Matrix product, full also where a device would round the factors first."""
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rotflex_jax.adaptive.objectives import Blocks, Objective
+from rotflex_jax.adaptive.objectives import Batch, Objective
+from rotflex_jax.adaptive.sums import times
 
 ROOM = 2640
 """Weights of all settings that are carried at a time; more than this leave the fastest memory."""
@@ -22,7 +23,7 @@ def lanes(P: int) -> int:
 
 
 def sweep(
-    data: Blocks, objective: Objective, mu: Float[Array, "C P"], leakage: Float[Array, " C"] | None
+    data: Batch, objective: Objective, mu: Float[Array, "C P"], leakage: Float[Array, " C"] | None
 ) -> Float[Array, " C"]:
     """The objective of LMS at every one of C settings.
 
@@ -44,7 +45,7 @@ def sweep(
     def turn(carry: tuple[Array, Array], sample: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
         w, total = carry
         phi, target = sample
-        e = target - jnp.matmul(phi, w, precision=jax.lax.Precision.HIGHEST)
+        e = target - times(phi, w)
         kept = w if keep is None else w * keep
         return (kept + (step * e[None]) * phi[:, None], total + e * e), None
 

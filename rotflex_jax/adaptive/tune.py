@@ -12,7 +12,7 @@ from rotflex_jax.adaptive.descent import Values, descend
 from rotflex_jax.adaptive.filter import AdaptiveFilter
 from rotflex_jax.adaptive.judged import CHECKED, judged, sample_moments
 from rotflex_jax.adaptive.lms import LMS
-from rotflex_jax.adaptive.objectives import Blocks, Objective, blocks, evaluate
+from rotflex_jax.adaptive.objectives import Batch, Objective, batch, evaluate
 from rotflex_jax.adaptive.penalty import Margin
 from rotflex_jax.adaptive.ranges import count
 from rotflex_jax.adaptive.settings import Build, Curve, built, named
@@ -74,7 +74,7 @@ def tune(
     curve = Curve(names, tuple((ranges or {}).get(name, (0.0, float("inf"))) for name in names))
     first = np.stack([curve.free(s) for s in starts])
     with double_precision():
-        data = blocks(basis, recordings, channel, objective)
+        data = batch(basis, recordings, channel, objective)
         guard = _guard(margin, data, *built(build, starts[0])) if margin else None
 
         def values(points: Float[np.ndarray, "S n"]) -> Values:
@@ -123,7 +123,7 @@ def tune(
 @functools.partial(jax.jit, static_argnames=("curve", "build", "objective"))
 def loss_and_slopes(
     points: Float[Array, "S n"],
-    data: Blocks,
+    data: Batch,
     guard: Margin | None = None,
     *,
     curve: Curve,
@@ -152,7 +152,7 @@ def _step_sizes(filter: AdaptiveFilter) -> Array:
     return jnp.asarray(filter.mu)
 
 
-def _guard(margin: float, data: Blocks, filter: AdaptiveFilter, changed: Basis | None) -> Margin:
+def _guard(margin: float, data: Batch, filter: AdaptiveFilter, changed: Basis | None) -> Margin:
     P = data.phi.shape[2]
     if not margin > 0 or changed is not None or P > CHECKED or not isinstance(filter, LMS):
         raise InputError(

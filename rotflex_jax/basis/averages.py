@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rotflex_jax.basis.bank import evaluate, impulse, whole
+from rotflex_jax.basis.bank import Bank, whole
 
 
-class Averages(eqx.Module):
+class Averages(Bank):
     """A tapped delay line with wide taps: an impulse response of equal steps.
 
         z_i[t] = mean of u[t - first - i width - j] over j = 0 ... width - 1,  i = 0 ... count - 1
@@ -68,15 +68,3 @@ class Averages(eqx.Module):
         until = jnp.maximum(jnp.arange(len(u), dtype=width.dtype)[:, None] - edges[None, :], 0)
         sums = total[until]
         return (sums[:, :-1] - sums[:, 1:]) / width.astype(u.dtype)
-
-    def outputs(self, u: Any) -> Float[np.ndarray, "N M"]:
-        """Columns for a signal, in its precision.
-
-        Args:
-            u: Signal (N,).
-        """
-        return evaluate(self, u)
-
-    def impulse_responses(self, length: int) -> Float[np.ndarray, "L M"]:
-        """Columns for a unit impulse, over so many samples."""
-        return self.outputs(impulse(length))

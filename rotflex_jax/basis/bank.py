@@ -4,9 +4,11 @@ A bank is linear: delays, or orthonormal filters. A basis is what weights stand 
 monomials of a bank's outputs, as they are or orthogonalised.
 """
 
+import abc
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,31 +26,39 @@ class Traced(Protocol):
         ...
 
 
-class Bank(Traced, Protocol):
-    """Turns a signal into linear regressors."""
+class Bank(eqx.Module):
+    """Turns a signal into linear regressors: what a bank of one's own derives from."""
 
     @property
+    @abc.abstractmethod
     def size(self) -> int:
         """Number of columns."""
-        ...
 
     @property
+    @abc.abstractmethod
     def names(self) -> tuple[str, ...]:
         """Of the columns."""
-        ...
 
     @property
+    @abc.abstractmethod
     def reach(self) -> int:
         """Samples after which an impulse has left the bank, to a millionth of its size."""
-        ...
+
+    @abc.abstractmethod
+    def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:
+        """Columns for a signal, inside of traced code too; causal, nothing before the first sample."""
 
     def outputs(self, u: Any) -> Float[np.ndarray, "N M"]:
-        """Columns for a signal."""
-        ...
+        """Columns for a signal, in its precision.
+
+        Args:
+            u: Signal (N,).
+        """
+        return evaluate(self, u)
 
     def impulse_responses(self, length: int) -> Float[np.ndarray, "L M"]:
-        """First samples of the answer to a unit impulse."""
-        ...
+        """Columns for a unit impulse, over so many samples."""
+        return self.outputs(impulse(length))
 
 
 class Basis(Traced, Protocol):

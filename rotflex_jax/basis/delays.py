@@ -1,16 +1,13 @@
 """The plainest bank: the last samples of the signal."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from rotflex_jax.basis.bank import evaluate, impulse, whole
+from rotflex_jax.basis.bank import Bank, whole
 
 
-class Delays(eqx.Module):
+class Delays(Bank):
     """A tapped delay line; with one weight per tap, a finite impulse response.
 
         z_i[t] = u[t - first - i],  i = 0 ... memory - 1,  u = 0 before the first sample
@@ -63,15 +60,3 @@ class Delays(eqx.Module):
         padded = jnp.concatenate([jnp.zeros(self.reach - 1, u.dtype), u])
         starts = [self.memory - 1 - i for i in range(self.memory)]
         return jnp.stack([padded[s : s + N] for s in starts], axis=1)
-
-    def outputs(self, u: Any) -> Float[np.ndarray, "N M"]:
-        """Columns for a signal, in its precision.
-
-        Args:
-            u: Signal (N,).
-        """
-        return evaluate(self, u)
-
-    def impulse_responses(self, length: int) -> Float[np.ndarray, "L M"]:
-        """Columns for a unit impulse, over so many samples."""
-        return self.outputs(impulse(length))

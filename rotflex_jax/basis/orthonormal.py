@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rotflex_jax.basis.bank import evaluate, impulse, whole
+from rotflex_jax.basis.bank import Bank, whole
 from rotflex_jax.basis.sections import Kinds, poles_of, run_chain, sections
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.samples import sampling_period
 
 
-class Orthonormal(eqx.Module):
+class Orthonormal(Bank):
     """Takenaka-Malmquist functions: rational, orthonormal, with given poles.
 
         F_k(z) = z^-first sqrt(1 - a^2) / (1 - a z^-1) * product of the all-passes of the poles before,
@@ -159,15 +159,3 @@ class Orthonormal(eqx.Module):
         ahead = jnp.concatenate([jnp.zeros(self.first, u.dtype), u, jnp.zeros(1, u.dtype)])
         states = run_chain(self.kinds, numbers, ahead)
         return states[1 : len(u) + 1]
-
-    def outputs(self, u: Any) -> Float[np.ndarray, "N M"]:
-        """Columns for a signal, in its precision.
-
-        Args:
-            u: Signal (N,).
-        """
-        return evaluate(self, u)
-
-    def impulse_responses(self, length: int) -> Float[np.ndarray, "L M"]:
-        """Columns for a unit impulse, over so many samples."""
-        return self.outputs(impulse(length))

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
 
 from rotflex_jax.basis.bank import signal, whole
@@ -88,12 +89,10 @@ _slopes = jax.jit(lambda residual, z, args: jax.jacfwd(residual)(z, args), stati
 
 def _descend(residual: _Residual, z: np.ndarray, args: Any, most: int) -> PoleStart:
     """One start of the search."""
-    from scipy.optimize import least_squares  # takes long to import
-
     with double_precision():
         args = (args[0], *map(jnp.asarray, args[1:]))
         try:
-            end = least_squares(
+            end = scipy.optimize.least_squares(
                 lambda z: np.asarray(_left(residual, jnp.asarray(z), args)),
                 z,
                 lambda z: np.asarray(_slopes(residual, jnp.asarray(z), args)),  # pyright: ignore[reportArgumentType]

@@ -6,7 +6,7 @@ Exact for a linear plant and an input whose autocovariance is known; no recordin
 from typing import Any
 
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Float
 
 from rotflex_jax.basis.bank import Bank, signal, whole
@@ -143,8 +143,6 @@ def best_laguerre(
     >>> round(bank.poles[0].real, 6), nmse < 1e-12
     (0.9, True)
     """
-    from scipy.optimize import minimize_scalar  # takes long to import
-
     h = signal(impulse_response, "impulse_response").astype(float)
     power = _power(h, _lags((1.0,), len(h)))
 
@@ -155,7 +153,7 @@ def best_laguerre(
     decays = np.linspace(np.log(3.0 / len(h)), np.log(3.0), whole(grid, "grid", 3))
     errors = [error(z) for z in decays]
     k = int(np.clip(np.argmin(errors), 1, len(decays) - 2))
-    found = minimize_scalar(
+    found = scipy.optimize.minimize_scalar(
         error, bounds=(decays[k - 1], decays[k + 1]), method="bounded", options={"xatol": 1e-10}
     )
     return Orthonormal.laguerre(float(np.exp(-np.exp(found.x))), count, first), error(found.x)

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from rotflex_jax.compare.held_in import free_run_cost, one_period, parted
 from rotflex_jax.compare.linear_system import LinearSystem

@@ -1,7 +1,6 @@
 """Terms of a sparse law of motion, and the motion that it makes; the same code to fit and to simulate."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 
@@ -168,7 +168,7 @@ def motions(
         return np.asarray(run)[:, :, :N]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@kept(static=4)
 def _motions(
     order: int,
     degree: int,

@@ -6,7 +6,7 @@ import numpy as np
 
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.lanes import Bench
-from rotflex_jax.discover.refit import NATS, Judge, moved, normal_equations
+from rotflex_jax.discover.refit import NATS, Judge, moved, whitened_sums
 from rotflex_jax.effects.kinds import Actuation, Linear, Sensing
 from rotflex_jax.mechanism import Exponential
 
@@ -41,7 +41,7 @@ def refined(judge: Judge, h: Hypothesis) -> Hypothesis:
     W = h.whitener(J[0, : h.moved], seen)
     best, w = h, h.whitener(fine.innovations([h.lane(bench)])[0], seen)
     for _ in range(TURNS):
-        H, g = normal_equations(h, w, W)
+        H, g = whitened_sums(h, w, W)
         size = np.sqrt(np.maximum(np.diag(H), 1e-300))
         step = -np.linalg.lstsq(H / np.outer(size, size), g / size, rcond=1e-10)[0] / size
         # Where friction holds and lets go at other samples, the slopes promise too much.

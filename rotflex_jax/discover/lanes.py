@@ -147,18 +147,14 @@ class Bench:
         return list(groups.values())
 
     def each(self, run: Callable[[Any], Any], jobs: list[Any], program: Callable[[Any], Any]) -> list[Any]:
-        """Results of jobs side by side; the first of each `program` (its name for a job) compiles alone."""
-        done: list[Any] = [None] * len(jobs)
-        rest = []
-        for i, job in enumerate(jobs):
-            if program(job) in self.compiled:
-                rest.append(i)
-            else:
-                done[i] = run(job)
-                self.compiled.add(program(job))
-        for i, result in zip(rest, _side_by_side(run, [jobs[i] for i in rest]), strict=True):
-            done[i] = result
-        return done
+        """Results of jobs side by side; of each new `program` (its name for a job) one compiles."""
+        names = [program(job) for job in jobs]
+        new = {name: i for i, name in enumerate(names) if name not in self.compiled}
+        done: dict[int, Any] = {}
+        for turn in (list(new.values()), [i for i in range(len(jobs)) if i not in new.values()]):
+            done.update(zip(turn, _side_by_side(run, [jobs[i] for i in turn]), strict=True))
+            self.compiled.update(new)
+        return [done[i] for i in range(len(jobs))]
 
     def on_device(self) -> Data:
         """The recordings as arrays of JAX; call it inside the precision that is wanted."""
@@ -176,7 +172,7 @@ def _side_by_side(run: Callable[[Any], Any], parts: list[Any]) -> list[Any]:
     A scan keeps one core busy whatever its width; compiled code runs outside of Python's lock.
 
     Args:
-        run: What to call; compiled before, so that no two threads compile the same.
+        run: What to call; no two threads may compile the same.
         parts: Its arguments.
     """
     return list(_threads().map(run, parts))

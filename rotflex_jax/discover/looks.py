@@ -198,8 +198,8 @@ def _reversals(speed: np.ndarray, error: float, Ts: float, what: str) -> View | 
     since[last < 0] = np.inf
     masks = np.array([since < h for h in HORIZONS])
     words = tuple(f"within {1e3 * h:.0f} ms after {what} reverses" for h in HORIZONS)
-    edges = np.array([0.0, *HORIZONS])
-    bins = np.searchsorted(edges, since, side="right") - 1
+    edges = np.array([0.0, *HORIZONS, np.inf])  # the last bin: later, or before the first reversal
+    bins = np.searchsorted(edges[:-1], since, side="right") - 1
     return _telling(View("reversal", masks, words, bins, edges, "s"))
 
 

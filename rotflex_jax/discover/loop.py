@@ -102,8 +102,10 @@ def discover(
         dataclasses.replace(model.solver, passes=2) if isinstance(model.solver, Exponential) else model.solver
     )
     judge = Judge(Bench(supermodel, solver, data), noise, torque, ports)
+    # One length for both, where that makes no run on training data longer, is compiled for once.
+    as_long = max(roomy(trained), roomy(unseen))
     away = Away(
-        Judge(Bench(supermodel, solver, stack(unseen, model, roomy(unseen))), noise, torque, ports),
+        Judge(Bench(supermodel, solver, stack(unseen, model, as_long)), noise, torque, ports),
         unseen,
         first_states(model, unseen),
         window_seconds,

@@ -86,7 +86,7 @@ class Judge:
         return dataclasses.replace(h, whitener=whitener, densities=whitener.log_densities(e, seen))
 
 
-def normal_equations(h: Hypothesis, w: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def whitened_sums(h: Hypothesis, w: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`J'J` and `J'w` of whitened innovations (R, N, C) and slopes (D, R, N, C).
 
     Directions of local parameters and first states belong to one recording each, so they open a block
@@ -133,7 +133,7 @@ def levenberg_marquardt(judge: Judge, hypotheses: list[Hypothesis], steps: int =
             innovations[i] = e[k]
             h = now[i]
             w, W = h.whitener(e[k], seen), h.whitener(J[k, : h.moved], seen)
-            waiting[i] = (*normal_equations(h, w, W), 0.5 * float(np.sum(w**2)))
+            waiting[i] = (*whitened_sums(h, w, W), 0.5 * float(np.sum(w**2)))
         still = []
         for _ in range(5):  # shorter and shorter steps until the cost falls
             trials = {i: moved(now[i], _step(H, g, damping[i])) for i, (H, g, _) in waiting.items()}
@@ -185,22 +185,32 @@ def choose_process_noise(judge: Judge, h: Hypothesis, wide: bool = False) -> Hyp
     it falls to the smallest value of the grid by itself; where it does not, something is missing.
     """
     least, most = judge.horizon
+    tried: list[dict[str, float]] = []
     if wide:
         levels = np.geomspace(least, most, 4) / most
-        h = _likeliest(judge, h, _grid(dict.fromkeys(judge.ports, most), levels))
+        h = _likeliest(judge, h, _grid(dict.fromkeys(judge.ports, most), levels), tried)
     for factor in (10.0, 10**0.5):
         trials = _grid(h.process_noise, (1 / factor, 1.0, factor))
         trials = [{p: min(max(v, least), most) for p, v in t.items()} for t in trials]
-        h = _likeliest(judge, h, trials)
+        h = _likeliest(judge, h, trials, tried)
     return h
 
 
-def _likeliest(judge: Judge, h: Hypothesis, trials: list[dict[str, float]]) -> Hypothesis:
-    gains = judge.gains(h, trials)
-    lane = h.lane(judge.bench)
+def _likeliest(
+    judge: Judge, h: Hypothesis, trials: list[dict[str, float]], tried: list[dict[str, float]]
+) -> Hypothesis:
+    """The likeliest process noise; `h` has that of the ones tried before, none of which is run again."""
+    new = [t for k, t in enumerate(trials) if t not in (*trials[:k], *tried)]
+    if not new:
+        return h
+    gains, lane = judge.gains(h, new), h.lane(judge.bench)
     es = judge.bench.innovations([lane._replace(K=K) for K in gains])
-    best = int(np.argmax([judge.likelihood(e) for e in es]))
-    return judge.judged(dataclasses.replace(h, K=gains[best], process_noise=trials[best]), es[best])
+    likelihoods = [judge.likelihood(e) for e in es]
+    best, first = int(np.argmax(likelihoods)), not tried
+    tried += new
+    if not first and likelihoods[best] <= h.log_likelihood:
+        return h
+    return judge.judged(dataclasses.replace(h, K=gains[best], process_noise=new[best]), es[best])
 
 
 def refit(judge: Judge, hypotheses: list[Hypothesis], wide: bool = False, turns: int = 3) -> list[Hypothesis]:

@@ -3,10 +3,10 @@
 import dataclasses
 
 import numpy as np
-from scipy.linalg import null_space
+import scipy
 
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.refit import LONGEST, Judge, choose_process_noise, normal_equations
+from rotflex_jax.discover.refit import LONGEST, Judge, choose_process_noise, whitened_sums
 from rotflex_jax.effects.learned import LearnedTorque
 
 # A step that lowers the penalised cost by less ends a turn [nat].
@@ -60,7 +60,7 @@ def information(judge: Judge, h: Hypothesis, weights: list[int]) -> Information:
     count = max(judge.directions(), h.moved)
     e, J = bench.slopes([h.lane(bench)], [h.directions(bench, count)])
     w, W = h.whitener(e[0], seen), h.whitener(J[0, : h.moved], seen)
-    H, g = normal_equations(h, w, W)
+    H, g = whitened_sums(h, w, W)
     own = np.array([h.free.index(i) for i in weights])
     rest = np.setdiff1d(np.arange(len(g)), own)
     width = max(round(STRETCH / float(bench.data.Ts[0])), 1)
@@ -137,7 +137,7 @@ def fit_map(
     loosest = size**-2
     smoothness = np.full(len(S), loosest)
     now = dataclasses.replace(h, free=(*h.free, *weights))
-    basis = null_space((apart / np.linalg.norm(apart, axis=0)).T, rcond=1e-9)
+    basis = scipy.linalg.null_space((apart / np.linalg.norm(apart, axis=0)).T, rcond=1e-9)
     for turn in range(TURNS):
         damping = 1e-6
         for _ in range(STEPS):

@@ -1,8 +1,8 @@
 """The baseline with every candidate built in and switched off.
 
-Which effects take part is a matter of their gates, which are numbers, so one structure serves nearly all
-refits and comparisons and is compiled once. Effects with states of their own would make every run dearer;
-they are left out of a run unless they are switched on, so each of them is one structure more.
+All hypotheses share its numbering of parameters, effects and states. A run has only those of its candidates
+that are switched on: the others would cost most of the time (twenty times the baseline's with all of them),
+and a structure of few effects compiles quickly.
 """
 
 import dataclasses
@@ -86,13 +86,6 @@ class SuperModel:
         return Transform.of(self.mechanism.parameter_specifications)
 
     @functools.cached_property
-    def costly(self) -> frozenset[int]:
-        """Candidates' effects that make a run dearer: states of their own, or a friction contact."""
-        own = state_rows(self.mechanism)
-        dry = [i for i, _ in effects_of(self.mechanism, DryFriction)]
-        return frozenset(i for i in (*own, *dry) if i >= len(self.baseline.effects))
-
-    @functools.cached_property
     def baseline_states(self) -> list[int]:
         """Places of the baseline's states in the state."""
         own, count = state_rows(self.mechanism), len(self.baseline.effects)
@@ -100,9 +93,8 @@ class SuperModel:
         return sorted([*moving, *(row for i, rows in own.items() if i < count for row in rows)])
 
     def part(self, gates: np.ndarray) -> Part:
-        """The super-model without the costly candidates whose gate (..., E) is zero."""
-        on = {int(i) for i in np.flatnonzero(np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0))}
-        return self._without(self.costly - on)
+        """The super-model without the candidates whose gate (..., E) is zero."""
+        return self.probed(np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0), ())
 
     def probed(self, gates: np.ndarray, family: Iterable[Candidate]) -> Part:
         """The super-model with no other candidates than a family and those whose gate (E,) is not zero."""
@@ -111,13 +103,14 @@ class SuperModel:
         return self._without(frozenset(i for i in others if gates[i] == 0))
 
     def families(self, candidates: Iterable[Candidate]) -> list[list[Candidate]]:
-        """Candidates by what it takes to probe them: states of their own, a torque, a signal."""
+        """Candidates by what it takes to probe them: states of their own, a contact, a torque, a signal."""
         own = state_rows(self.mechanism)
         found: dict[str, list[Candidate]] = {}
         for c in candidates:
-            signal = isinstance(self.mechanism.effects[c.effect], Actuation | Sensing)
-            kind = "states" if c.effect in own else "signal" if signal else "torque"
-            found.setdefault(kind, []).append(c)
+            effect = self.mechanism.effects[c.effect]
+            kinds = {Actuation: "signal", Sensing: "signal", DryFriction: "contact"}
+            by_kind = next((name for kind, name in kinds.items() if isinstance(effect, kind)), "torque")
+            found.setdefault("states" if c.effect in own else by_kind, []).append(c)
         return list(found.values())
 
     def _without(self, left_out: frozenset[int]) -> Part:

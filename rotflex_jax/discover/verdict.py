@@ -35,18 +35,18 @@ def judge_end(
     left = ", ".join(f"{c} {_times(r)}" for c, r in ratios.items())
     reached = f"the held-out error over {seconds:g} s is {left} times the sensor noise"
     names = " and ".join(f"{r.effect.replace('_', ' ')} at the {r.port}" for r in rounds)
+    explain, others = "explain", "some of them from others (listed with each)"
+    if len(rounds) == 1:
+        explain, others = "explains", "this from others (listed with it)"
     visible = [s for s in ranking if s.excited]
     unseen = len(ranking) - len(visible)
     if not explained:
         found = f"{names} found, but something" if rounds else "Something"
         return "unexplained", f"{found} remains that no candidate explains: {reached}."
     if any(r.equivalent for r in rounds):
-        return "ambiguous", (
-            f"{names} explain the recording, but it cannot tell some of them from others "
-            f"(listed with each): {reached}."
-        )
+        return "ambiguous", (f"{names} {explain} the recording, but it cannot tell {others}: {reached}.")
     if rounds:
-        return "found", f"{names} explain the recording: {reached}."
+        return "found", f"{names} {explain} the recording: {reached}."
     if ranking and unseen > len(ranking) / 2:
         return "not_excited", (
             f"Nothing was found, but {unseen} of {len(ranking)} candidates could not have shown in this "

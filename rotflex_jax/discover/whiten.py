@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import scipy
-from scipy.linalg import solve_toeplitz
 
 # White innovations by default. An autoregression fitted to the innovations of an incomplete model also
 # takes away the slow error that the missing effect makes, and with it the power to name the effect.
@@ -66,7 +65,7 @@ def fit_whitener(e: np.ndarray, seen: np.ndarray, floor: np.ndarray, order: int 
         lags = np.array([np.sum(x[:, k:] * x[:, : x.shape[1] - k]) for k in range(order + 1)])
         # A trace of white noise keeps the recursion regular for smooth model errors.
         lags[0] = lags[0] * (1 + 1e-9) + np.sum(seen) * 0.01 * floor[c] ** 2
-        a[c, 1:] = -solve_toeplitz(lags[:-1], lags[1:])
+        a[c, 1:] = -scipy.linalg.solve_toeplitz(lags[:-1], lags[1:])
     plain = Whitener(a, np.eye(C))
     w = plain(e, seen).reshape(-1, C)
     count = max(float(np.sum(seen[:, order:])), 1.0)

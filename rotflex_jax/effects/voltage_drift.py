@@ -19,7 +19,10 @@ class VoltageDrift(Actuation):
         v -> v + rate t
 
     Beside it a constant offset for the value at the beginning. It belongs to a recording, hardly ever
-    to a machine: not for predictions of another run.
+    to a machine: not for predictions of another run. Time counts from the first sample of whatever
+    recording a model is given, so a part that was cut from another (`split`, `slice`) and a window of a fit
+    (`window_seconds`) begin at zero again: fit it to whole recordings, and add `rate * part.start` to the
+    voltage of a later part. Windows of one simulation (`simulate_windows`) share their recording's time.
 
     Args:
         at: Always `input`.

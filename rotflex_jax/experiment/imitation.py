@@ -5,7 +5,6 @@ new recording leaves open: B's shape, every free parameter of the machine, first
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -16,6 +15,7 @@ from rotflex_jax.experiment.hypotheses import Hypothesis
 from rotflex_jax.fit.linear import factor
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, predictor_run
 from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.parameters import Transform
 from rotflex_jax.precision import double_precision
 
@@ -59,7 +59,7 @@ def truth(h: Hypothesis, u: np.ndarray, Ts: float) -> np.ndarray:
         return np.asarray(run)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def _truth(structure: Mechanism, solver: Solver, values: jax.Array, u: jax.Array, Ts: jax.Array) -> jax.Array:
     gates = jnp.ones(len(structure.effects), u.dtype)
     return free_run(structure, solver, values, gates, _rest(structure, u), u, Ts)[1]
@@ -94,14 +94,14 @@ class _Rival:
         return (y - y_hat) @ L.T
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@kept(static=1)
 def _whitened(
     rival: _Rival, numbers: jax.Array, fixed: Any, u: jax.Array, y: jax.Array, Ts: jax.Array
 ) -> Any:
     return rival.whitened(numbers, fixed, u, y, Ts)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@kept(static=1)
 def _with_slopes(
     rival: _Rival, numbers: jax.Array, fixed: Any, u: jax.Array, y: jax.Array, Ts: jax.Array
 ) -> Any:
@@ -111,7 +111,7 @@ def _with_slopes(
     return jax.vmap(lambda way: jax.jvp(run, (numbers,), (way,)), out_axes=(None, -1))(jnp.eye(len(numbers)))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@kept(static=3)
 def _pull(
     structure: Mechanism, solver: Solver, rival: _Rival, numbers: Any, u: jax.Array, Ts: jax.Array
 ) -> Any:

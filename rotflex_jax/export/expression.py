@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 Scalar = Any  # an Expression, a float, or a bool
 
@@ -28,7 +28,7 @@ class Operation(NamedTuple):
     truth: bool = False
 
 
-# By the names that JAX gives its primitives.
+# By the names that JAX gives its primitives. What scipy loads late is named only when it is called.
 OPERATIONS: dict[str, Operation] = {
     "add": Operation("({} + {})", np.add),
     "sub": Operation("({} - {})", np.subtract),
@@ -62,9 +62,9 @@ OPERATIONS: dict[str, Operation] = {
     "asinh": Operation("asinh({})", np.arcsinh),
     "acosh": Operation("acosh({})", np.arccosh),
     "atanh": Operation("atanh({})", np.arctanh),
-    "erf": Operation("erf({})", special.erf),
-    "erfc": Operation("erfc({})", special.erfc),
-    "logistic": Operation("(1.0 / (1.0 + exp(-{})))", special.expit),
+    "erf": Operation("erf({})", lambda x: scipy.special.erf(x)),
+    "erfc": Operation("erfc({})", lambda x: scipy.special.erfc(x)),
+    "logistic": Operation("(1.0 / (1.0 + exp(-{})))", lambda x: scipy.special.expit(x)),
     "floor": Operation("floor({})", np.floor),
     "ceil": Operation("ceil({})", np.ceil),
     "round": Operation("round({})", lambda x: np.trunc(x + np.copysign(0.5, x))),

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 
 from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Force, Gear, Memory
 from rotflex_jax.errors import InputError, optional
-from rotflex_jax.mechanism.assembly import Layout, effects_of, equations
+from rotflex_jax.mechanism.assembly import Layout, effects_of, equations, rest_state
+from rotflex_jax.mechanism.linearise import zero_order_hold
 from rotflex_jax.mechanism.sensors import read_outputs
 from rotflex_jax.mechanism.states import state_names
 from rotflex_jax.mechanism.torques import flows, torques
@@ -51,9 +51,8 @@ class LinearModel:
             raise InputError("The model is in discrete time already; discretise the continuous one.")
         if not (np.isfinite(Ts) and Ts > 0):
             raise InputError(f"Ts was given as {Ts!r}, but it is a sampling period in seconds; give one.")
-        n = len(self.A)
-        big = scipy.linalg.expm(np.block([[self.A, self.B], [np.zeros((1, n + 1))]]) * Ts)
-        return dataclasses.replace(self, A=big[:n, :n], B=big[:n, n:], Ts=float(Ts))
+        A, B = zero_order_hold(self.A, self.B, Ts)
+        return dataclasses.replace(self, A=A, B=B, Ts=float(Ts))
 
     def to_control(self) -> Any:
         """A `StateSpace` of the package python-control, with names.
@@ -119,7 +118,8 @@ def state_space(
                 dL = dL + eq.ports @ torques(mechanism, L, z, u[0], gates)
             return jnp.concatenate([dL, flows(mechanism, L, z, u[0], gates)]) if z.shape[0] else dL
 
-        x = np.concatenate([*point, np.zeros(start - 2 * layout.n), _rests(model, layout)])
+        x = rest_state(mechanism.structure, np.float64)
+        x[: 2 * layout.n] = np.concatenate(point)
         u = jnp.asarray([float(voltage)])
         x = _settled(slope, jnp.asarray(x), u, start)
         A, B = (np.asarray(m) for m in jax.jacfwd(slope, argnums=(0, 1))(x, u))
@@ -148,10 +148,6 @@ def _point(given: Sequence[float] | None, n: int, what: str) -> np.ndarray:
             f"{values.size} {what} were given, but the model has {n} coordinates; give one for each."
         )
     return values
-
-
-def _rests(model: Model, layout: Layout) -> np.ndarray:
-    return np.array([e.initial() for _, e in effects_of(model.mechanism, Memory)], dtype=float)
 
 
 def _settled(slope: Any, x: jax.Array, u: jax.Array, start: int) -> jax.Array:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 
 from rotflex_jax.fit.marquardt import BOUND
 from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations
@@ -16,6 +16,7 @@ from rotflex_jax.fit.residuals import Coordinates, Data
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.mechanism.absent import Numbers, Samples
 from rotflex_jax.mechanism.assembly import whole_state
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.tangents import Ways, outputs_with_slopes
 
 # A step that would lower the negative log-likelihood by less than this is not taken [nat]. A relative
@@ -97,7 +98,7 @@ class Given(NamedTuple):
     scale: Any
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@kept(static=1)
 def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
     """Sums over all recordings, by the M moved coordinates."""
 
@@ -113,7 +114,7 @@ def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
     return Sums(jnp.sum(found.cost, axis=0), g, H)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@kept(static=1)
 def residuals_and_slopes(moved: Moved, flat: jax.Array, given: Given) -> tuple[jax.Array, jax.Array]:
     """Scaled errors (R, N, C) and their slopes by the moved coordinates (R, N, C, M)."""
 

@@ -15,7 +15,7 @@ from rotflex_jax.fit.fitted import Fit
 from rotflex_jax.fit.residuals import Coordinates, Data, first_states, sensor_noise, stack
 from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Mechanism, kalman_gains
-from rotflex_jax.mechanism.assembly import equations
+from rotflex_jax.mechanism.linearise import inverse_mass, linearise
 from rotflex_jax.model import Model, window_starts
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
@@ -109,7 +109,7 @@ def fit(
         for number, stage in enumerate(stages):
             last = number == len(stages) - 1
             for _ in range(3 if last else 1):
-                now = m.with_values(np.asarray(coordinates.split(jnp.asarray(flat))[0]).mean(axis=0))
+                now = m.with_values(coordinates.values(flat).mean(axis=0))
                 if first == "measured":
                     there = dataclasses.replace(model, mechanism=now)
                     for r, recording in enumerate(listed):
@@ -167,9 +167,7 @@ def everywhere(m: Mechanism, intensity: float) -> dict[str, float]:
 
 def torque_scale(m: Mechanism, data: Data) -> float:
     """Torque [N m] that the motor gives at the root mean square voltage."""
-    with double_precision():
-        eq = equations(m, jnp.ones(len(m.effects)))
-        n = len(m.coordinates)
-        push = np.linalg.solve(np.asarray(eq.inverse_mass), np.asarray(eq.B)[n : 2 * n])
+    n = len(m.coordinates)
+    push = np.linalg.solve(inverse_mass(m), linearise(m).B[n : 2 * n])
     level = float(np.sqrt(np.sum(data.u**2 * data.seen) / np.sum(data.seen)))
     return max(float(np.max(np.abs(push))) * level, 1e-6)

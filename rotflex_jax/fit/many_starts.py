@@ -10,6 +10,7 @@ from jaxtyping import Float
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.marquardt import ENOUGH, ROUGHLY, Problem, Reached, descend
 from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
+from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Transform
@@ -101,7 +102,8 @@ def many_starts(
         The best, and where the others ended.
 
     Raises:
-        InputError: Nothing to fit, numbers out of their range, or no start with a finite error.
+        InputError: Nothing to fit, numbers out of their range, a channel that moves against the model, or
+            no start with a finite error.
     """
     model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
     listed = [recordings] if isinstance(recordings, Recording) else list(recordings)
@@ -120,6 +122,7 @@ def many_starts(
             f"Argument `short_seconds` must be positive, but is {short_seconds!r}; give for instance 1.5, or "
             "None."
         )
+    check_signs(model, listed)
     free = np.array([m.parameter_names.index(n) for n in m.free_names])
     transform = Transform.of(m.parameter_specifications)
     z = transform.unconstrain(_box(m, free, starts, spread, seed))[:, free]

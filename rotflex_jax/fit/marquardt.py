@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import export
 from jaxtyping import Array, Float
 
 from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations
@@ -12,6 +13,7 @@ from rotflex_jax.fit.residuals import Data
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.absent import Numbers, Samples
 from rotflex_jax.mechanism.assembly import whole_state
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.parameters import Transform
 
 BOUND = 1.0
@@ -63,7 +65,10 @@ class Reached(NamedTuple):
     z: Any
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+export.register_namedtuple_serialization(Reached, serialized_name=f"{__name__}.Reached")
+
+
+@kept(static=2)
 def descend(
     structure: Mechanism,
     solver: Solver,

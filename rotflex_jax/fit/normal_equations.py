@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, Float
 
 from rotflex_jax.mechanism import Mechanism, Solver
@@ -27,6 +28,9 @@ class Sums(NamedTuple):
     cost: Float[Array, " C"]
     g: Float[Array, " D"]
     H: Float[Array, "D D"]
+
+
+export.register_namedtuple_serialization(Sums, serialized_name=f"{__name__}.Sums")
 
 
 def normal_equations(

@@ -17,6 +17,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
 from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.initial import rough_state
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
@@ -119,11 +120,20 @@ class Coordinates:
         constrain = jax.vmap(self.transform.constrain)
         return constrain(z), flat[P + each * L :].reshape(R, self.states)
 
+    def values(self, flat: np.ndarray) -> np.ndarray:
+        """Physical parameter values (R, P)."""
+        return np.asarray(_split(self, jnp.asarray(flat))[0])
+
     def flatten(self, values: np.ndarray, x0: np.ndarray) -> np.ndarray:
         """The flat vector for physical values (P,), the same in every recording, and first states."""
         z = self.transform.unconstrain(values)
         own = np.tile(z[list(self.local)], self.owning)
         return np.concatenate([z, own, np.asarray(x0, float).ravel()])
+
+
+@kept(static=1)
+def _split(coordinates: Coordinates, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return coordinates.split(flat)
 
 
 def predicted(

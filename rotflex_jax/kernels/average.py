@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels

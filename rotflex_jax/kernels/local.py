@@ -1,6 +1,5 @@
 """Taylor kernels about a constant voltage: exact derivatives of the simulator."""
 
-import functools
 from typing import Any
 
 import jax
@@ -12,6 +11,7 @@ from rotflex_jax.kernels.result import Kernels
 from rotflex_jax.kernels.subject import Modelled, lags_of, subject
 from rotflex_jax.mechanism.assembly import driven_voltage, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.propagate import states
 from rotflex_jax.mechanism.sensors import read_outputs
 from rotflex_jax.mechanism.simulate import FreeStep, Solver, free_run
@@ -98,7 +98,7 @@ def local_kernels(
     )
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
+@kept(static=5)
 def _derivatives(
     structure: Mechanism,
     solver: Solver,

@@ -5,7 +5,6 @@ states alone and are formed for all samples at once. The answer to the voltage k
 `A[t-1] ... A[t-k+1] B[t-k]`, a recursion over the lag in which all samples go side by side.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,12 +14,13 @@ import jax.numpy as jnp
 from rotflex_jax.effects.kinds import Actuation
 from rotflex_jax.mechanism.assembly import driven_voltage, effects_of
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.propagate import chunks, joined, states
 from rotflex_jax.mechanism.sensors import read_outputs
 from rotflex_jax.mechanism.simulate import FreeStep, Solver
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@kept(static=4)
 def slopes(
     structure: Mechanism,
     solver: Solver,

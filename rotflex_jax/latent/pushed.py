@@ -1,7 +1,6 @@
 """A mechanism with unknown torques at some ports, and its linear model along a motion."""
 
 import dataclasses
-import functools
 from typing import Any, ClassVar
 
 import jax
@@ -12,6 +11,7 @@ from rotflex_jax.fit.residuals import Data
 from rotflex_jax.latent.smoother import Linear
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
 from rotflex_jax.mechanism.assembly import driven_voltage
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.propagate import slopes
 from rotflex_jax.mechanism.sensors import read_outputs
 from rotflex_jax.parameters import parameter
@@ -56,7 +56,7 @@ class PushedStep:
         return jnp.concatenate([moved, decay * d])
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def followed(
     structure: Mechanism, solver: Solver, values: jax.Array, gates: jax.Array, x0: Any, data: Data, K: Any
 ) -> jax.Array:
@@ -68,7 +68,7 @@ def followed(
     return jax.vmap(one)(x0, K, *data)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@kept(static=1)
 def linear_model(
     step: PushedStep, values: jax.Array, gates: jax.Array, S: jax.Array, data: Data, decay: jax.Array
 ) -> Linear:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import export
 
 
 class Linear(NamedTuple):
@@ -31,6 +32,9 @@ class Linear(NamedTuple):
     H: Any
     y: Any
     seen: Any
+
+
+export.register_namedtuple_serialization(Linear, serialized_name=f"{__name__}.Linear")
 
 
 class Start(NamedTuple):

@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rotflex_jax.mechanism.assembly import driven_voltage
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.propagate import forcing, recursion, slopes, states
 from rotflex_jax.mechanism.sensors import read_outputs
-from rotflex_jax.mechanism.simulate import PredictorStep, Solver
+from rotflex_jax.mechanism.simulate import PredictorStep, Solver, driven
 
 
 class Numbers(NamedTuple):
@@ -56,10 +55,8 @@ def run_slopes(structure: Mechanism, solver: Solver, numbers: Numbers, samples: 
         samples: The recording.
     """
     step = PredictorStep(structure, solver)
-    driven = driven_voltage(structure.with_values(numbers.values), numbers.gates, samples.u, samples.Ts)
-    v = solver.inputs(driven)
-    inputs = (v, samples.y, samples.seen)
-    constants = (solver.prepare(structure, numbers.values, numbers.gates, samples.Ts), numbers.K)
+    _, v, c = driven(structure, solver, numbers.values, numbers.gates, samples.u, samples.Ts)
+    inputs, constants = (v, samples.y, samples.seen), (c, numbers.K)
     return slopes(step, states(step, numbers.x0, inputs, constants), inputs, constants)
 
 
@@ -88,8 +85,7 @@ def absent_slopes(
     step = PredictorStep(structure, solver)
 
     def prepared(values: jax.Array, gates: jax.Array) -> Any:
-        v = solver.inputs(driven_voltage(structure.with_values(values), gates, samples.u, samples.Ts))
-        return v, solver.prepare(structure, values, gates, samples.Ts)
+        return driven(structure, solver, values, gates, samples.u, samples.Ts)[1:]
 
     v, c = prepared(numbers.values, numbers.gates)
     inputs, constants = (v, samples.y, samples.seen), (c, numbers.K)

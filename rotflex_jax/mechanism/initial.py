@@ -5,13 +5,16 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.simulate import Solver, free_run
 from rotflex_jax.precision import double_precision
+
+# Stretches of one call at least; short as they are, more of them cost next to nothing.
+TOGETHER = 8
 
 
 def rough_state(structure: Mechanism, y: np.ndarray, Ts: float) -> np.ndarray:
@@ -114,6 +117,10 @@ def initial_states(
         rest = rest_state(structure, np.float64)[2 * Layout.of(structure).n :]
         hidden = np.tile(rest, (len(u), 1))
     guess = np.array([rough_state(structure, stretch, Ts) for stretch in y])
+    # Filled up with copies of the last, so that few numbers of stretches are compiled for.
+    rows = np.minimum(np.arange(max(TOGETHER, 2 ** (len(u) - 1).bit_length())), len(u) - 1)
     with double_precision():
-        arrays = map(jnp.asarray, (mechanism.values, gates, guess, hidden, u, y, np.float64(Ts)))
-        return np.concatenate([np.asarray(_refine(structure, solver, *arrays)), hidden], axis=1)
+        stretches = map(jnp.asarray, (guess[rows], hidden[rows], u[rows], y[rows], np.float64(Ts)))
+        numbers = map(jnp.asarray, (mechanism.values, gates))
+        found = np.asarray(_refine(structure, solver, *numbers, *stretches))
+    return np.concatenate([found[: len(u)], hidden], axis=1)

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
+from jaxtyping import Float
 
 from rotflex_jax.mechanism.assembly import Equations, Layout, equations
 from rotflex_jax.mechanism.mechanism import Mechanism
@@ -23,11 +24,24 @@ class StateSpace(NamedTuple):
 
     def discretise(self, Ts: float) -> tuple[np.ndarray, np.ndarray]:
         """`(Ad, Bd)` for an input held over `Ts` [s]; exact."""
-        n = len(self.A)
-        big = np.zeros((n + 1, n + 1))
-        big[:n, :n], big[:n, n] = self.A, self.B
-        big = scipy.linalg.expm(big * Ts)
-        return big[:n, :n], big[:n, n]
+        Ad, Bd = zero_order_hold(self.A, self.B[:, None], Ts)
+        return Ad, Bd[:, 0]
+
+
+def zero_order_hold(
+    A: Float[np.ndarray, "n n"], B: Float[np.ndarray, "n k"], Ts: float
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n k"]]:
+    """`x' = A x + B u` from sample to sample, exact for inputs held over `Ts` [s]: `x+ = Ad x + Bd u`.
+
+    Source: C. F. Van Loan, IEEE Trans. Autom. Control 23, 1978 (exponential of a block matrix).
+
+    >>> Ad, Bd = zero_order_hold(np.array([[-1.0]]), np.array([[1.0]]), np.log(2.0))
+    >>> print(f"{Ad[0, 0]:.3f} {Bd[0, 0]:.3f}")
+    0.500 0.500
+    """
+    n, k = B.shape
+    big = scipy.linalg.expm(np.block([[A, B], [np.zeros((k, n + k))]]) * Ts)
+    return big[:n, :n], big[:n, n:]
 
 
 @kept(static=1)

@@ -15,8 +15,6 @@ from rotflex_jax.mechanism.consistent import check
 from rotflex_jax.mechanism.units import TURNING, Units
 from rotflex_jax.parameters import Specification, specifications
 
-Pairs = tuple[tuple[str, Any], ...]
-
 
 class _Slot:
     """Stands for a number whose value is given elsewhere."""

@@ -1,7 +1,7 @@
 """Whether every coordinate of a mechanism has an inertia, without which there is no motion to compute."""
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from rotflex_jax.effects.kinds import Linear
 from rotflex_jax.errors import InputError

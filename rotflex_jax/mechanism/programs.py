@@ -1,4 +1,7 @@
-"""Traced programs that outlive the process: the next one need not trace them again.
+"""Programs that compile in half the time, and whose trace outlives the process.
+
+XLA's newer way to emit fused operations takes as long over a loop of many small ones as all the rest of the
+compiler, and the loop runs no faster for it; so the older way is asked for, where this XLA has the choice.
 
 JAX's own cache on disk spares the compiler, but only once a program has been traced anew, and where a
 mechanism has thirty effects that takes longer than to run it. So the traced program is kept as well, under a
@@ -34,18 +37,20 @@ _SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
 _WRITES = importlib.util.find_spec("flatbuffers") is not None
 # With these JAX does more at each call than to run a program.
 _WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
+_OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
 _programs: list["Program"] = []
 
 
 class Program:
     """`jax.jit` of a pure function whose first arguments are static, kept on disk beside JAX's own cache.
 
-    Do not differentiate it or map over it: write the function that is to be traced inside of it. Where no
-    folder is set (`enable_compilation_cache`), and on other devices than a CPU, it is `jax.jit` and nothing
-    else.
+    Do not differentiate it or map over it: write the function that is to be traced inside of it. Nothing is
+    kept where no folder is set (`enable_compilation_cache`). On other devices than a CPU, and inside of
+    other programs, it is `jax.jit` and nothing else.
 
     Args:
-        function: Pure; a function of a module of this package that returns an array or a tuple of them.
+        function: Pure; a function of a module of this package that returns an array, a tuple of them, or a
+            named tuple that `jax.export` knows (`register_namedtuple_serialization`).
         static: How many of the first arguments are static.
     """
 
@@ -59,7 +64,7 @@ class Program:
     def __call__(self, *arguments: Any) -> Any:
         """What the function returns."""
         known, leaves = arguments[: self._static], jax.tree.leaves(arguments[self._static :])
-        if not _keeps() or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if _plain() or any(isinstance(leaf, Tracer) for leaf in leaves):
             return self.jitted(*arguments)
         tree = jax.tree.structure(arguments[self._static :])
         kinds = tuple(jax.typeof(leaf) for leaf in leaves)
@@ -67,7 +72,7 @@ class Program:
         key = (known, tree, kinds, settings)
         if key not in self._held:
             texts = [written(x) for x in known]
-            lasting = all(texts) and _unchanged()
+            lasting = _keeps() and all(texts) and _unchanged()
             name = f"{self._name}{texts}{tree}{kinds}{settings}" if lasting else ""
             self._held[key] = self._made(known, tree, leaves, name)
         return self._held[key](*leaves)
@@ -87,14 +92,14 @@ class Program:
             return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
 
         if not name:
-            return jax.jit(flat)
+            return jax.jit(flat, compiler_options=_options())
         file = _folder() / hashlib.sha256(name.encode()).hexdigest()
         program = _read(file)
         if program is None:
             program = export.export(jax.jit(flat))(*leaves)
             _write(program.serialize(), file)
         # Also where it has just been made: the compiler's cache is to meet the same program again.
-        return jax.jit(program.call)
+        return jax.jit(program.call, compiler_options=_options())
 
 
 def kept(static: int) -> Callable[[Callable[..., Any]], Program]:
@@ -142,12 +147,26 @@ def _parts(value: Any) -> Iterator[str | None]:
         yield from _parts(tuple(getattr(value, f.name) for f in fields))
 
 
+def _plain() -> bool:
+    """Whether a program is to be `jax.jit` alone: not on a CPU, or watched at each call."""
+    return jax.default_backend() != "cpu" or any(getattr(jax.config, w) for w in _WATCHED)
+
+
+@functools.cache
+def _options() -> dict[str, Any]:
+    """For the compiler; none where this XLA does not know them."""
+    try:
+        jax.jit(lambda: 0, compiler_options=_OLDER_EMITTERS).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return _OLDER_EMITTERS
+
+
 def _keeps() -> bool:
-    """Whether programs are kept: where JAX keeps what it compiles, on a CPU."""
+    """Whether programs are kept: where JAX keeps what it compiles."""
     known = jax.config.values
     folder = known["jax_compilation_cache_dir"]
-    usual = known["jax_enable_compilation_cache"] and not any(getattr(jax.config, w) for w in _WATCHED)
-    return bool(_WRITES and usual and folder and "://" not in folder and jax.default_backend() == "cpu")
+    return bool(_WRITES and known["jax_enable_compilation_cache"] and folder and "://" not in folder)
 
 
 def _folder() -> Path:

@@ -1,7 +1,6 @@
 """Free run and prediction on arrays; everything is pure, jitted once per structure and differentiable."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ from rotflex_jax.mechanism.assembly import Layout, driven_voltage, effects_of, r
 from rotflex_jax.mechanism.blocks import WORTH, linear_outputs
 from rotflex_jax.mechanism.combine import apply
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.propagate import states
 from rotflex_jax.mechanism.sensors import read_outputs, read_with_sign, sensed
 from rotflex_jax.mechanism.smooth import SmoothRK4
@@ -57,6 +57,15 @@ class PredictorStep:
         return self.solver.advance(self.structure, x + apply(K, e), v, c)
 
 
+def driven(
+    structure: Mechanism, solver: Solver, values: jax.Array, gates: jax.Array, u: jax.Array, Ts: jax.Array
+) -> tuple[Mechanism, Any, Any]:
+    """The mechanism with its numbers, what the solver takes at each sample of `u` (N,), its constants."""
+    mechanism = structure.with_values(values)
+    constants = solver.prepare(structure, values, gates, Ts)
+    return mechanism, solver.inputs(driven_voltage(mechanism, gates, u, Ts)), constants
+
+
 def free_run(
     structure: Mechanism,
     solver: Solver,
@@ -77,9 +86,7 @@ def free_run(
         u: Voltage (N,) [V], held over each sample.
         Ts: Sampling period [s].
     """
-    mechanism = structure.with_values(values)
-    c = solver.prepare(structure, values, gates, Ts)
-    v = solver.inputs(driven_voltage(mechanism, gates, u, Ts))
+    mechanism, v, c = driven(structure, solver, values, gates, u, Ts)
     X = states(FreeStep(structure, solver), x0, v, c)
     return X, read_outputs(mechanism, gates, X.T).T
 
@@ -110,32 +117,21 @@ def predictor_run(
         K: Gain (n, C); zero is a free run.
         Ts: Sampling period [s].
     """
-    mechanism = structure.with_values(values)
-    c = solver.prepare(structure, values, gates, Ts)
-    v = solver.inputs(driven_voltage(mechanism, gates, u, Ts))
+    mechanism, v, c = driven(structure, solver, values, gates, u, Ts)
     X = states(PredictorStep(structure, solver), x0, (v, y, seen), (c, K))
     return X, read_outputs(mechanism, gates, X.T).T
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@kept(static=2)
 def _free_states(structure: Mechanism, solver: Solver, *given: jax.Array) -> jax.Array:
     return free_run(structure, solver, *given)[0]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _free_outputs(
-    structure: Mechanism,
-    solver: Solver,
-    values: jax.Array,
-    gates: jax.Array,
-    x0: jax.Array,
-    u: jax.Array,
-    Ts: jax.Array,
-) -> jax.Array:
-    """Outputs (N, C) alone: no state is kept. Arguments as in `free_run`."""
-    mechanism, step = structure.with_values(values), FreeStep(structure, solver)
-    c = solver.prepare(structure, values, gates, Ts)
-    v = solver.inputs(driven_voltage(mechanism, gates, u, Ts))
+@kept(static=2)
+def _free_outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN202 - as `free_run`
+    """Outputs (N, C) alone: no state is kept."""
+    mechanism, v, c = driven(structure, solver, values, gates, u, Ts)
+    step = FreeStep(structure, solver)
     if step.linear and len(u) >= WORTH:
         rows = jnp.asarray(Layout.of(structure).output_rows, x0.dtype)
         rows = jnp.pad(rows, ((0, 0), (0, len(x0) - rows.shape[1])))

@@ -7,7 +7,7 @@ import numpy as np
 import rotflex_jax as rf
 from arena.rivals.answer import Answer
 from arena.rivals.motion import Array, Motion, motion
-from arena.rivals.selection import select
+from arena.rivals.selection import rows, select
 from arena.rivals.terms import linear_columns, terms
 
 
@@ -16,8 +16,8 @@ def balance(train: rf.Recording) -> Answer:
     m = motion(train)
     listed = terms(m)
     scale = weights(m)
-    flat = [_rows(t.columns, scale) for t in listed]
-    answer = select(_rows(m.missing[:, :, None], scale)[:, 0], _rows(linear_columns(m), scale), listed, flat)
+    flat = [rows(t.columns, scale) for t in listed]
+    answer = select(rows(m.missing[:, :, None], scale)[:, 0], rows(linear_columns(m), scale), listed, flat)
     return answer._replace(note=f"window {m.window}; {answer.note}")
 
 
@@ -26,9 +26,3 @@ def weights(m: Motion) -> Array:
     # On the hub: what acts on theta less what acts on alpha; on the arm: what acts on alpha.
     split = np.array([[1.0, -1.0], [0.0, 1.0]])
     return split / np.std(m.missing @ split.T, axis=0)[:, None]
-
-
-def _rows(torque: Array, scale: Array) -> Array:
-    """(N, 2, k) torques as rows (2 N, k), hub first."""
-    weighted = np.einsum("ij,njk->ink", scale, torque)
-    return weighted.reshape(-1, torque.shape[2])

@@ -18,9 +18,9 @@ import numpy as np
 import rotflex_jax as rf
 from arena.rivals.answer import Answer
 from arena.rivals.motion import Array, Motion, motion
-from arena.rivals.residual import _discrete
-from arena.rivals.selection import select
+from arena.rivals.selection import rows, select
 from arena.rivals.terms import linear_columns, terms
+from rotflex_jax.mechanism.linearise import zero_order_hold
 
 WIDTH, RUN_SECONDS, STEPS, RATE = 24, 0.5, 1200, 5e-3
 
@@ -32,10 +32,11 @@ def neural(train: rf.Recording) -> Answer:
     listed = terms(m)
     # Only samples that are far enough apart to say something new.
     thin = slice(None, None, 5)
-    scale = np.std(torque, axis=0) + 1e-12
-    rows = lambda c: np.moveaxis(c[thin] / scale[:, None], 1, 0).reshape(-1, c.shape[2])  # noqa: E731
-    base = linear_columns(m)
-    answer = select(rows(torque[:, :, None])[:, 0], rows(base), listed, [rows(t.columns) for t in listed])
+    unit = np.diag(1 / (np.std(torque, axis=0) + 1e-12))
+    flat = [rows(t.columns[thin], unit) for t in listed]
+    answer = select(
+        rows(torque[thin, :, None], unit)[:, 0], rows(linear_columns(m)[thin], unit), listed, flat
+    )
     return answer._replace(note=f"runs left with {left:.2g} of the error; {answer.note}")
 
 
@@ -44,7 +45,7 @@ def learn(m: Motion) -> tuple[Array, float]:
     n = len(m.joint.A)
     push = np.zeros((n, 2))
     push[2:4] = np.linalg.inv(m.mass)
-    A, B = _discrete(m.joint.A, np.column_stack([m.joint.B, push]), m.Ts)
+    A, B = zero_order_hold(m.joint.A, np.column_stack([m.joint.B, push]), m.Ts)
     length = round(RUN_SECONDS / m.Ts)
     runs = len(m.u) // length
     cut = lambda x: x[: runs * length].reshape(runs, length, *x.shape[1:])  # noqa: E731

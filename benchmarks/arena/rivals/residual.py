@@ -8,8 +8,9 @@ from scipy.signal import dlsim
 import rotflex_jax as rf
 from arena.rivals.answer import Answer
 from arena.rivals.motion import Array, Motion, linear_joint, motion
-from arena.rivals.selection import select
+from arena.rivals.selection import rows, select
 from arena.rivals.terms import linear_columns, terms
+from rotflex_jax.mechanism.linearise import zero_order_hold
 
 
 def residual(train: rf.Recording) -> Answer:
@@ -19,7 +20,7 @@ def residual(train: rf.Recording) -> Answer:
     inside = slice(m.start, m.start + len(m.u))
     error = (np.asarray(train.y) - fit.model.simulate(train))[inside]
     listed = terms(m)
-    spread = np.std(error, axis=0)
+    unit = np.diag(1 / np.std(error, axis=0))
     start = [_free(m, k) for k in range(4)]
     linear = linear_columns(m)
     own = [_answer(m, linear[:, :, k]) for k in range(linear.shape[2])]
@@ -27,39 +28,24 @@ def residual(train: rf.Recording) -> Answer:
     columns = [
         np.stack([_answer(m, t.columns[:, :, k]) for k in range(t.columns.shape[2])], axis=2) for t in listed
     ]
-    flat = [_rows(c, spread) for c in columns]
-    return select(_rows(error[:, :, None], spread)[:, 0], _rows(base, spread), listed, flat)
+    flat = [rows(c, unit) for c in columns]
+    return select(rows(error[:, :, None], unit)[:, 0], rows(base, unit), listed, flat)
 
 
 def _answer(m: Motion, torque: Array) -> Array:
     """Angles (N, 2) that a generalised torque (N, 2) makes of the linear joint, from rest."""
     push = np.zeros((len(m.joint.A), 2))
     push[2:4] = np.linalg.inv(m.mass)
-    A, B = _discrete(m.joint.A, push, m.Ts)
+    A, B = zero_order_hold(m.joint.A, push, m.Ts)
     held = 0.5 * (torque + np.vstack([torque[1:], torque[-1:]]))
     return dlsim((A, B, m.joint.C, np.zeros((2, 2)), m.Ts), held)[1]
 
 
 def _free(m: Motion, k: int) -> Array:
     """Angles (N, 2) after a unit of one first state."""
-    A, _ = _discrete(m.joint.A, np.zeros((len(m.joint.A), 1)), m.Ts)
+    A, _ = m.joint.discretise(m.Ts)
     x, out = np.eye(len(A))[:, k], np.empty((len(m.u), 2))
     for row in out:
         row[:] = m.joint.C @ x
         x = A @ x
     return out
-
-
-def _discrete(A: Array, B: Array, Ts: float) -> tuple[Array, Array]:
-    from scipy.linalg import expm
-
-    n, k = len(A), B.shape[1]
-    big = np.zeros((n + k, n + k))
-    big[:n, :n], big[:n, n:] = A, B
-    big = expm(big * Ts)
-    return big[:n, :n], big[:n, n:]
-
-
-def _rows(signal: Array, spread: Array) -> Array:
-    """(N, 2, k) as rows (2 N, k), each channel in units of its error."""
-    return np.moveaxis(signal / spread[:, None], 1, 0).reshape(-1, signal.shape[2])

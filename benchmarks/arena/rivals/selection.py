@@ -17,6 +17,11 @@ from rotflex_jax.effects import CATALOG
 ROUNDS, MARGIN, PARSIMONY = 3, 30.0, 0.9
 
 
+def rows(signal: Array, scale: Array) -> Array:
+    """(N, 2, k) as rows (2 N, k), the two channels turned and scaled by a matrix (2, 2) first."""
+    return np.einsum("ij,njk->ink", scale, signal).reshape(-1, signal.shape[2])
+
+
 def select(target: Array, base: Array, candidates: Sequence[Term], columns: Sequence[Array]) -> Answer:
     """Adds the group that lowers BIC most, until none does.
 

@@ -1,0 +1,76 @@
+"""A search over the whole catalogue: from nothing, from a new process, and with everything compiled."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# What is hidden in the records, 20 s at 500 Hz each, tuning seeds.
+HIDDEN = ("", "cubic_spring@joint", "coulomb@hub", "lag@input")
+PROCESS = """
+import json, resource, sys, time
+import rotflex_jax as rf
+rf.enable_fast_loops(); rf.enable_compilation_cache()
+import numpy as np
+used = lambda: sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+rounds = []
+for path in sys.argv[1:]:
+    record = np.load(path)
+    train, test = rf.Recording(u=record["u"], y=record["y"], Ts=float(record["Ts"])).split(0.7)
+    began, worked = time.perf_counter(), used()
+    found = rf.discover(rf.joints.paper(), train, test)
+    rounds.append([time.perf_counter() - began, used() - worked, len(found.rounds)])
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(json.dumps({"rounds": rounds, "processor": used(), "peak": peak}))
+"""
+
+
+def searches(seconds: float) -> dict[str, float]:
+    """Times by the clock and of the processor [s], and memory [MB]."""
+    from arena.records import make_record
+
+    with tempfile.TemporaryDirectory() as folder:
+        paths = []
+        for k, place in enumerate(HIDDEN):
+            effects = [(place.split("@")[0], place.split("@")[1])] if place else []
+            made = make_record(effects, kind="noise", seed=104 + k, seconds=seconds)
+            paths.append(f"{folder}/{k}.npz")
+            np.savez(paths[-1], u=made["u"], y=made["y"], Ts=made["Ts"])
+        one, cache = paths[1], f"{folder}/cache"
+        first, again = _process([one], cache), _process([one], cache)
+        # All of them twice: the second time everything is compiled and loaded.
+        every = _process([*paths, *paths], cache)
+    warm = every["rounds"][len(paths) :]
+    return {
+        "new process, nothing compiled, seconds": first["clock"],
+        "new process, nothing compiled, processor seconds": first["processor"],
+        "new process, warm cache, seconds": again["clock"],
+        "new process, warm cache, processor seconds": again["processor"],
+        "everything compiled, median, seconds": statistics.median(r[0] for r in warm),
+        "everything compiled, median, processor seconds": statistics.median(r[1] for r in warm),
+        "everything compiled, longest, seconds": max(r[0] for r in warm),
+        "peak memory of one search in MB": again["peak"],
+    }
+
+
+def _process(paths: list[str], cache: str) -> dict[str, Any]:
+    """What a new process says that searches these records, and its seconds by the clock."""
+    began = time.perf_counter()
+    known = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
+    done = subprocess.run(
+        [sys.executable, "-c", PROCESS, *paths],
+        check=True,
+        capture_output=True,
+        text=True,
+        env={**known, "JAX_COMPILATION_CACHE_DIR": cache},
+    )
+    return {**json.loads(done.stdout.splitlines()[-1]), "clock": time.perf_counter() - began}
