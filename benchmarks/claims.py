@@ -301,6 +301,91 @@ def methods_count() -> str:
     return str(len(results("B5/rotflex_mixed.json")["rows"]))
 
 
+def _fit_seconds() -> dict[str, float]:
+    """What each method but the search took to fit, from run A of the measured joint [s]."""
+    rows = results("B5/rotflex_AB.json")["rows"]
+    return {r["method"]: r["fit_seconds"] for r in rows if r["method"] != "discovered" and r["fit_seconds"]}
+
+
+@named
+def compare_seconds() -> str:
+    """All of them together [s]."""
+    return f"{sum(_fit_seconds().values()):.0f}"
+
+
+@named
+def compare_ensemble() -> str:
+    """The one that takes longest [s]."""
+    assert max(_fit_seconds(), key=_fit_seconds().__getitem__) == "sindy_ensemble"
+    return f"{_fit_seconds()['sindy_ensemble']:.0f}"
+
+
+@named
+def compare_first() -> str:
+    """The first fit of the physics, which compiles for the others [s]."""
+    return f"{_fit_seconds()['linear']:.0f}"
+
+
+@named
+def compare_other() -> str:
+    """The slowest of the others [s]."""
+    return f"{max(s for m, s in _fit_seconds().items() if m not in ('sindy_ensemble', 'linear')):.1f}"
+
+
+# -- many recordings ----------------------------------------------------------------------------------------
+
+
+@named
+def fleet_million() -> str:
+    """What the machinery around a million searches takes [min]."""
+    return f"{1e6 * results('B8.json')['fleet']['searched'] / 60:.0f}"
+
+
+@named
+def fleet_workers() -> str:
+    """How many workers one command can feed, for each second that a search takes, in two digits."""
+    return f"{float(format(1 / results('B8.json')['fleet']['searched'], '.2g')):,.0f}"
+
+
+# -- kernels and learned torques ----------------------------------------------------------------------------
+
+
+def _change(name: str, kernel: str) -> str:
+    """By how much an effect changes a kernel."""
+    share = 100 * results("B8.json")["kernels"]["shares"][name][kernel]
+    return f"{share:.2g} %" if share else "exactly nothing"
+
+
+for _effect in (
+    *("coulomb hub", "coulomb joint", "stribeck hub", "dead zone", "saturation", "cubic spring"),
+    *("quadratic drag", "joint play", "sensor cubic", "offset", "quadratic spring", "rectifier"),
+    *("one-sided dead zone", "unequal coulomb", "offset with friction"),
+):
+    for _degree, _kernel in ((1, "linear"), (2, "quadratic")):
+        _key = f"kernel_{_effect.replace(' ', '_').replace('-', '_')}_h{_degree}"
+        NAMED[_key] = functools.partial(_change, _effect, _kernel)
+
+
+def _in_noise(hidden: str, when: str) -> str:
+    """Errors of short held-out runs, in multiples of the noise."""
+    found = results("B8.json")["torque"][hidden]
+    if when == "after" and not found["kept"]:
+        return "not kept"
+    return " / ".join(f"{found[when][c]:.1f}" for c in ("theta", "alpha"))
+
+
+def _reads(hidden: str) -> str:
+    """The formula of a learned torque, for a cell of a table."""
+    found = results("B8.json")["torque"][hidden]
+    return "`" + found["formula"].replace("|", "\\|") + "`" if found["kept"] else ""
+
+
+for _hidden in ("friction", "drag", "uneven friction", "nothing"):
+    _key = f"torque_{_hidden.replace(' ', '_')}"
+    NAMED |= {f"{_key}_{w}": functools.partial(_in_noise, _hidden, w) for w in ("before", "after")}
+    NAMED[f"{_key}_reads"] = functools.partial(_reads, _hidden)
+
+
 # -- the next experiment ------------------------------------------------------------------------------------
 
 
@@ -374,6 +459,12 @@ def _cost(row: str) -> float:
 def _digits(value: float) -> str:
     """Three digits, without a power of ten."""
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+@named
+def order_4_over_2() -> str:
+    """How many times as much as at order 2 a run costs at order 4."""
+    return f"{_cost(BESIDE['order_4'][0]) / _cost(BESIDE['order_2'][0]):.1f}"
 
 
 for _name, (_row_name, _base) in BESIDE.items():

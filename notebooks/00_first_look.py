@@ -159,9 +159,9 @@ def show_missing(fit, colour):
 show_missing(textbook, RED)
 
 # %% [markdown]
-# Left: beyond some five degrees the real arm is pulled back harder than the linear spring pulls. The
-# bend the other way in between is the fit's doing: it made the linear spring stiffer to make up for
-# it. Right: a step where the hub changes direction. One thing after the other.
+# Left: far from its middle the real arm is pulled back harder than the linear spring pulls. The bend the
+# other way in between is the fit's doing: it made the linear spring stiffer to make up for it. Right: a
+# step where the hub changes direction. One thing after the other.
 #
 # ## Which effect?
 #
@@ -195,10 +195,10 @@ def show_errors(fits):
 show_errors(fits)
 
 # %% [markdown]
-# - The **cubic spring** takes two thirds of the error of alpha away, and little of theta. Two effects may
-#   be missing, then.
-# - The **dead zone** is a warning: it nearly halves the *training* error of theta, and more than
-#   doubles the held-out one. It imitates friction on the data it was fitted to, and only there.
+# - The **cubic spring** takes more than half of the error of alpha away, and little of theta. Two effects
+#   may be missing, then.
+# - The **dead zone** is a warning: it takes more than a third of the *training* error of theta away, and
+#   more than doubles the held-out one. It imitates friction on the data it was fitted to, and only there.
 #
 # Look and table agree on the spring. Keep it, and look again.
 
@@ -326,7 +326,7 @@ print(result.report("rotflex-report").as_posix())
 # - `ambiguous` names effects that your recording cannot tell apart; `not_excited` those it could
 #   not have shown. Another experiment helps, another algorithm does not.
 # - The held-out part has helped to choose the effects, so it is no neutral judge any more. Where the
-#   error falls twentyfold this does not matter; in a close call, record again.
+#   error falls tenfold this does not matter; in a close call, record again.
 # - All torques hang on one trusted constant, the arm's inertia here: if it is 10 % off, so are
 #   stiffness and friction.
 #

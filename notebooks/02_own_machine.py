@@ -10,7 +10,7 @@
 # # Does this work for my machine, and for an effect of my own?
 #
 # Nothing in the toolkit knows of a flexible joint in particular. This notebook describes another machine
-# in ten lines, an effect that the catalogue lacks in fifteen, and asks `rf.discover` what is missing.
+# in some lines, an effect that the catalogue lacks in some more, and asks `rf.discover` what is missing.
 #
 # The machine: a motor turns a platter through a belt. An encoder sits on the motor. The platter has only
 # a tacho behind a rectifier, which reads the speed without its sign; no sensor shows the platter's angle.
@@ -40,7 +40,7 @@ GREY, RED, BLUE = "#9aa5b1", "#c8452f", "#0f6f86"
 #
 # Two coordinates: the angles of motor and platter. A port is where something can push: the motor, the
 # platter, and the belt, which feels the difference of the two angles. Everything else is an effect at a
-# port. The numbers are from data sheets, up to a fifth off; the motor's and the rectifier's are trusted,
+# port. The numbers are from data sheets, up to a quarter off; the motor's and the rectifier's are trusted,
 # since voltage and angles tell torques only up to one common factor.
 
 # %%

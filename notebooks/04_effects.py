@@ -128,7 +128,7 @@ for name, row in zip(added, table, strict=True):
 
 # %% [markdown]
 # Take the gain away: scale the linear run so that it comes as near as it can, and see what is left of the
-# last four. Under the binary input nothing is left of dead zone and saturation. A search says so: such a
+# last three. Under the binary input nothing is left of dead zone and saturation. A search says so: such a
 # candidate is listed as *not excited*, which is not the same as absent.
 
 # %%

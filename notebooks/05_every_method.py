@@ -32,7 +32,7 @@ recording
 # %% [markdown]
 # The recording (ten seconds of it) comes with the package; it is simulated, with dry friction at the hub
 # and a spring that hardens. `linear` and `grey_box` are the two ends of physics: the textbook joint, and
-# the joint with both effects built in. A dozen more methods are a name each; `rf.compare(recording)` runs
+# the joint with both effects built in. Twenty more methods are a name each; `rf.compare(recording)` runs
 # them all, and [docs/compare.md](../docs/compare.md) shows them on a measured joint.
 
 # %%

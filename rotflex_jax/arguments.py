@@ -38,7 +38,7 @@ OutputColumns = Annotated[
     typer.Option(
         "--output",
         metavar="COLUMN",
-        help="Column of theta, then again for alpha; or CHANNEL=COLUMN.",
+        help="Column of theta, and once more for that of alpha; or CHANNEL=COLUMN.",
     ),
 ]
 Degrees = Annotated[bool, typer.Option("--degrees", help="Angles in the files are in degrees.")]

@@ -1,4 +1,4 @@
-"""The command line: `rotflex demo`, `discover`, `compare`, `reproduce`, `simulate` and others.
+"""The command line: `rotflex demo`, `check`, `discover`, `compare` and others.
 
 Exit status 0 on any verdict, 2 on bad input with one sentence on stderr. Everything heavy is
 imported inside the commands, so that `rotflex --help` answers at once.
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from rotflex_jax import arguments as given, terminal
-from rotflex_jax.data_commands import data_app
+from rotflex_jax.data_commands import check, data_app
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment_command import experiment
 from rotflex_jax.export_command import export
@@ -29,11 +29,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the physics a model of a rotary flexible joint is missing, from a recording of it.",
 )
-app.add_typer(data_app, name="data")
-app.command()(reproduce)
-app.command()(simulate)
-app.command()(experiment)
-app.command()(export)
 
 # The class of every mistake in the arguments; typer does not export it by name.
 _UsageError: Any = typer.BadParameter.__bases__[0]
@@ -81,7 +76,6 @@ def _start(
         print(context.get_help())
 
 
-@app.command()
 def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.JsonFile = None) -> None:
     """Show the loop on a recording that comes with the package, up to its report."""
     given.check_writable(json_file=json_file, folder=report)
@@ -91,7 +85,6 @@ def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.Jso
     _discover(given.joint("paper"), [train], [test], report, json_file)
 
 
-@app.command()
 def discover(
     files: given.Files,
     joint: given.JointName = "paper",
@@ -127,7 +120,6 @@ def discover(
     _discover(model, train, test, report, json_file, save_model)
 
 
-@app.command()
 def compare(
     files: given.Files,
     methods: Annotated[
@@ -176,7 +168,6 @@ def compare(
         terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
 
 
-@app.command()
 def effects(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")] = False,
 ) -> None:
@@ -223,3 +214,9 @@ def _give(result: Any, show: Callable[[Any], None], json_file: Path | None) -> N
     show(result)
     if json_file is not None:
         json_file.write_text(text + "\n", encoding="utf-8")
+
+
+# In the order in which a newcomer needs them.
+for _command in (demo, check, discover, compare, simulate, experiment, export, effects, reproduce):
+    app.command()(_command)
+app.add_typer(data_app, name="data")

@@ -1,10 +1,14 @@
-"""`rotflex data`: the public recordings, listed and fetched."""
+"""`rotflex check`: a look at one's own recordings; `rotflex data`: the public ones, listed and fetched."""
 
 from typing import Annotated
 
 import typer
 
 from rotflex_jax import arguments as given, terminal
+from rotflex_jax.errors import InputError
+
+# Below so many seconds a search has too few reversals to learn from and to judge on.
+BRIEF = 5.0
 
 data_app = typer.Typer(help="Public recordings: list them, fetch them.")
 
@@ -43,3 +47,34 @@ def data_fetch(
             paths = fetch(name)
         for path in paths:
             print(path)
+
+
+def check(
+    files: given.Files,
+    joint: given.JointName = "paper",
+    input_column: given.InputColumn = None,
+    output_columns: given.OutputColumns = None,
+    degrees: given.Degrees = False,
+    Ts: given.SamplingPeriod = None,
+    time_column: given.TimeColumn = None,
+    accept: given.Accept = None,
+) -> None:
+    """Say what is in a recording and what is wrong with it; takes seconds."""
+    given.check_distinct(files, [])
+    model = given.model(joint)
+    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    from rotflex_jax.fit.signs import check_signs
+
+    for file in files:
+        recording = columns.load(file)
+        terminal.print_recording(recording)
+        if recording.duration < BRIEF:
+            terminal.message(
+                f"note: {recording.duration:g} s are little for a search; ten to twenty with many reversals "
+                "are right."
+            )
+        try:
+            check_signs(model, [recording])
+        except InputError as error:
+            raise InputError(f"{file}: {error}") from None
+        terminal.message(f"The signs of {' and '.join(model.mechanism.channels)} are those of {joint}.")

@@ -57,6 +57,8 @@ def simulate(
     errors = dict(zip(units, rmse, strict=True))
     console = terminal.output()
     console.print(terminal.error_table([("RMS error of the free run", errors)], units))
+    explained = zip(units, rf.metrics.fit_percent(y, y_hat, recording.n_init), strict=True)
+    terminal.message(f"Fit, where 100 % is perfect: {', '.join(f'{c} {p:.1f} %' for c, p in explained)}")
     if save is not None:
         terminal.save_simulation(save, recording, dict(zip(units, y_hat.T, strict=True)))
     if save_model is not None:

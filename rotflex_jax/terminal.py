@@ -159,6 +159,22 @@ def print_findings(recordings: Sequence[Any]) -> None:
                 message(f"Look at {where}{finding.message}", error=True)
 
 
+def print_recording(recording: Any) -> None:
+    """What was measured: extent, ranges, steps of the sensors, and everything that was noticed."""
+    about = f"{recording.N} samples, {recording.duration:g} s at {1 / recording.Ts:g} Hz"
+    message(f"{recording.source}: {about}" if recording.source else about)
+    signals = [(recording.input_name, recording.input_unit, recording.u)]
+    signals += zip(recording.channels, recording.units, recording.y.T, strict=True)
+    rows = []
+    for name, unit, x in signals:
+        limits = [number(shown(float(end), unit)[0]) for end in (x.min(), x.max())]
+        step = number(shown(recording.resolution.get(name), unit)[0])
+        rows.append((name, shown(None, unit)[1], *limits, step))
+    print_rows(("signal", "unit", "from", "to", "step"), rows)
+    for finding in recording.findings:
+        message(f"{finding.severity}: {finding}")
+
+
 def message(text: str, *, error: bool = False) -> None:
     """One line for a person."""
     Console(stderr=error, highlight=False).print(text, markup=False, soft_wrap=True)

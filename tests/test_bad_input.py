@@ -129,6 +129,26 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
         {"outputs": ("theta (rad)", "alpha (rad)"), "degrees": True},
         "in rad by its name, but degrees=True was given",
     ),
+    "unit ms": (
+        text(edited(0, "t,voltage,theta,alpha\nms,V,rad,rad")),
+        {},
+        "'t' is in ms by its line of units, but seconds are needed",
+    ),
+    "unit deg": (
+        text(edited(0, "t,voltage,theta,alpha\ns,V,deg,deg")),
+        {},
+        "'theta' is in deg by its line of units, but degrees=False was given; pass degrees=True",
+    ),
+    "text below the units": (
+        text(edited(0, "t,voltage,theta,alpha\ns,V,rad,rad\nx,0,0,0")),
+        {},
+        "'voltage' holds 'V' at line 2",
+    ),
+    "two names in one": (
+        text(),
+        {"outputs": "theta,alpha"},
+        "no column 'theta,alpha'; .*: name theta and alpha one by one with outputs=",
+    ),
     "contradicting Ts": (text(), {"Ts": 0.001}, "advances by 0.002 s, but Ts=0.001 was given"),
     "no Ts": (text(t=None), {"Ts": 0.0}, "`Ts` must be a positive number of seconds, but is 0"),
     "input as output": (text(), {"input": "theta"}, "'theta' was given as input and as output"),

@@ -1,6 +1,7 @@
 """The command line: what it accepts, what it refuses and how, what it prints."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -20,12 +21,12 @@ from rotflex_jax.data.datasets import DATASETS
 from rotflex_jax.model import Model
 
 NAMES = ("t", "voltage", "theta", "alpha")
-DEMO = np.loadtxt(
-    files("rotflex_jax.data").joinpath("demo.csv").read_text().splitlines(),
-    delimiter=",",
-    skiprows=1,
-    max_rows=600,
+DEMO_WHOLE = np.loadtxt(
+    files("rotflex_jax.data").joinpath("demo.csv").read_text().splitlines(), delimiter=",", skiprows=1
 )
+DEMO = DEMO_WHOLE[:600]
+IN_THE_ROOM = np.eye(4)  # the angle of the arm in the room instead of its deflection
+IN_THE_ROOM[2, 3] = 1.0
 WAVE = np.sin(np.arange(len(DEMO)) / 50)
 # A process of its own finds the package wherever it was started.
 HERE = os.environ | {"PYTHONPATH": str(Path(rf.__path__[0]).parent)}
@@ -260,6 +261,25 @@ def test_simulate_tells_errors_and_saves(run, recorded, tmp_path) -> None:
     np.testing.assert_allclose(table[:, 4:], y_hat, atol=1e-6)
     degrees = np.rad2deg(rf.metrics.rmse(recording.y, y_hat, recording.n_init))
     assert all(terminal.number(value) in out for value in degrees)
+    theta, alpha = rf.metrics.fit_percent(recording.y, y_hat, recording.n_init)
+    assert f"Fit, where 100 % is perfect: theta {theta:.1f} %, alpha {alpha:.1f} %" in out
+
+
+def test_check_tells_what_is_in_a_file_and_refuses_a_wrong_sign(run, recorded, tmp_path) -> None:
+    status, out, err = run("check", recorded)
+    assert (status, err) == (0, "")
+    assert "600 samples, 1.2 s at 500 Hz" in out
+    ends = np.rad2deg([DEMO[:, 2].min(), DEMO[:, 2].max()])
+    (row,) = (line.split() for line in out.splitlines() if line.startswith("theta "))
+    assert row[:4] == ["theta", "deg", *(terminal.number(end) for end in ends)]
+    assert "note: Channel 'theta' is quantised" in out and "note: 1.2 s are little for a search" in out
+    assert "The signs of theta and alpha are those of paper." in out
+    status, _, err = run("check", write(tmp_path / "turned.csv", DEMO * [1, 1, 1, -1]))
+    assert status == 2
+    assert_one_sentence(err, "turned.csv", "negate the column of alpha")
+    status, out, _ = run("check", write(tmp_path / "room.csv", DEMO_WHOLE @ IN_THE_ROOM))
+    assert status == 0 and "warning: Channel 'alpha' follows 'theta' one to one" in out
+    assert "little for a search" not in out
 
 
 class FakeSearch:
@@ -410,13 +430,15 @@ print(enable_compilation_cache())
 
 
 @pytest.mark.slow
-def test_discover_on_the_demo_recording(run, tmp_path: Path) -> None:
-    demo = files("rotflex_jax.data").joinpath("demo.csv").read_text().splitlines()
-    # As long as the recordings of the other searches, with which it shares what is compiled.
-    (tmp_path / "demo.csv").write_text("\n".join(demo[:3501]))
-    status, out, err = run("discover", tmp_path / "demo.csv", "--json", "-")
+def test_discover_on_the_demo_recording(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real search behind the command; of two effects, since finding among all is shown elsewhere."""
+    pairs = [(rf.effects.Coulomb, "hub"), (rf.effects.CubicSpring, "joint")]
+    monkeypatch.setattr(rf, "discover", functools.partial(rf.discover, candidates=pairs, rounds=1))
+    status, out, err = run("discover", write(tmp_path / "demo.csv", DEMO_WHOLE[:2000]), "--json", "-")
     assert status == 0, err
     found = json.loads(out, parse_constant=pytest.fail)
     assert found["schema"] == 1
-    assert ("coulomb", "hub") in {(turn["effect"], turn["port"]) for turn in found["rounds"]}
+    (turn,) = found["rounds"]
+    assert (turn["effect"], turn["port"]) in {(effect.name, port) for effect, port in pairs}
+    assert turn["held_out_rmse_windows"]["theta"] < found["baseline"]["held_out_rmse_windows"]["theta"]
     assert "Traceback" not in err

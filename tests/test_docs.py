@@ -84,6 +84,17 @@ def clipped() -> rf.Recording:
     return rf.Recording(u=rf.data.excitation.noise(2000, TS, seed=3), y=y, Ts=TS)
 
 
+def in_the_room() -> rf.Recording:
+    """The demo recording with the angle of the arm in the room."""
+    demo = rf.data.demo_recording()
+    return rf.Recording(u=demo.u, y=demo.y @ np.array([[1.0, 1.0], [0.0, 1.0]]), Ts=demo.Ts)
+
+
+def doubted(recording: rf.Recording) -> None:
+    """A warning, which is no refusal, as one."""
+    raise rf.InputError(next(str(f) for f in recording.findings if f.severity == "warning"))
+
+
 def held() -> rf.Discovery:
     joint = rf.joints.paper()
     return rf.discover(joint.trust(*joint.free_names), recording(), recording())
@@ -105,7 +116,10 @@ RAISED: dict[str, Callable[[], object]] = {
     "many other names": lambda: rf.load(
         file(t=None, clock=GOOD["t"], voltage=None, u=GOOD["voltage"], theta=None, hub=GOOD["theta"])
     ),
-    "line of units": lambda: rf.load(lines(lambda rows: [rows[0], "s,V,rad,rad", *rows[1:]])),
+    "line of remarks": lambda: rf.load(lines(lambda rows: [rows[0], "s,V,rad,rad", "run 3,,,", *rows[1:]])),
+    "degrees by unit": lambda: rf.load(lines(lambda rows: [rows[0], "s,V,deg,deg", *rows[1:]])),
+    "two names in one": lambda: rf.load(file(), outputs="theta,alpha"),
+    "in the room": lambda: doubted(in_the_room()),
     "milliseconds by name": lambda: rf.load(file(t=None, t_ms=1000 * GOOD["t"]), time="t_ms"),
     "no time": lambda: rf.load(file(t=None)),
     "no header": lambda: rf.load(lines(lambda rows: rows[1:])),

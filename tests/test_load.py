@@ -12,6 +12,7 @@ import scipy.io
 
 from rotflex_jax.data import load, save_csv
 from rotflex_jax.data.excitation import noise
+from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 
 Ts = 0.004
@@ -157,6 +158,22 @@ def test_matrices_and_structures_have_columns(tmp_path: Path) -> None:
         outputs=("log.angles[0]", "log.angles[1]"),
     )
     assert_is_the_run(recording)
+
+
+@pytest.mark.parametrize("write", [scipy.io.savemat, write_hdf5])
+def test_signals_in_rows_are_signals(write: Callable, tmp_path: Path) -> None:
+    """As Simulink's block To File writes them; a matrix of fewer than 50 rows can hold no recording else."""
+    write(tmp_path / "run.mat", {"ans": TABLE.T})
+    outputs = ("ans[2]", "ans[3]")
+    assert_is_the_run(load(tmp_path / "run.mat", time="ans[0]", input="ans[1]", outputs=outputs))
+
+
+@pytest.mark.parametrize("units", ["s,V,rad,rad", '"[s]","[V]","[rad]","[rad]"', "s,,rad,rad"])
+def test_line_of_units_is_read(units: str, tmp_path: Path) -> None:
+    path = write_text(tmp_path / "run.csv", header="t,voltage,theta,alpha\n" + units)
+    assert_is_the_run(load(path))
+    with pytest.raises(InputError, match="in rad by its line of units, but degrees=True"):
+        load(path, degrees=True)
 
 
 def test_matrix_of_matlab_7_3_is_not_transposed(tmp_path: Path) -> None:

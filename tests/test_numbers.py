@@ -1,5 +1,6 @@
 """Every number that README and paper claim of the benchmarks is traced to a generated result."""
 
+import json
 import math
 import re
 from collections.abc import Iterator
@@ -99,8 +100,38 @@ TABLES = {
     "next_experiment.md": ["B4.json"],
     "public_recordings.md": ["B3.json"],
     "seed_paper.md": ["B2.json"],
+    "kernels.md": ["B8.json"],
+    "latent_torque.md": ["B8.json"],
+    "many_recordings.md": ["B8.json"],
+    **dict.fromkeys(["first_look.md", "glossary.md", "load_data.md", "method.md", "read_report.md"], ()),
+    **dict.fromkeys(["add_effect.md", "export.md", "own_machine.md", "trust.md", "speed.md", "index.md"], ()),
+    **dict.fromkeys(["from_matlab.md", "troubleshooting.md", "design.md", "cite.md"], ()),
 }
 KNOWN = {
+    "kernels.md": {
+        **dict.fromkeys(["0.03", "0.003", "0.045", "0.015"], "levels of friction, settings [N m]"),
+        **dict.fromkeys(["0.1", "1.5", "0.3", "0.25"], "dead zones, limit, offset, settings [V]"),
+        **dict.fromkeys(["0.001", "0.006", "0.15"], "drag, play, loss of a sensor, settings"),
+        "0.8": "bandwidth, a setting [Hz]",
+    },
+    "latent_torque.md": {
+        **dict.fromkeys(["0.03", "0.008", "0.04", "0.8"], "what was hidden, settings"),
+        **dict.fromkeys(["2109.10681", "2501.05842"], "names of preprints"),
+    },
+    "many_recordings.md": {"3.5": "fleet.processes.ROOM [GB], compared below"},
+    "first_look.md": {
+        "3.11": "version of Python",
+        **dict.fromkeys(["1.01", "0.7"], "what the demo prints, compared below"),
+        "0.2": "time that a model may look at, a setting [s]",
+        **dict.fromkeys(["0.000", "0.0000", "0.002", "0.31", "0.35", "0.0001", "-0.0002"], "lines of a file"),
+    },
+    "glossary.md": {"0.2": "time that a model may look at, a setting [s]"},
+    "load_data.md": {"7.3": "version of a file of MATLAB"},
+    "method.md": {
+        **dict.fromkeys(["1.5", "0.07"], "numbers of the decision, compared in test_docs.py"),
+        "13.4": "section of a book",
+    },
+    "read_report.md": {"1.5": "verdict.NEAR_FLOOR"},
     "measured_joint.md": {"-27.60": "reading of the sensor at rest [deg]"},
     "public_recordings.md": {"-3.16": "published [N]", "2405.10779": "name of a preprint"},
     "seed_paper.md": {
@@ -138,6 +169,26 @@ def untraced(text: str, values: list[float]) -> list[str]:
     return loose
 
 
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb"))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
+def test_every_number_in_the_text_of_a_notebook_is_in_its_code_or_in_what_it_shows(notebook: Path) -> None:
+    text, shown = "", ""
+    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "markdown":
+            text += prose("".join(cell["source"])) + "\n"
+            continue
+        shown += "".join(cell["source"]).replace("_", "") + "\n"
+        for output in cell["outputs"]:
+            parts = {"text": output.get("text", ""), **output.get("data", {})}
+            shown += "".join("".join(part) for kind, part in parts.items() if kind.startswith("text"))
+    values = {float(n) for n in re.findall(r"\d+(?:\.\d+)?", shown)}
+    # A share may be told in %, a time in ms.
+    values |= {round(scale * v, 9) for v in values for scale in (100, 1e3)}
+    assert [n for n in numbers(text) if float(n) not in values] == []
+
+
 @pytest.mark.parametrize("page", TABLES)
 def test_pages_of_results_hold_what_the_results_hold(page: str) -> None:
     values = [v for file in TABLES[page] for v in leaves(claims.results(file))]
@@ -145,3 +196,17 @@ def test_pages_of_results_hold_what_the_results_hold(page: str) -> None:
     assert [n for n in untraced(text, values) if n not in KNOWN.get(page, ())] == []
     # A number that is nowhere is noticed.
     assert untraced("| error | 0.123456 |", values) == ["0.123456"]
+
+
+def test_what_pages_say_of_settings_and_of_the_demo_is_so() -> None:
+    from rotflex_jax.fleet.processes import ROOM
+
+    assert f"holds more than {ROOM / 1e9:g} GB" in (ROOT / "docs" / "many_recordings.md").read_text()
+    look = (ROOT / "docs" / "first_look.md").read_text()
+    shown = (ROOT / "notebooks" / "00_first_look.ipynb").read_text(encoding="utf-8")
+    # The notebook runs the loop of the demo, by hand and in one call.
+    (before,) = re.findall(r"textbook +[\d.]+ +[\d.]+ +([\d.]+) ", shown)
+    assert f"is off by {float(before):.1f} degrees" in look
+    found = re.findall(r"theta (1\.\d+), alpha (1\.\d+) times", shown)
+    told = re.findall(r"theta (1\.\d+), alpha (1\.\d+) times", look)
+    assert len(told) == 1 and told[0] in found

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 from rich.console import Console
+from test_locate import recording as turning, reversals, white
 
 from rotflex_jax.discover import locate
 from rotflex_jax.discover.formula import Formula, Term
@@ -27,6 +28,7 @@ from rotflex_jax.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report import parameter_table, summary_table, write_report
+from rotflex_jax.report.failure import profiles
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.report.html import render
 from rotflex_jax.report.wording import HEADLINES, next_steps
@@ -369,6 +371,22 @@ def _has_unit(ax, axis) -> bool:
     return any(re.search(r"\[.+\]", label) for label in labels)
 
 
+def test_errors_after_reversals_are_drawn_to_the_last(discovery) -> None:
+    """What comes later than the last limit, or before the first reversal, has a bar of its own."""
+    run = turning()
+    error = white(run)
+    for k in reversals(run):
+        error[k : k + 20, 0] *= 6.0
+    found = locate(run, error, run.channels, dict.fromkeys(run.channels, 1e-4))
+    place = next(w for w in found if w.kind == "reversal")
+    figure = profiles(dataclasses.replace(discovery, where=(place,)))
+    assert figure is not None
+    (ax,) = figure.axes
+    assert len(ax.patches) >= len(place.profile) == len(place.edges) - 1
+    assert sum(place.profile) == pytest.approx(1) and sum(place.expected) == pytest.approx(1)
+    assert [label.get_text() for label in ax.get_xticklabels()][-1] == "later"
+
+
 def test_figures_leave_the_settings_of_matplotlib_alone(discovery) -> None:
     import sys
 
@@ -385,18 +403,19 @@ def test_degrees_are_drawn_where_angles_are_read(discovery) -> None:
     assert points[0] == pytest.approx(np.rad2deg(discovery.baseline.held_out_rmse_windows["theta"]))
 
 
-def test_the_missing_torque_is_shown_and_what_was_learned(discovery) -> None:
+def test_the_missing_torque_is_shown_and_what_was_learned(discovery, page, monkeypatch) -> None:
     lacking = Photographs(photographed(), photographed().given_back())
-    page = render(discovery, lacking, map_of_friction(discovery, True))
-    text = read(page).text
+    grown = render(discovery, lacking, map_of_friction(discovery, True))
+    text = read(grown).text
     assert "At the hub the baseline lacks 0.014 N m rms" in text
     assert "At the joint the baseline lacks nothing that could be seen" in text
     assert "τ = −0.0300 sign(w)" in text or "τ = −0.03 sign(w)" in text
     assert "98 %" in text and "755 nat" in text
-    assert page.count("<figure>") == render(discovery).count("<figure>") + 3
+    assert grown.count("<figure>") == page.count("<figure>") + 3
+    monkeypatch.setattr("rotflex_jax.report.content.pictures", lambda *given: {})  # text alone is read below
     without = read(render(discovery, lacking, map_of_friction(discovery, False))).text
     assert "does not make unseen data likelier" in without
-    assert "The missing torque" not in read(render(discovery)).text
+    assert "The missing torque" not in read(page).text
 
 
 def test_a_map_is_learned_only_where_something_is_unexplained(

@@ -9,6 +9,7 @@ import numpy as np
 
 from rotflex_jax.data.table import Table, distinct, unreadable
 from rotflex_jax.errors import InputError, optional
+from rotflex_jax.recording.quality import SHORTEST
 
 
 def read_mat(path: Path) -> dict[str, Any]:
@@ -52,7 +53,10 @@ def _read_hdf5(path: Path) -> dict[str, Any]:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, np.ndarray]]:
-    """Nested variables with dotted names, matrices as columns; what is no array is left out."""
+    """Nested variables with dotted names, matrices as columns; what is no array is left out.
+
+    The columns of a matrix that is too short to hold signals, but long enough across, are its rows.
+    """
     found: list[tuple[str, np.ndarray]] = []
     for key, value in values.items():
         name = prefix + str(key)
@@ -66,6 +70,8 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, np.nda
         if name.startswith("__") or array.dtype.kind == "V":  # of the file itself, or not decoded
             continue
         if array.ndim == 2 and 1 not in array.shape:
+            if array.shape[0] < SHORTEST <= array.shape[1]:  # Simulink's "To File" writes rows
+                array = array.T
             found += [(f"{name}[{k}]", array[:, k]) for k in range(array.shape[1])]
         elif array.ndim <= 2 and array.size:
             found.append((name, array.ravel()))

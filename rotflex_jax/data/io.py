@@ -150,26 +150,34 @@ def _outputs(outputs: Any) -> dict[str, str]:
 def _column(table: Table, name: str, argument: str, wrong: Mapping[str, str]) -> np.ndarray:
     values = table.column(name, argument)
     label = f"{table.label}: column {name!r}"
-    for unit in _words(name) & set(wrong):
+    for unit in _words(table, name) & set(wrong):
         raise InputError(
-            f"{label} is in {unit} by its name, but {wrong[unit]} are needed; convert and rename it"
-            f"{', or leave it out and give Ts=' if unit == 'ms' else ''}."
+            f"{label} is in {unit} by its {_told(name, unit)}, but {wrong[unit]} are needed; convert and "
+            f"rename it{', or leave it out and give Ts=' if unit == 'ms' else ''}."
         )
     numbers = real_numbers(values, label, table.where, table.first)
     finite(numbers, label, table.where, table.first)
     return numbers
 
 
-def _words(name: str) -> set[str]:
-    return set(re.split(r"[^a-z°]+", name.lower()))
+def _words(table: Table, name: str) -> set[str]:
+    """The words of a name and of its unit, in small letters."""
+    return set(re.split(r"[^a-z°]+", f"{name} {table.units.get(name, '')}".lower()))
+
+
+def _told(name: str, unit: str) -> str:
+    """What told that a column is in a unit."""
+    return "name" if unit in name.lower() else "line of units"
 
 
 def _check_angle_unit(table: Table, name: str, degrees: bool) -> None:
     given, other = ("deg", "rad") if degrees else ("rad", "deg")
-    if _words(name) & ANGLE_UNITS[other] and not _words(name) & ANGLE_UNITS[given]:
+    words = _words(table, name)
+    if words & ANGLE_UNITS[other] and not words & ANGLE_UNITS[given]:
+        word = min(words & ANGLE_UNITS[other])
         raise InputError(
-            f"{table.label}: column {name!r} is in {other} by its name, but degrees={degrees} was "
-            f"given; pass degrees={not degrees}, or rename the column."
+            f"{table.label}: column {name!r} is in {other} by its {_told(name, word)}, but "
+            f"degrees={degrees} was given; pass degrees={not degrees}, or correct what the file says."
         )
 
 

@@ -1,7 +1,7 @@
 """A table: named columns of whatever length and type, nothing interpreted yet."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,14 @@ class Table:
         columns: by name; a matrix gives a column `name[k]` for each of its own.
         where: what a row is called.
         first: number of the first row.
+        units: as a line of its own gives them, by name.
     """
 
     label: str
     columns: Mapping[str, np.ndarray]
     where: str = "row"
     first: int = 1
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def column(self, name: str, what: str) -> np.ndarray:
         """One column.
@@ -37,6 +39,8 @@ class Table:
         """
         if isinstance(name, str) and name in self.columns:
             return self.columns[name]
+        if isinstance(name, str) and set(parts := name.split(",")) < set(self.columns):
+            raise self._lacks(f"column {name!r}", f"name {' and '.join(parts)} one by one with {what}")
         raise self._lacks(f"column {name!r}", f"name the right one with {what}")
 
     def check(self, wanted: Sequence[tuple[str, str]]) -> None:

@@ -14,7 +14,7 @@ def table_from_text(path: Path) -> Table:
 
     The delimiter is a tab, semicolon, bar or comma, the first of these in the header, otherwise
     spaces; a comma beside another delimiter is a decimal comma. Remarks with # or % may stand on
-    top, the last of them may be the header.
+    top, the last of them may be the header. A line of units may follow it.
 
     Raises:
         InputError: no text, no header, no samples, or a line with more or fewer cells than names.
@@ -42,7 +42,10 @@ def table_from_text(path: Path) -> Table:
     if delimiter != ",":
         rows = [row.replace(",", ".") for row in rows]
     first = start + 2  # as an editor counts
-    return Table(path.name, _columns(rows, names, delimiter, path.name, first), "line", first)
+    units = _units(rows, names, delimiter)
+    if units:
+        rows, first = rows[1:], first + 1
+    return Table(path.name, _columns(rows, names, delimiter, path.name, first), "line", first, units)
 
 
 def _header(lines: list[str]) -> int | None:
@@ -54,6 +57,16 @@ def _header(lines: list[str]) -> int | None:
             numbers = _are_numbers(lines[k].replace(",", " ").replace(";", " ").split())
             return before if numbers and before is not None else k
     return filled[-1] if filled else None
+
+
+def _units(rows: list[str], names: list[str], delimiter: str | None) -> dict[str, str]:
+    """The units, where the line below the names holds no number and the next one nothing else."""
+    cells = _cells(rows[0], delimiter)
+    if len(cells) != len(names) or len(rows) < 2 or not _are_numbers(_cells(rows[1], delimiter)):
+        return {}
+    if not "".join(cells).strip() or any(_are_numbers([cell]) for cell in cells):
+        return {}
+    return dict(zip(names, cells, strict=True))
 
 
 def _columns(

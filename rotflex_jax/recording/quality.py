@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotflex_jax.errors import InputError
+from rotflex_jax.recording.arm_angle import looks_absolute
 from rotflex_jax.recording.sensor import cut_off
 
 ACCEPTABLE = ("short", "constant_input", "constant", "saturated", "units", "huge")
@@ -75,6 +76,7 @@ def inspect(
         found += [_quantised(name, unit, step), _cut_off(x, u, Ts, name, unit, step)]
         if unit == "rad":
             found.append(_like_degrees(x, u, Ts, name, units[0]))
+    found.append(_in_the_room(y, names[1:]))
     accepted = {("error", kind): "warning" for kind in accept}
     return tuple(
         replace(finding, severity=accepted.get((finding.severity, finding.kind), finding.severity))
@@ -170,6 +172,18 @@ def _like_degrees(x: np.ndarray, u: np.ndarray, Ts: float, name: str, input_unit
         "or accept=('units',) if it is radians."
     )
     return Finding("units", name, message, "warning")
+
+
+def _in_the_room(y: np.ndarray, names: Sequence[str]) -> Finding | None:
+    if not {"theta", "alpha"} <= set(names):
+        return None
+    if not looks_absolute(*(y[:, names.index(name)] for name in ("theta", "alpha"))):
+        return None
+    message = (
+        "Channel 'alpha' follows 'theta' one to one in slow motion, as the angle of the arm in the room "
+        "does and a deflection never: if it is that angle, subtract theta."
+    )
+    return Finding("absolute", "alpha", message, "warning")
 
 
 def _cut_off(

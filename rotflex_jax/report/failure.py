@@ -144,7 +144,7 @@ def _profile(ax: Axes, place: Where, channels: list[str]) -> None:
     if place.kind == "reversal":  # bins of unequal width are drawn equally wide
         scale, read = 1e3, "ms"
         edges = np.arange(len(place.edges), dtype=float)
-        ax.set_xticks(edges, [f"{scale * e:.3g}" for e in place.edges])
+        ax.set_xticks(edges, [f"{scale * e:.3g}" if np.isfinite(e) else "later" for e in place.edges])
     bars = 0.86 * np.diff(edges)
     middle = (edges[:-1] + edges[1:]) / 2
     ax.bar(middle, 100 * place.profile, bars, color=BASELINE, alpha=0.85, label="share of the error")

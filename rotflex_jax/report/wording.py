@@ -192,7 +192,7 @@ def next_steps(discovery: Discovery) -> list[str]:
         )
         steps.append(
             "Check the recording (sampling, scaling, sensor range) and the constants that are "
-            "held, then try an effect of your own: a class of ten lines joins the search."
+            "held, then try an effect of your own: one small class joins the search."
         )
     elif discovery.verdict == "not_excited":
         steps.append(
