@@ -1,5 +1,6 @@
 """Does the machine move the way the model would? A sign turned round lets no fit succeed."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,8 @@ from rotflex_jax.recording import Recording
 
 # Moves over each of these shares of the recording, of at most so many samples, are compared.
 SHARES, SAMPLES = (0.001, 0.003, 0.01, 0.03), 20_000
+# Samples of a block of the linear run.
+BLOCK = 64
 # A channel that moves against the model at all shares, correlated at least this much.
 AGAINST = -0.6
 
@@ -55,14 +58,23 @@ def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
 
 
 def _response(discrete: tuple[np.ndarray, np.ndarray], C: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Outputs (N, C) of a linear system from rest."""
+    """Outputs (N, C) of a linear system from rest, a block of samples at a time."""
     A, B = discrete
-    x, out = np.zeros(len(A)), np.empty((len(u), len(C)))
     with np.errstate(all="ignore"):
-        for k, v in enumerate(u):
-            out[k] = C @ x
-            x = A @ x + B * v
-    return out
+        powers = np.array([*itertools.accumulate([A] * BLOCK, np.matmul, initial=np.eye(len(A)))])
+        left, pushed = (
+            C @ powers[:-1],
+            powers[:-1] @ B,
+        )  # what a state and an input do later (L, C, n), (L, n)
+        lag = np.subtract.outer(np.arange(BLOCK), np.arange(BLOCK)) - 1
+        kernel = np.where(lag[..., None] >= 0, (pushed @ C.T)[lag], 0.0)  # (L, L, C)
+        blocks = np.pad(u, (0, -len(u) % BLOCK)).reshape(-1, BLOCK)
+        adds = blocks @ pushed[::-1]
+        states = np.array(
+            [*itertools.accumulate(adds[:-1], lambda x, new: powers[-1] @ x + new, initial=0 * B)]
+        )
+        y = np.tensordot(blocks, kernel, (1, 1)) + np.tensordot(states, left, (1, 2))
+    return y.reshape(-1, len(C))[: len(u)]
 
 
 def _alike(a: np.ndarray, b: np.ndarray, step: int) -> float:
