@@ -4,6 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from rotflex_jax.discover.calibrations import own_notes, settle
@@ -49,6 +50,8 @@ REFITTED, ROUNDS = 4, 4
 
 # Matrices here are small and many: threads of a linear algebra library only wait for one another.
 @threadpool_limits.wrap(limits=1, user_api="blas")
+# A trial may diverge; its cost, which is then not finite, says so.
+@np.errstate(over="ignore", invalid="ignore")
 def discover(
     mechanism: Mechanism | Model,
     train: Recording | Sequence[Recording],
