@@ -55,15 +55,20 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
 
     Args:
         folder: Where to keep compiled code; the user's cache folder unless given. A folder that the
-            user chose before (`JAX_COMPILATION_CACHE_DIR`) is kept.
+            user chose before (`JAX_COMPILATION_CACHE_DIR`) is kept, and so is the shortest compilation
+            that is worth keeping (`JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS`); all are without it.
 
     Returns:
         The folder in use, or None where it cannot be written (then nothing is changed).
     """
     import jax
 
+    # Most programs compile in less than the second that JAX asks for, and a search needs dozens of them.
+    short = "jax_persistent_cache_min_compile_time_secs"
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if folder is None and chosen:
+        if short.upper() not in os.environ:
+            jax.config.update(short, 0.0)
         return Path(chosen)
     if folder is None:
         import pooch
@@ -77,7 +82,7 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
     if not os.access(folder, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update(short, 0.0)
     return folder
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.descent import NATS, Given, Moved, descend, residuals_and_slopes
@@ -29,6 +30,8 @@ Progress = Callable[[str], None]
 NEAR = 1.0
 
 
+# Matrices here are small: threads of a linear algebra library only wait for one another.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def fit(
     mechanism: Mechanism | Model,
     recordings: Recording | Sequence[Recording],

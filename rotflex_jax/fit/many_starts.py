@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.marquardt import ENOUGH, ROUGHLY, Problem, Reached, descend
@@ -61,6 +62,8 @@ class ManyStarts:
         return "\n".join(lines)
 
 
+# Matrices here are small: threads of a linear algebra library only wait for one another.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def many_starts(
     mechanism: Mechanism | Model,
     recordings: Recording | Sequence[Recording],
