@@ -63,27 +63,24 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
     """
     import jax
 
-    # Most programs compile in less than the second that JAX asks for, and a search needs dozens of them.
-    short = "jax_persistent_cache_min_compile_time_secs"
     chosen = jax.config.values["jax_compilation_cache_dir"]
-    if folder is None and chosen:
-        if short.upper() not in os.environ:
-            jax.config.update(short, 0.0)
-        return Path(chosen)
-    if folder is None:
-        import pooch
+    if folder is not None or not chosen:
+        if folder is None:
+            import pooch
 
-        folder = Path(pooch.os_cache("rotflex_jax")) / "compiled"
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    if not os.access(folder, os.W_OK):
-        return None
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update(short, 0.0)
-    return folder
+            folder = Path(pooch.os_cache("rotflex_jax")) / "compiled"
+        folder = Path(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return None
+        if not os.access(folder, os.W_OK):
+            return None
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    # Most programs compile in less than the second that JAX asks for, and a search needs dozens of them.
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    return Path(folder or chosen)
 
 
 def quicken() -> None:

@@ -153,7 +153,7 @@ class Bench:
         done: dict[int, Any] = {}
         for turn in (list(new.values()), [i for i in range(len(jobs)) if i not in new.values()]):
             done.update(zip(turn, _side_by_side(run, [jobs[i] for i in turn]), strict=True))
-            self.compiled.update(new)
+        self.compiled.update(new)
         return [done[i] for i in range(len(jobs))]
 
     def on_device(self) -> Data:

@@ -100,7 +100,10 @@ class SuperModel:
         """The super-model with no other candidates than a family and those whose gate (E,) is not zero."""
         kept = {c.effect for c in family}
         others = (c.effect for c in self.candidates.values() if c.effect not in kept)
-        return self._without(frozenset(i for i in others if gates[i] == 0))
+        left_out = frozenset(i for i in others if gates[i] == 0)
+        if left_out not in self.parts:
+            self.parts[left_out] = self._part(left_out)
+        return self.parts[left_out]
 
     def families(self, candidates: Iterable[Candidate]) -> list[list[Candidate]]:
         """Candidates by what it takes to probe them: states of their own, a contact, a torque, a signal."""
@@ -108,15 +111,14 @@ class SuperModel:
         found: dict[str, list[Candidate]] = {}
         for c in candidates:
             effect = self.mechanism.effects[c.effect]
-            kinds = {Actuation: "signal", Sensing: "signal", DryFriction: "contact"}
-            by_kind = next((name for kind, name in kinds.items() if isinstance(effect, kind)), "torque")
-            found.setdefault("states" if c.effect in own else by_kind, []).append(c)
+            if c.effect in own:
+                kind = "states"
+            elif isinstance(effect, Actuation | Sensing):
+                kind = "signal"
+            else:
+                kind = "contact" if isinstance(effect, DryFriction) else "torque"
+            found.setdefault(kind, []).append(c)
         return list(found.values())
-
-    def _without(self, left_out: frozenset[int]) -> Part:
-        if left_out not in self.parts:
-            self.parts[left_out] = self._part(left_out)
-        return self.parts[left_out]
 
     def _part(self, left_out: frozenset[int]) -> Part:
         kept = [i for i in range(len(self.mechanism.effects)) if i not in left_out]
