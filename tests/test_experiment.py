@@ -263,8 +263,9 @@ def test_a_direction_that_nothing_shows_does_not_count():
     m = machine()
     a = hypothesis(m, fx.Stribeck(at="hub", level=0.01, excess=0.02), ("coulomb", "hub"), {}, NOISE, Ts)
     b = hypothesis(m, fx.Coulomb(at="hub", level=0.01), ("stribeck", "hub"), {}, NOISE, Ts)
-    c = Contest((a, b), Ts, V).settled(noise(500, Ts, seed=2))
-    assert c.counted == (True, False)
+    c = Contest((a, b), Ts, V)
+    meetings = [c.meet(noise(500, Ts, seed=seed)) for seed in (2, 3)]
+    assert c.visible(meetings).counted == (True, False)
 
 
 def test_a_machine_that_drifts_out_of_its_limits_is_named():

@@ -87,7 +87,7 @@ class Contest:
             found.append(min(tried, key=lambda i: i.nats))
         return Meeting(np.array(runs), (found[0], found[1]), self.counted)
 
-    def settled(self, u: np.ndarray) -> "Contest":
+    def visible(self, meetings: Sequence[Meeting]) -> "Contest":
         """The contest without a direction that no input can show.
 
         Where one machine contains the other (Stribeck friction Coulomb's), or one effect at the size that
@@ -95,10 +95,11 @@ class Contest:
         shows in a recording.
 
         Args:
-            u: Voltage (N,) [V] of a recording in which the two are alike.
+            meetings: Under inputs of many kinds.
         """
-        one, other = (i.nats for i in dataclasses.replace(self, counted=(True, True)).meet(u).imitations)
-        counted = (one > CONTAINED * other, other > CONTAINED * one)
+        nats = np.array([[i.nats for i in m.imitations] for m in meetings])
+        one, other = np.max(nats, axis=0, where=np.isfinite(nats), initial=0.0)
+        counted = (bool(one > CONTAINED * other), bool(other > CONTAINED * one))
         return dataclasses.replace(self, counted=counted if any(counted) else (True, True))
 
     def excess(self, outputs: np.ndarray) -> np.ndarray:

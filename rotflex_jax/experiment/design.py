@@ -93,13 +93,15 @@ def next_experiment(
                 f"{', '.join(fitted.mechanism.port_vectors)}; name one of these."
             )
     say("fitting each effect to the other")
-    pair, reference = _rivals(fitted, a, b, dict(process_noise or {}), sd, Ts, reference, limits)
-    contest = Contest(pair, Ts, limits, _doubts(model, pair[0])).settled(reference)
+    pair = _rivals(fitted, a, b, dict(process_noise or {}), sd, Ts, reference, limits)
+    contest = Contest(pair, Ts, limits, _doubts(model, pair[0]))
     listed = []
     offered = standard_inputs(N, Ts, limits)
     for k, s in enumerate(offered):
         say(f"ranking standard inputs: {k + 1} of {len(offered)}")
         listed.append(_rated(contest, s))
+    contest = contest.visible([m for *_, m in listed])
+    listed = [_counted(contest, *row) for row in listed]
     listed.sort(key=lambda r: -r[0].nats)
     for rated, u, _ in listed[:2]:
         for share in SHARES:
@@ -158,6 +160,12 @@ def _rated(c: Contest, s: Standard, thorough: bool = False) -> tuple[Rated, np.n
     return Rated(s.kind, s.setting, m.nats, each, float(np.max(np.abs(u))), slew, peaks, settled), u, m
 
 
+def _counted(c: Contest, rated: Rated, u: np.ndarray, m: Meeting) -> tuple[Rated, np.ndarray, Meeting]:
+    """The same with only the directions that count."""
+    m = dataclasses.replace(m, counted=c.counted)
+    return dataclasses.replace(rated, nats=m.nats), u, m
+
+
 def _rivals(
     model: Model,
     a: Any,
@@ -167,8 +175,8 @@ def _rivals(
     Ts: float,
     reference: np.ndarray | None,
     limits: Limits,
-) -> tuple[tuple[Hypothesis, Hypothesis], np.ndarray]:
-    """Both hypotheses, the one whose numbers are not known fitted to the other; and the reference."""
+) -> tuple[Hypothesis, Hypothesis]:
+    """Both hypotheses, the one whose numbers are not known fitted to the other."""
     places = place_of(a), place_of(b)
     if places[0] == places[1]:
         raise InputError(
@@ -196,7 +204,7 @@ def _rivals(
     # Offset and bias belong to a recording: the next one has its own.
     fitted = fitted.with_values(dict.fromkeys(h.calibrations, 0.0))
     made[rival] = dataclasses.replace(made[rival], mechanism=fitted)
-    return (made[0], made[1]), u
+    return made[0], made[1]
 
 
 def lengths(seconds: float, Ts: float) -> tuple[int, int]:

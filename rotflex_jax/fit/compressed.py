@@ -33,6 +33,7 @@ def minimise(minimiser: Minimiser, moved: Moved, flat: np.ndarray, given: Given,
         given: What it holds.
         max_steps: Most steps.
     """
+    first = np.asarray(sums(moved, jnp.asarray(flat), given).cost)
     start = jnp.asarray(flat[moved.index])
     end, steps, result = _solved(minimiser, moved, start, (jnp.asarray(flat), given), max_steps)
     there = flat.copy()
@@ -43,7 +44,7 @@ def minimise(minimiser: Minimiser, moved: Moved, flat: np.ndarray, given: Given,
         status = "converged"
     elif result == optx.RESULTS.nonlinear_max_steps_reached:
         status = f"stopped after {max_steps} steps"
-    return Reached(there, cost, int(steps), status)
+    return Reached(there, first, cost, int(steps), status)
 
 
 @eqx.filter_jit

@@ -132,9 +132,10 @@ def residuals_and_slopes(moved: Moved, flat: jax.Array, given: Given) -> tuple[j
 
 
 class Reached(NamedTuple):
-    """Where a descent ended: flat vector, half the squared error of each channel, steps, and how."""
+    """Where a descent ended: flat vector, half the squared errors (C,) at its start and here, steps, how."""
 
     flat: np.ndarray
+    first: np.ndarray
     cost: np.ndarray
     steps: int
     status: str
@@ -151,16 +152,17 @@ def descend(
     """The least squared error near a place, in float64, as far as steps gain `enough` [nat]."""
     run = lambda flat: jax.device_get(sums(moved, flat, given))  # noqa: E731
     cost, g, H = run(flat)
+    first = cost
     if not np.isfinite(cost).all():
-        return Reached(flat, cost, 0, "diverged: the model error at the start is not finite")
+        return Reached(flat, first, cost, 0, "diverged: the model error at the start is not finite")
     damping, used, before = SHORT, 0, float("inf")
     while used < max_steps:
         step = _step(g, H, damping, moved.bounds)
         if step is None:
-            return Reached(flat, cost, used, UNSOLVED)
+            return Reached(flat, first, cost, used, UNSOLVED)
         expected = -(g @ step + step @ H @ step / 2)
         if expected < enough and damping <= SHORT:
-            return Reached(flat, cost, used, "converged")
+            return Reached(flat, first, cost, used, "converged")
         there = flat.copy()
         there[moved.index] += step
         trial = run(there)
@@ -177,8 +179,8 @@ def descend(
             before, slow = cost.sum(), before - cost.sum() < LITTLE
         # A step that was held short says nothing of what is left to gain.
         if slow or (0 < gain < enough and damping <= SHORT) or damping > STUCK:
-            return Reached(flat, cost, used, "converged")
-    return Reached(flat, cost, used, f"stopped after {max_steps} steps")
+            return Reached(flat, first, cost, used, "converged")
+    return Reached(flat, first, cost, used, f"stopped after {max_steps} steps")
 
 
 def _step(g: np.ndarray, H: np.ndarray, damping: float, bounds: np.ndarray) -> np.ndarray | None:

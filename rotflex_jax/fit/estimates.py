@@ -7,25 +7,20 @@ import numpy as np
 
 from rotflex_jax.fit.covariance import sandwich
 from rotflex_jax.fit.fitted import Fit
-from rotflex_jax.fit.residuals import Coordinates, Data
-from rotflex_jax.model import Model
+from rotflex_jax.fit.stages import Ended, Task
 from rotflex_jax.parameters import Estimate
 
 
-def report(
-    model: Model,
-    coordinates: Coordinates,
-    flat: np.ndarray,
-    index: np.ndarray,
-    data: Data,
-    scale: np.ndarray,
-    e: jax.Array,
-    J: jax.Array,
-    status: str,
-    steps: int,
-    history: list[float],
-) -> Fit:
-    """Estimates with intervals, from the residuals and slopes at the optimum."""
+def report(task: Task, end: Ended, e: jax.Array, J: jax.Array) -> Fit:
+    """Estimates with intervals.
+
+    Args:
+        task: What was fitted to what.
+        end: The optimum.
+        e: Scaled errors there (R, N, C).
+        J: Their slopes by the moved coordinates (R, N, C, M).
+    """
+    model, data, coordinates, index = task.model, task.data, task.moved.coordinates, task.moved.index
     m = model.mechanism
     R, N, C = data.y.shape
     seen = data.seen.ravel() > 0
@@ -33,9 +28,9 @@ def report(
     slopes = -np.asarray(J).reshape(R * N, C, len(index))[seen]
     segments = np.repeat(np.arange(R), N)[seen]
     each = range(coordinates.owning)
-    z = np.tile(flat[: coordinates.parameters], (len(each), 1))
+    z = np.tile(end.flat[: coordinates.parameters], (len(each), 1))
     for i in coordinates.local:
-        z[:, i] = [flat[coordinates.local_index(r, i)] for r in each]
+        z[:, i] = [end.flat[coordinates.local_index(r, i)] for r in each]
     values, stretch = coordinates.transform.physical(z)
     covariance = sandwich(slopes, residual, segments)
     row_of = {int(k): row for row, k in enumerate(index)}
@@ -59,18 +54,18 @@ def report(
         free.append(name)
         places.append((rows, weights))
     natural = np.array([[a @ covariance[np.ix_(i, k)] @ b for k, b in places] for i, a in places])
-    deviation = np.sqrt(np.mean(residual**2, axis=0)) * scale
+    deviation = np.sqrt(np.mean(residual**2, axis=0)) * np.asarray(end.given.scale)
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
     return Fit(
         model=dataclasses.replace(model, mechanism=m.with_values(values.mean(axis=0))),
         cost=cost,
-        status=status,
+        status=end.status,
         parameters=tuple(estimates),
         noise=dict(zip(m.channels, deviation.tolist(), strict=True)),
         covariance=natural,
         free_names=tuple(free),
-        steps=steps,
-        history=tuple(history),
+        steps=end.steps,
+        history=tuple(end.history),
         weakest=_weakest(np.stack([slopes[:, :, rows].sum(axis=2) for rows, _ in places], axis=2), free),
         local=local,
     )

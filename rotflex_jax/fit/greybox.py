@@ -1,21 +1,20 @@
 """The grey-box fit: parameters of the physics, first states and bounds, by Levenberg-Marquardt."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.descent import NATS, Given, Moved, descend, residuals_and_slopes
+from rotflex_jax.fit.descent import Moved, residuals_and_slopes
 from rotflex_jax.fit.estimates import report
 from rotflex_jax.fit.fitted import Fit
 from rotflex_jax.fit.residuals import Coordinates, Data, first_states, sensor_noise, stack
 from rotflex_jax.fit.signs import check_signs
-from rotflex_jax.mechanism import Mechanism, kalman_gains
+from rotflex_jax.fit.stages import Task
+from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.linearise import inverse_mass, linearise
 from rotflex_jax.model import Model, window_starts
 from rotflex_jax.precision import double_precision
@@ -25,9 +24,6 @@ if TYPE_CHECKING:
     from rotflex_jax.fit.compressed import Minimiser
 
 Progress = Callable[[str], None]
-
-# A stage that only leads to the next one ends where steps gain less than this [nat].
-NEAR = 1.0
 
 
 # Matrices here are small: threads of a linear algebra library only wait for one another.
@@ -52,8 +48,10 @@ def fit(
     `y_hat` is a free run, or, with `process_noise`, the prediction of a steady Kalman filter whose
     model admits white torques of that intensity. A free run asks the model to be right over the whole
     recording; where physics is missing, it bends the parameters to hide that, and a prediction bends
-    them less. The fit starts with short predictions, which are easy to get right from a distant start,
-    and ends with what was asked for. The scale `s` of each channel is the deviation of its residuals.
+    them less. Where the run at the start misses most of the motion, the fit begins a second time with short
+    predictions, which are easy to get right from afar, and the better of the two ends counts. From a near
+    start they would lead away, since they say little of numbers that only a long run shows. The scale `s` of
+    each channel is the deviation of its residuals.
 
     Args:
         mechanism: What to fit; its numbers are the start, its trusted parameters are held.
@@ -98,47 +96,21 @@ def fit(
     data = stack(listed, model)
     say = progress or (lambda _: None)
     noise = sensor_noise(listed, model)
-    # Torques as large as those of the motion make the filter follow the data within a few samples.
-    reach = torque_scale(m, data)
-    stages: list[Mapping[str, float] | None] = [everywhere(m, (0.03 * reach) ** 2)]
-    stages.append(process_noise)
     flat = coordinates.flatten(m.values, first_states(model, listed))
     free = tuple(names.index(n) for n in m.free_names)
     moved = Moved(coordinates, model.solver, free, first == "fitted")
-    history, steps, status, scale = [], 0, "converged", noise
-    gates = np.ones(len(m.effects))
+    task = Task(model, listed, moved, data, noise, first == "measured", max_steps, minimiser, say)
     with double_precision():
-        given = Given(gates, data, None, scale)
-        for number, stage in enumerate(stages):
-            last = number == len(stages) - 1
-            for _ in range(3 if last else 1):
-                now = m.with_values(coordinates.values(flat).mean(axis=0))
-                if first == "measured":
-                    there = dataclasses.replace(model, mechanism=now)
-                    for r, recording in enumerate(listed):
-                        start = there._start(recording)
-                        flat[coordinates.state_index(r)] = start[: coordinates.states]
-                K = np.stack([kalman_gains(now, [stage or {}], noise, float(Ts))[0] for Ts in data.Ts])
-                given = Given(*jax.tree.map(jnp.asarray, (gates, data, K, scale)))
-                if minimiser is None:
-                    flat, squares, used, status = descend(
-                        moved, flat, given, max_steps, say, NATS if last else NEAR
-                    )
-                else:
-                    from rotflex_jax.fit.compressed import minimise  # takes long to import
-
-                    flat, squares, used, status = minimise(minimiser, moved, flat, given, max_steps)
-                steps += used
-                history.append(float(squares.sum()))
-                new = np.sqrt(2 * squares / np.sum(data.seen)) * scale
-                settled = np.all(np.abs(np.log(new / scale)) < 0.02)
-                scale = np.maximum(new, noise * 0.1)
-                if settled or status != "converged":
-                    break
-        e, J = residuals_and_slopes(moved, jnp.asarray(flat), given._replace(scale=jnp.asarray(scale)))
-        if throw and status != "converged":
-            raise RuntimeError(f"The fit did not converge: {status}.")
-        return report(model, coordinates, flat, moved.index, data, scale, e, J, status, steps, history)
+        end = task.run(flat, [process_noise])
+        if end.far:
+            say("fit: the start is far away; once more, from short predictions")
+            # Torques as large as those of the motion make the filter follow the data within a few samples.
+            short = everywhere(m, (0.03 * torque_scale(m, data)) ** 2)
+            end = min(end, task.run(flat, [short, process_noise]), key=lambda e: e.cost)
+        e, J = residuals_and_slopes(moved, jnp.asarray(end.flat), end.given)
+        if throw and end.status != "converged":
+            raise RuntimeError(f"The fit did not converge: {end.status}.")
+        return report(task, end, e, J)
 
 
 def _windows(recordings: list[Recording], seconds: float | None) -> tuple[list[Recording], tuple[int, ...]]:
