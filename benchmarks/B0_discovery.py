@@ -12,6 +12,8 @@ report seeds.
     python benchmarks/B0_discovery.py --channels theta --inputs noise --seeds 1000
     python benchmarks/B0_discovery.py --pairs 36 --triples 12 --inputs noise --seeds 1000
 
+    python benchmarks/B0_discovery.py --oracles
+
 Records that the file has already are skipped unless `--fresh` is given; every run adds to the file, and
 the tables and figures beside it are of all its records.
 """
@@ -89,10 +91,10 @@ def prepare() -> None:
 
 
 def one(job: Job) -> dict[str, Any]:
-    """A job in a process of its own; imports late, after the settings."""
-    from arena.trial import trial
+    """A job in a process of its own, or the oracle of one that is done; imports late, after the settings."""
+    from arena.trial import judged_again, trial
 
-    return trial(job)
+    return judged_again(job) if "lines" in job else trial(job)
 
 
 def rows(todo: list[Job], workers: int) -> Iterator[tuple[Job, dict[str, Any]]]:
@@ -153,6 +155,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a record [s]")
     parser.add_argument("--quick", action="store_true", help="one seed, one input, 10 s, 5 nulls")
     parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--oracles", action="store_true", help="of all known records anew, no search")
     parser.add_argument("--fresh", action="store_true", help="do not reuse records in the file")
     parser.add_argument("--out", type=Path, default=None, help="results file")
     return parser.parse_args()
@@ -183,10 +186,12 @@ def main() -> int:
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
     known = results["records"]
     todo = [j for j in wanted if key(j) not in known or "error" in known[key(j)]]
+    if a.oracles:
+        wanted = todo = [r for r in known.values() if "error" not in r]
     console.print(f"{len(wanted)} records, {len(wanted) - len(todo)} known, {len(todo)} to run")
     began = time.perf_counter()
     for count, (job, row) in enumerate(rows(todo, a.workers), 1):
-        known[key(job)] = {**row, "code": made["code"]}
+        known[key(job)] = {"code": made["code"], **row}
         save(path, results)
         got = row.get("error") or f"{answer(row)}, {row['verdict']}, {row['wall_s']:.1f} s"
         left = (time.perf_counter() - began) / count * (len(todo) - count)

@@ -36,13 +36,13 @@ from rotflex_jax.experiment.menu import standard_inputs
 TS, SECONDS = 0.002, 20.0
 LIMITS = Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
 
-# Pair: the effect that the machine has, its numbers, and its rival. Small enough, or, the mode, above what
-# the ordinary noise reaches, for the ordinary recording to tell little.
+# Pair: the effect that the machine has, its numbers, and its rival; the first two so small that the
+# ordinary recording tells little.
 PAIRS = {
     "delay or lag": (("delay", "input"), {"time": 0.0012}, ("lag", "input")),
     "second mode or sensor gain": (
         ("second_mode", "arm"),
-        {"inertia": 8e-4, "frequency": 20.0, "damping": 0.03},
+        {"inertia": 5e-5, "frequency": 10.0, "damping": 0.03},
         ("sensor_gain", "alpha"),
     ),
     "lag or backlash": (("lag", "input"), {"time": 3e-4}, ("backlash", "hub")),

@@ -389,18 +389,21 @@ for _hidden in ("friction", "drag", "uneven friction", "nothing"):
 # -- the next experiment ------------------------------------------------------------------------------------
 
 
-@named
-def next_ratio() -> str:
+def _next_ratio(pair: str) -> str:
     """How many times a design is worth the best standard input: the least and the largest."""
     ratios = []
     for row in results("B4.json")["rows"]:
-        if row["pair"] == "delay or lag":
-            total = {True: 0.0, False: 0.0}
+        if row["pair"] == pair:
+            worth = {True: 0.0, False: 0.0}
             for i in row["inputs"]:
-                worth = i["train"] + i["held_out"]
-                total[i["input"] == "design"] = max(total[i["input"] == "design"], worth)
-            ratios.append(total[True] / total[False])
+                design = i["input"] == "design"
+                worth[design] = max(worth[design], i["margin"])
+            ratios.append(worth[True] / worth[False])
     return f"{min(ratios):.0f} to {max(ratios):.0f}"
+
+
+NAMED["next_ratio"] = functools.partial(_next_ratio, "delay or lag")
+NAMED["next_ratio_mode"] = functools.partial(_next_ratio, "second mode or sensor gain")
 
 
 # -- speed --------------------------------------------------------------------------------------------------

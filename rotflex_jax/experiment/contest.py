@@ -40,8 +40,12 @@ class Meeting:
 
     @property
     def smooth(self) -> float:
-        """Half the harmonic mean of what counts, a smooth stand-in for the smaller [nat]."""
-        return 1 / sum(1 / max(nats, 1e-12) for nats in self._told)
+        """Geometric mean of what counts, what a climb raises in the place of the smaller [nat].
+
+        Where one direction is bounded, as that of a play by its size, the slope of the smaller would leave the
+        other where it is.
+        """
+        return float(np.exp(np.mean(np.log(np.maximum(self._told, 1e-12)))))
 
     @property
     def _told(self) -> list[float]:
@@ -121,7 +125,7 @@ class Contest:
             share = np.abs(y / size) ** (PEAKED - 1) * np.sign(y)
             weight = share / np.sum(np.abs(y / size) ** PEAKED, axis=0) / size
             true, rival = self.pair[k], self.pair[1 - k]
-            part = self.counted[k] * m.smooth / max(i.nats, 1e-12) ** 2
+            part = self.counted[k] / sum(self.counted) / max(i.nats, 1e-12)
             total += pull(true, rival, i.numbers, u, self.Ts, part, -penalty[k] * weight)
         return total
 
