@@ -120,6 +120,14 @@ def test_a_frame_has_the_numbers_of_the_rows(table: Comparison) -> None:
     assert frame.loc["fast", "worst_alpha"] == table["fast"].worst["alpha"]
 
 
+def test_a_noise_far_below_all_errors_does_not_stretch_the_ranks(table: Comparison) -> None:
+    quiet = dataclasses.replace(table, noise_floor={c: 1e-9 * v for c, v in table.noise_floor.items()})
+    for figure, off in ((ranks(table), False), (ranks(quiet), True)):
+        for ax in figure.axes:
+            assert any("off to the left" in t.get_text() for t in ax.texts) is off
+            assert any(line.get_label() == "sensor noise" for line in ax.get_lines()) is not off
+
+
 def test_every_axis_has_a_unit(table: Comparison) -> None:
     for figure in (overlays(table), spectra(table), horizons(table), ranks(table), table.plot()):
         labels = [text for ax in figure.axes for text in (ax.get_xlabel(), ax.get_ylabel()) if text]

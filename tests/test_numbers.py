@@ -145,10 +145,10 @@ KNOWN = {
 
 
 def leaves(found: Any) -> Iterator[float]:
-    """Every number of a result; of the next experiment also what its table adds up and divides."""
+    """Every number of a result; of the next experiment also what its table divides."""
     if isinstance(found, dict):
         if "original" in found and "inputs" in found:
-            worth = [i["train"] + i["held_out"] for i in (found["original"], *found["inputs"])]
+            worth = [i["margin"] for i in (found["original"], *found["inputs"])]
             yield from (*worth, *(max(worth) / w for w in worth))
         found = list(found.values())
     if isinstance(found, list):

@@ -42,8 +42,8 @@ class Meeting:
     def smooth(self) -> float:
         """Geometric mean of what counts, what a climb raises in the place of the smaller [nat].
 
-        Where one direction is bounded, as that of a play by its size, the slope of the smaller would leave the
-        other where it is.
+        Where one direction is bounded, as that of a play by its size, the slope of the smaller would leave
+        the other where it is.
         """
         return float(np.exp(np.mean(np.log(np.maximum(self._told, 1e-12)))))
 

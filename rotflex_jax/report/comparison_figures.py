@@ -25,6 +25,8 @@ from rotflex_jax.report.wording import readable
 # Longer recordings are shown in part [s], fast ones only so many times through their mean; the errors are
 # those of the whole.
 LONGEST, CROSSINGS = 10.0, 60
+# How many times below the least error the noise of the sensor still has its line in the ranks.
+FARTHEST = 100.0
 # In this order by rank; dashes and marks tell them apart without colour.
 COLOURS = (FINAL, BASELINE, *BETWEEN)
 DASHES = ("-", (0, (6, 1.5)), (0, (3, 1.5)), (0, (6, 1.5, 1.2, 1.5)), (0, (1.2, 1.2)), (0, (9, 3)))
@@ -188,8 +190,11 @@ def ranks(comparison: Comparison) -> Figure:
             label=f"runs of {comparison.window_seconds:g} s",
         )
         floor = 100 * comparison.noise_floor.get(channel, 0.0) / std
-        if floor > 0:
+        if floor * FARTHEST > min([*whole, *short], default=0.0):
             ax.axvline(floor, color=NOISE, lw=1.1, ls=(0, (4, 2)), label="sensor noise")
+        elif floor > 0:  # a line there would leave the errors a corner of the picture
+            text = f"sensor noise {floor:.1g} %, off to the left"
+            ax.text(0.01, 0.01, text, transform=ax.transAxes, color=NOISE, fontsize="small")
         ax.axvline(100, color=MEASURED, lw=0.9, ls=":", label="no better than the mean")
         ax.set_xscale("log")
         plain_ticks(ax.xaxis)
