@@ -48,10 +48,10 @@ def fit(
     `y_hat` is a free run, or, with `process_noise`, the prediction of a steady Kalman filter whose
     model admits white torques of that intensity. A free run asks the model to be right over the whole
     recording; where physics is missing, it bends the parameters to hide that, and a prediction bends
-    them less. Where the run at the start misses most of the motion, the fit begins a second time with short
-    predictions, which are easy to get right from afar, and the better of the two ends counts. From a near
-    start they would lead away, since they say little of numbers that only a long run shows. The scale `s` of
-    each channel is the deviation of its residuals.
+    them less. Where the run at the start misses most of the motion, or the fit does not converge, it begins a
+    second time with short predictions, which are easy to get right from afar, and the better of the two ends
+    counts. From a near start they would lead away, since they say little of numbers that only a long run
+    shows. The scale `s` of each channel is the deviation of its residuals.
 
     Args:
         mechanism: What to fit; its numbers are the start, its trusted parameters are held.
@@ -102,8 +102,8 @@ def fit(
     task = Task(model, listed, moved, data, noise, first == "measured", max_steps, minimiser, say)
     with double_precision():
         end = task.run(flat, [process_noise])
-        if end.far:
-            say("fit: the start is far away; once more, from short predictions")
+        if end.doubtful:
+            say("fit: once more, from short predictions")
             # Torques as large as those of the motion make the filter follow the data within a few samples.
             short = everywhere(m, (0.03 * torque_scale(m, data)) ** 2)
             end = min(end, task.run(flat, [short, process_noise]), key=lambda e: e.cost)

@@ -49,9 +49,9 @@ class Ended:
     cost: float
 
     @property
-    def far(self) -> bool:
-        """Whether the start was too far away for its end to be trusted."""
-        return not np.all(self.missed <= FAR)
+    def doubtful(self) -> bool:
+        """Whether another way from the start may end better: it was far away, or this way did not end."""
+        return self.status != "converged" or not np.all(self.missed <= FAR)
 
 
 @dataclasses.dataclass(frozen=True)
