@@ -191,7 +191,8 @@ def main() -> int:
     console.print(f"{len(wanted)} records, {len(wanted) - len(todo)} known, {len(todo)} to run")
     began = time.perf_counter()
     for count, (job, row) in enumerate(rows(todo, a.workers), 1):
-        known[key(job)] = {"code": made["code"], **row}
+        new = {"oracle_code": made["code"]} if a.oracles else {}
+        known[key(job)] = {"code": made["code"], **row, **new}
         save(path, results)
         got = row.get("error") or f"{answer(row)}, {row['verdict']}, {row['wall_s']:.1f} s"
         left = (time.perf_counter() - began) / count * (len(todo) - count)

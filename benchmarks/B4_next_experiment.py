@@ -123,7 +123,7 @@ def trial(name: str, seed: int, starts: int, say) -> dict:
                 "setting": rated.setting,
                 "voltage": rated.voltage,
                 "predicted": rated.each[0],
-                "worse_of_both": rated.nats,
+                "nats": rated.nats,
                 **got,
                 "peaks": np.max(np.abs(rec.y), axis=0).tolist(),
             }
@@ -144,7 +144,8 @@ def summary(rows: list[dict]) -> str:
         f"{1 / TS:g} Hz. The margin is the evidence for the truth less that for its rival [nat], the first "
         "effect of a pair being true; of "
         f"{len(standard_inputs(2000, TS, LIMITS))} standard inputs the {PLAYED} "
-        "that rank best are played too, and the one with the largest measured margin is the best.",
+        "that rank best are played too, and the one with the largest measured margin is the best. "
+        "A star: one of the two fits had not converged, so the margin may be larger or smaller.",
         "",
         "| pair | seed | ordinary recording | best standard | its margin | design: promised "
         "| design: measured | per second | ratio | peak V | peak deflection [deg] |",
@@ -154,9 +155,10 @@ def summary(rows: list[dict]) -> str:
         design = [i for i in r["inputs"] if i["input"] == "design"]
         standard = max((i for i in r["inputs"] if i["input"] != "design"), key=lambda i: i["margin"])
         d = design[0] if design else standard
+        told = lambda m: f"{m['margin']:.1f}" + "*" * (not m["converged"])  # noqa: E731
         lines.append(
-            f"| {r['pair']} | {r['seed']} | {r['original']['margin']:.1f} | {standard['input']}, "
-            f"{standard['setting']} | {standard['margin']:.1f} | {d['predicted']:.0f} | {d['margin']:.1f} "
+            f"| {r['pair']} | {r['seed']} | {told(r['original'])} | {standard['input']}, "
+            f"{standard['setting']} | {told(standard)} | {d['predicted']:.0f} | {told(d)} "
             f"| {d['margin'] / SECONDS:.1f} | {d['margin'] / standard['margin']:.2f} | {d['voltage']:.2f} "
             f"| {np.rad2deg(d['peaks'][1]):.1f} |"
         )

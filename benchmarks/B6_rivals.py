@@ -154,7 +154,8 @@ def page(summary: dict[str, dict[str, Any]]) -> str:
         "true structure. `failed`: it raised an error, or its answer could not be fitted.",
         "What is no torque of angles, speeds and voltage, such as a sensor's error, a mode or a warm motor,",
         "has no name in the regressions of torque. `refit + BIC` fits the whole catalogue one by one, which",
-        "takes about a quarter of an hour a record; where it is not in the table, it was not run.",
+        "takes about a quarter of an hour a record; where it is not in the table, it was not run. `s` is by",
+        "the clock on a busy machine, compiling included.",
     ]
     return "\n".join(["# B6: one hidden effect, every method", "", head, *rows, "", *notes]) + "\n"
 

@@ -393,6 +393,7 @@ for _hidden in ("friction", "drag", "uneven friction", "nothing"):
 def _rivals() -> dict[str, dict[str, Any]]:
     """Sums of every method on the same records, the search itself left out."""
     summary = results("B6.json")["summary"]
+    assert len({(sums["first"][1], sums["false_alarms"][1]) for sums in summary.values()}) == 1
     return {name: sums for name, sums in summary.items() if name != "rotflex_jax"}
 
 

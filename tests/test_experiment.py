@@ -14,9 +14,9 @@ from rotflex_jax.data.excitation import multisine, noise, prbs
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import imitation
 from rotflex_jax.experiment.ascent import improved
-from rotflex_jax.experiment.contest import Contest
+from rotflex_jax.experiment.contest import Contest, Meeting
 from rotflex_jax.experiment.hypotheses import hypothesis, place_of
-from rotflex_jax.experiment.imitation import imitate, truth
+from rotflex_jax.experiment.imitation import Imitation, imitate, truth
 from rotflex_jax.experiment.limits import Limits
 from rotflex_jax.model import Model
 from rotflex_jax.precision import double_precision
@@ -125,7 +125,7 @@ def test_slope_is_that_of_differences(contest):
     for _ in range(3):
         # A direction with energy at all frequencies, along which the slope does not vanish.
         way = 0.3 * rng.standard_normal(len(u)) + g / np.abs(g).max()
-        up, down = (contest.meet(u + s * 1e-3 * way, m).smooth for s in (1, -1))
+        up, down = (contest.meet(u + s * 1e-3 * way, m).mean for s in (1, -1))
         assert g @ way == pytest.approx((np.log(up) - np.log(down)) / 2e-3, rel=0.01)
 
 
@@ -266,6 +266,13 @@ def test_a_direction_that_nothing_shows_does_not_count():
     c = Contest((a, b), Ts, V)
     meetings = [c.meet(noise(500, Ts, seed=seed)) for seed in (2, 3)]
     assert c.visible(meetings).counted == (True, False)
+
+
+@pytest.mark.parametrize(("other", "counts"), [(500.0, True), (5.0, False)])
+def test_a_direction_that_decides_counts_though_the_opposite_shows_far_more(contest, other, counts):
+    one, two = (Imitation(np.zeros(1), nats, np.zeros((1, 2)), 0.0, 1) for nats in (20_000.0, other))
+    meeting = Meeting(np.zeros((2, 1, 2)), (one, two))
+    assert contest.visible([meeting]).counted == (True, counts)
 
 
 def test_a_machine_that_drifts_out_of_its_limits_is_named():

@@ -236,7 +236,7 @@ def test_windows_give_the_numbers_with_which_short_free_runs_are_best():
 
 @pytest.mark.parametrize("frequency", [8.0, 15.0, 20.0])
 def test_a_mode_is_found_from_a_fitted_joint_without_it(frequency):
-    """Short predictions say little of a mode: begun with them, the fit ends 240 nats short, past 13 Hz."""
+    """Short predictions say little of a mode: begun with them, the fit ends above 13 Hz, 240 nats worse."""
     mode = ("second_mode", "arm")
     r = make_record({mode: {"inertia": 2e-4, "frequency": 10.0, "damping": 0.03}}, seed=7, seconds=20.0)
     rec = Recording(u=r["u"], y=r["y"], Ts=r["Ts"])

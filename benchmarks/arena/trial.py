@@ -75,8 +75,11 @@ def with_oracle(row: dict[str, Any], train: rf.Recording, test: rf.Recording) ->
 
 
 def judged_again(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with its oracle anew, the search left as it was."""
-    return with_oracle(row, *recording(row)[0].split(SPLIT))
+    """A row with its oracle anew, the search left as it was; the row itself where that fails."""
+    try:
+        return with_oracle(row, *recording(row)[0].split(SPLIT))
+    except Exception as problem:  # a finished search is worth more than its oracle
+        return {**row, "oracle_error": f"{type(problem).__name__}: {problem}"}
 
 
 def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:

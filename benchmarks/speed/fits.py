@@ -164,7 +164,7 @@ def one_start(seconds: float) -> list[Case]:
             note="and four first states",
         ),
         Case("one fit: scipy + numba", lambda: scipy_fit([r], p0), 1e-3),
-        Case("one fit: rotflex_jax fit, with intervals", lambda: fit(joint, r), 1e-3, note="its own start"),
+        Case("one fit: rotflex_jax fit, with intervals", lambda: fit(joint, r), 1e-3),
         Case("one fit: optimistix", lambda: optimistix_fit(r, p0), 1e-3),
         Case(
             "one fit: scipy + solve_ivp",

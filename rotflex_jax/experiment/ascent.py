@@ -26,7 +26,7 @@ class View:
     """One period as the climb sees it.
 
     Attributes:
-        value: Logarithm of the evidence, less what peaks beyond their limits cost.
+        value: Logarithm of the mean evidence, less what peaks beyond their limits cost.
         slope: Along each sample of the period, per voltage limit (P,).
         meeting: Both machines under it.
     """
@@ -68,7 +68,7 @@ class Climb:
         # A clipped sample does not follow; the others share the slope of what follows them.
         back = (np.bincount(low, g, len(u)) + np.bincount(high, g, len(u))) / 2
         period = c.limits.voltage * back.reshape(REHEARSED, -1).sum(axis=0)
-        return View(np.log(m.smooth) - float(np.sum(cost)), period - period.mean(), m)
+        return View(np.log(m.mean) - float(np.sum(cost)), period - period.mean(), m)
 
 
 def improved(

@@ -13,8 +13,9 @@ from rotflex_jax.experiment.limits import Limits
 # Shapes from which an imitation also starts: factors of every number of the rival's effect that is not an
 # amplitude. Linear algebra alone sees one shape at a time.
 FACTORS = (0.6, 1.6)
-# A run that the other machine imitates to this share of the opposite case is contained in it.
-CONTAINED = 0.05
+# A run is contained in the other machine that imitates it to this share of the opposite case, and to so
+# little that no recording would decide it [nat].
+CONTAINED, FEW = 0.05, 10.0
 # Exponent of the smooth maximum whose slope stands for that of a peak.
 PEAKED = 24
 
@@ -39,7 +40,7 @@ class Meeting:
         return min(self._told)
 
     @property
-    def smooth(self) -> float:
+    def mean(self) -> float:
         """Geometric mean of what counts, what a climb raises in the place of the smaller [nat].
 
         Where one direction is bounded, as that of a play by its size, the slope of the smaller would leave
@@ -94,16 +95,16 @@ class Contest:
     def visible(self, meetings: Sequence[Meeting]) -> "Contest":
         """The contest without a direction that no input can show.
 
-        Where one machine contains the other (Stribeck friction Coulomb's), or one effect at the size that
-        imitates the other is next to nothing, that run can always be imitated; only the opposite case
-        shows in a recording.
+        Where one machine contains the other (Stribeck friction Coulomb's), or one effect is next to nothing
+        at the size that imitates the other, that run can always be imitated; only the opposite case shows
+        in a recording.
 
         Args:
             meetings: Under inputs of many kinds.
         """
         nats = np.array([[i.nats for i in m.imitations] for m in meetings])
         one, other = np.max(nats, axis=0, where=np.isfinite(nats), initial=0.0)
-        counted = (bool(one > CONTAINED * other), bool(other > CONTAINED * one))
+        counted = (bool(one > min(CONTAINED * other, FEW)), bool(other > min(CONTAINED * one, FEW)))
         return dataclasses.replace(self, counted=counted if any(counted) else (True, True))
 
     def excess(self, outputs: np.ndarray) -> np.ndarray:
@@ -111,7 +112,7 @@ class Contest:
         return np.max(np.abs(outputs), axis=1) / self.limits.outputs(outputs.shape[-1])
 
     def slope(self, u: np.ndarray, m: Meeting, penalty: np.ndarray) -> np.ndarray:
-        """Slope (N,) of `log(smooth) - sum penalty * log(peak)` along the voltage [1/V].
+        """Slope (N,) of `log(mean) - sum penalty * log(peak)` along the voltage [1/V].
 
         Args:
             u: Voltage (N,) [V].

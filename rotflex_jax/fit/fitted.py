@@ -22,8 +22,8 @@ class Fit:
         noise: Standard deviation of the residual per channel [unit of the channel].
         covariance: Of the free parameters [declared units], in the order of `free_names`.
         free_names: Full names of the free parameters.
-        steps: Iterations.
-        history: Cost after each stage.
+        steps: Iterations on the way that ended here.
+        history: Half the squared error after each descent of that way.
         weakest: Direction of the free parameters (in shares of their values) that the data say least of.
         local: Parameter that each recording has for itself -> its estimates, in the order of the
             recordings; `parameters` has the mean.

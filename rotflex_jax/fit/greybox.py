@@ -48,10 +48,10 @@ def fit(
     `y_hat` is a free run, or, with `process_noise`, the prediction of a steady Kalman filter whose
     model admits white torques of that intensity. A free run asks the model to be right over the whole
     recording; where physics is missing, it bends the parameters to hide that, and a prediction bends
-    them less. Where the run at the start misses most of the motion, or the fit does not converge, it begins a
-    second time with short predictions, which are easy to get right from afar, and the better of the two ends
-    counts. From a near start they would lead away, since they say little of numbers that only a long run
-    shows. The scale `s` of each channel is the deviation of its residuals.
+    them less. Where the run or prediction at the start misses most of the motion, or the fit does not
+    converge, it begins a second time with short predictions, which are easy to get right from afar, and the
+    better of the two ends counts. From a near start they would lead away, since they say little of numbers
+    that only a long run shows. The scale `s` of each channel is the deviation of its residuals.
 
     Args:
         mechanism: What to fit; its numbers are the start, its trusted parameters are held.
@@ -62,7 +62,7 @@ def fit(
             nothing pulls the machine back, a free first position hides a drift of the model.
         window_seconds: Begin anew every so often [s], each time with a first state of its own and with
             memories at rest: the numbers with which free runs of that length are best.
-        max_steps: Most iterations of each stage.
+        max_steps: Most iterations of each descent; there are several, each with the scale of the one before.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
         progress: Called with a line of text now and then.
@@ -106,7 +106,7 @@ def fit(
             say("fit: once more, from short predictions")
             # Torques as large as those of the motion make the filter follow the data within a few samples.
             short = everywhere(m, (0.03 * torque_scale(m, data)) ** 2)
-            end = min(end, task.run(flat, [short, process_noise]), key=lambda e: e.cost)
+            end = min(end, task.run(flat, [short, process_noise]), key=lambda e: e.rank)
         e, J = residuals_and_slopes(moved, jnp.asarray(end.flat), end.given)
         if throw and end.status != "converged":
             raise RuntimeError(f"The fit did not converge: {end.status}.")

@@ -85,8 +85,8 @@ def many_starts(
     are fitted jointly: parameters are common, first states each recording's own.
 
     It gives numbers, not intervals: hand the `model` to `fit` for those. Not for a model that is known to
-    miss something large: a long free run then has its least cost at wrong numbers, and `fit`, which comes
-    from short predictions, does better. Memory is that of the recordings, whatever the starts.
+    miss something large: a long free run then has its least cost at wrong numbers, and `fit` with
+    `process_noise` does better. Memory is that of the recordings, whatever the starts.
 
     Args:
         mechanism: What to fit; its numbers are the first start and the middle of the others, its trusted

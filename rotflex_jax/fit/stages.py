@@ -22,8 +22,13 @@ Stage = Mapping[str, float] | None
 
 # A stage that only leads to the next one ends where steps gain less than this [nat].
 NEAR = 1.0
+# Descents of the last stage at most, each with the scale that the one before left; they end where it changes
+# by less than this share, with measured first states after so many at least.
+PASSES, SETTLED, FOLLOWED = 5, 0.02, 4
 # A start is far where its run misses a channel by more than this share of the channel's deviation.
 FAR = 0.7
+# Of two ends that differ by less, one that converged is better [nat].
+ALIKE = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,12 +37,12 @@ class Ended:
 
     Attributes:
         flat: All coordinates.
-        given: What the last runs were made with, its scale the one that is left.
+        given: What the last runs were made with, with the scale of the last residuals.
         status: "converged", or why not.
         steps: Iterations.
         history: Half the squared error after each descent.
         missed: What the run at the start missed each channel by, as a share of its deviation (C,).
-        cost: Negative log-likelihood, deviations re-estimated, constants left out; infinite if diverged.
+        cost: Negative log-likelihood with the last scale, constants left out; infinite if diverged.
     """
 
     flat: np.ndarray
@@ -49,8 +54,13 @@ class Ended:
     cost: float
 
     @property
+    def rank(self) -> float:
+        """Smaller for a better end."""
+        return self.cost + ALIKE * (self.status != "converged")
+
+    @property
     def doubtful(self) -> bool:
-        """Whether another way from the start may end better: it was far away, or this way did not end."""
+        """Whether another way may end better: the start was far away, or this way did not converge."""
         return self.status != "converged" or not np.all(self.missed <= FAR)
 
 
@@ -83,13 +93,13 @@ class Task:
     def run(self, flat: np.ndarray, stages: Sequence[Stage]) -> Ended:
         """One stage after the other, from a start; each but the last only until it is near its end."""
         seen = self.data.seen > 0
-        spread = np.std(self.data.y[seen], axis=0)
+        spread = np.maximum(np.std(self.data.y[seen], axis=0), self.noise)
         error = lambda cost, scale: np.sqrt(2 * cost / np.sum(seen)) * scale  # noqa: E731
         scale, missed = self.noise, []
         history, steps, status = [], 0, "converged"
         for number, stage in enumerate(stages):
             last = number == len(stages) - 1
-            for _ in range(3 if last else 1):
+            for turn in range(PASSES if last else 1):
                 if self.measured:
                     flat = self._with_measured_states(flat)
                 given = self._given(flat, stage, scale)
@@ -98,13 +108,16 @@ class Task:
                 history.append(float(found.cost.sum()))
                 missed.append(error(found.first, scale) / spread)
                 new = error(found.cost, scale)
-                settled = np.all(np.abs(np.log(new / scale)) < 0.02)
-                scale = np.maximum(new, self.noise * 0.1)
-                if settled or status != "converged":
+                settled = np.all(np.abs(np.log(new / scale)) < SETTLED)
+                scale = np.where(np.isfinite(new), np.maximum(new, self.noise * 0.1), scale)
+                # States that the first samples tell follow the numbers, fitted with the former ones.
+                if status != "converged" or (settled and turn + 1 >= FOLLOWED * self.measured):
                     break
         given = given._replace(scale=jnp.asarray(scale))
         cost = float(np.sum(seen) * np.sum(np.log(scale)))
-        return Ended(flat, given, status, steps, history, missed[0], cost if np.isfinite(cost) else np.inf)
+        if status.startswith("diverged") or not np.isfinite(cost):
+            cost = np.inf
+        return Ended(flat, given, status, steps, history, missed[0], cost)
 
     def _model(self, flat: np.ndarray) -> Model:
         values = self.moved.coordinates.values(flat).mean(axis=0)
