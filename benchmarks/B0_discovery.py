@@ -30,7 +30,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -91,20 +91,29 @@ def prepare() -> None:
 
 
 def one(job: Job) -> dict[str, Any]:
-    """A job in a process of its own, or the oracle of one that is done; imports late, after the settings."""
-    from arena.trial import judged_again, trial
+    """A job in a process of its own; imports late, after the settings."""
+    from arena.trial import trial
 
-    return judged_again(job) if "lines" in job else trial(job)
+    return trial(job)
 
 
-def rows(todo: list[Job], workers: int) -> Iterator[tuple[Job, dict[str, Any]]]:
+def again(row: Job) -> dict[str, Any]:
+    """The oracle of a record that is done, likewise."""
+    from arena.trial import judged_again
+
+    return judged_again(row)
+
+
+def rows(
+    todo: list[Job], workers: int, task: Callable[[Job], dict[str, Any]] = one
+) -> Iterator[tuple[Job, dict[str, Any]]]:
     """Rows as they are ready; a process that dies takes only its own records with it."""
     if workers == 1:
         prepare()
-        yield from ((job, one(job)) for job in todo)
+        yield from ((job, task(job)) for job in todo)
         return
     with ProcessPoolExecutor(workers, get_context("spawn"), initializer=prepare) as pool:
-        running = {pool.submit(one, job): job for job in todo}
+        running = {pool.submit(task, job): job for job in todo}
         for done in as_completed(running):
             job = running[done]
             try:
@@ -186,11 +195,13 @@ def main() -> int:
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
     known = results["records"]
     todo = [j for j in wanted if key(j) not in known or "error" in known[key(j)]]
+    task = one
     if a.oracles:
+        task = again
         wanted = todo = [r for r in known.values() if "error" not in r]
     console.print(f"{len(wanted)} records, {len(wanted) - len(todo)} known, {len(todo)} to run")
     began = time.perf_counter()
-    for count, (job, row) in enumerate(rows(todo, a.workers), 1):
+    for count, (job, row) in enumerate(rows(todo, a.workers, task), 1):
         new = {"oracle_code": made["code"]} if a.oracles else {}
         known[key(job)] = {"code": made["code"], **row, **new}
         save(path, results)

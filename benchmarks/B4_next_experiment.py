@@ -30,7 +30,7 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.experiment.contest import other_shapes
 from rotflex_jax.experiment.hypotheses import Hypothesis, hypothesis
-from rotflex_jax.experiment.imitation import imitate
+from rotflex_jax.experiment.imitation import best_imitation
 from rotflex_jax.experiment.menu import standard_inputs
 
 TS, SECONDS = 0.002, 20.0
@@ -68,7 +68,7 @@ def evidence(h: Hypothesis, rec: rf.Recording, noise: np.ndarray) -> tuple[float
     Gaussian, the deviation of each channel re-estimated, constants left out. First state, offset, bias and
     every number of the machine are fitted to this recording, from several shapes of the effect.
     """
-    found = min((imitate(h, rec.u, rec.y, TS, s) for s in [h.start, *other_shapes(h)]), key=lambda i: i.nats)
+    found = best_imitation(h, rec.u, rec.y, TS, [h.start, *other_shapes(h)])
     errors = np.mean(np.square(found.remainder * noise), axis=0)
     fit = -0.5 * rec.N * float(np.sum(np.log(errors)))
     return fit - 0.5 * len(found.numbers) * float(np.log(rec.y.size)), found.converged

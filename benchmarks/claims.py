@@ -390,6 +390,11 @@ for _hidden in ("friction", "drag", "uneven friction", "nothing"):
 # -- other ways to find the effect --------------------------------------------------------------------------
 
 
+def _search() -> dict[str, Any]:
+    """Sums of the search on the records that the others were given."""
+    return results("B6.json")["summary"]["rotflex_jax"]
+
+
 def _rivals() -> dict[str, dict[str, Any]]:
     """Sums of every method on the same records, the search itself left out."""
     summary = results("B6.json")["summary"]
@@ -400,13 +405,13 @@ def _rivals() -> dict[str, dict[str, Any]]:
 @named
 def rivals_records() -> str:
     """Records with an effect that all methods were given."""
-    return str(results("B6.json")["summary"]["rotflex_jax"]["first"][1])
+    return str(_search()["first"][1])
 
 
 @named
 def rivals_ours() -> str:
     """In how many the search named it first."""
-    return str(results("B6.json")["summary"]["rotflex_jax"]["first"][0])
+    return str(_search()["first"][0])
 
 
 @named
@@ -431,7 +436,7 @@ def rivals_alarms() -> str:
 @named
 def rivals_nothing() -> str:
     """Records with nothing hidden that all were given."""
-    return str(results("B6.json")["summary"]["rotflex_jax"]["false_alarms"][1])
+    return str(_search()["false_alarms"][1])
 
 
 # -- the next experiment ------------------------------------------------------------------------------------

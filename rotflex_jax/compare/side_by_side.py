@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from rotflex_jax import joints
 from rotflex_jax.compare.horizon import against_horizon
@@ -18,10 +17,10 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
+from rotflex_jax.threads import one_thread
 
 
-# Matrices here are small and many: threads of a linear algebra library only wait for one another.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def compare(
     recordings: Recording | Sequence[Recording],
     methods: Iterable[str | Method] | None = None,

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from rotflex_jax.discover.calibrations import own_notes, settle
 from rotflex_jax.discover.decide import choose, describe, on_equal_terms, samples_of
@@ -41,6 +40,7 @@ from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.threads import one_thread
 
 Progress = Callable[[str], None]
 
@@ -48,8 +48,7 @@ Progress = Callable[[str], None]
 REFITTED, ROUNDS = 4, 4
 
 
-# Matrices here are small and many: threads of a linear algebra library only wait for one another.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 # A trial may diverge; its cost, which is then not finite, says so.
 @np.errstate(over="ignore", invalid="ignore")
 def discover(

@@ -7,7 +7,7 @@ import numpy as np
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.hypotheses import Hypothesis
-from rotflex_jax.experiment.imitation import Imitation, imitate, pull, truth
+from rotflex_jax.experiment.imitation import Imitation, best_imitation, pull, truth
 from rotflex_jax.experiment.limits import Limits
 
 # Shapes from which an imitation also starts: factors of every number of the rival's effect that is not an
@@ -88,8 +88,7 @@ class Contest:
             starts = [rival.start if last is None else last.imitations[k].numbers]
             if thorough:
                 starts += [rival.start] * (last is not None) + other_shapes(rival)
-            tried = [imitate(rival, u, y, self.Ts, s) for s in starts]
-            found.append(min(tried, key=lambda i: i.nats))
+            found.append(best_imitation(rival, u, y, self.Ts, starts))
         return Meeting(np.array(runs), (found[0], found[1]), self.counted)
 
     def visible(self, meetings: Sequence[Meeting]) -> "Contest":

@@ -11,7 +11,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.ascent import LOOKS, improved
 from rotflex_jax.experiment.contest import Contest, Meeting, other_shapes
 from rotflex_jax.experiment.hypotheses import Hypothesis, hypothesis, place_of
-from rotflex_jax.experiment.imitation import imitate, truth
+from rotflex_jax.experiment.imitation import best_imitation, truth
 from rotflex_jax.experiment.limits import Limits
 from rotflex_jax.experiment.menu import SHARES, Standard, standard_inputs
 from rotflex_jax.experiment.result import Experiment, Rated
@@ -199,7 +199,7 @@ def _rivals(
         held = {i for i, n in enumerate(h.mechanism.parameter_names) if n.startswith(own)}
         h = dataclasses.replace(h, moved=tuple(i for i in h.moved if i not in held))
     y = truth(made[true], u, Ts)
-    best = min((imitate(h, u, y, Ts, s) for s in (h.start, *other_shapes(h))), key=lambda i: i.nats)
+    best = best_imitation(h, u, y, Ts, [h.start, *other_shapes(h)])
     fitted = h.with_numbers(best.numbers).mechanism
     # Offset and bias belong to a recording: the next one has its own.
     fitted = fitted.with_values(dict.fromkeys(h.calibrations, 0.0))

@@ -5,6 +5,7 @@ new recording leaves open: B's shape, every free parameter of the machine, first
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -179,6 +180,13 @@ def imitate(
     left = w.ravel() + J.reshape(w.size, -1) @ step
     nats = 0.5 * float(left @ left)
     return Imitation(numbers, nats, w, cost - nats, steps)
+
+
+def best_imitation(
+    rival: Hypothesis, u: np.ndarray, y: np.ndarray, Ts: float, starts: Sequence[np.ndarray]
+) -> Imitation:
+    """The imitation that leaves least, of those from several starts; arguments as in `imitate`."""
+    return min((imitate(rival, u, y, Ts, start) for start in starts), key=lambda i: i.nats)
 
 
 def _best_step(w: np.ndarray, J: np.ndarray, damping: float) -> np.ndarray:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.descent import Moved, residuals_and_slopes
@@ -19,6 +18,7 @@ from rotflex_jax.mechanism.linearise import inverse_mass, linearise
 from rotflex_jax.model import Model, window_starts
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.threads import one_thread
 
 if TYPE_CHECKING:
     from rotflex_jax.fit.compressed import Minimiser
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str], None]
 
 
-# Matrices here are small: threads of a linear algebra library only wait for one another.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit(
     mechanism: Mechanism | Model,
     recordings: Recording | Sequence[Recording],

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.marquardt import ENOUGH, ROUGHLY, Problem, Reached, descend
@@ -17,6 +16,7 @@ from rotflex_jax.model import Model
 from rotflex_jax.parameters import Transform
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.threads import one_thread
 
 TOGETHER = 8
 """Starts in one compiled call; progress is told between calls."""
@@ -62,8 +62,7 @@ class ManyStarts:
         return "\n".join(lines)
 
 
-# Matrices here are small: threads of a linear algebra library only wait for one another.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def many_starts(
     mechanism: Mechanism | Model,
     recordings: Recording | Sequence[Recording],

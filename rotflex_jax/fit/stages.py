@@ -95,7 +95,7 @@ class Task:
         seen = self.data.seen > 0
         spread = np.maximum(np.std(self.data.y[seen], axis=0), self.noise)
         error = lambda cost, scale: np.sqrt(2 * cost / np.sum(seen)) * scale  # noqa: E731
-        scale, missed = self.noise, []
+        scale, missed = self.noise, np.full_like(spread, np.inf)
         history, steps, status = [], 0, "converged"
         for number, stage in enumerate(stages):
             last = number == len(stages) - 1
@@ -105,8 +105,9 @@ class Task:
                 given = self._given(flat, stage, scale)
                 found = self._descend(flat, given, NATS if last else NEAR)
                 flat, status, steps = found.flat, found.status, steps + found.steps
+                if not history:
+                    missed = error(found.first, scale) / spread
                 history.append(float(found.cost.sum()))
-                missed.append(error(found.first, scale) / spread)
                 new = error(found.cost, scale)
                 settled = np.all(np.abs(np.log(new / scale)) < SETTLED)
                 scale = np.where(np.isfinite(new), np.maximum(new, self.noise * 0.1), scale)
@@ -117,7 +118,7 @@ class Task:
         cost = float(np.sum(seen) * np.sum(np.log(scale)))
         if status.startswith("diverged") or not np.isfinite(cost):
             cost = np.inf
-        return Ended(flat, given, status, steps, history, missed[0], cost)
+        return Ended(flat, given, status, steps, history, missed, cost)
 
     def _model(self, flat: np.ndarray) -> Model:
         values = self.moved.coordinates.values(flat).mean(axis=0)
