@@ -5,70 +5,12 @@
     train, test = rec.split(0.7)
     result = rf.discover(rf.joints.paper(), train, test)
 
-Importing the package changes no setting of JAX and loads neither matplotlib nor pandas.
+Importing the package changes no setting of JAX. A name is loaded when it is first asked for, so a fit does
+not wait for the search, the filters or a plot; `__init__.pyi` says which names there are and where they live.
 """
 
-from rotflex_jax import adaptive, basis, data, effects, export, joints, kernels, metrics
-from rotflex_jax.compare import Comparison, compare
-from rotflex_jax.data import load
-from rotflex_jax.discover import Discovery, LearnedTorqueResult, discover, learn_torque, locate
-from rotflex_jax.display import explore, live
-from rotflex_jax.errors import InputError
-from rotflex_jax.experiment import Experiment, Limits, next_experiment
-from rotflex_jax.fastloops import enable_compilation_cache, enable_fast_loops
-from rotflex_jax.fit import ManyStarts, SeriesFit, fit, forward_regression, least_squares, many_starts
-from rotflex_jax.fit.fitted import Fit
-from rotflex_jax.fleet import Fleet, fleet
-from rotflex_jax.latent import LatentTorque, latent_torque
-from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, linearise, simulate
-from rotflex_jax.model import Model
-from rotflex_jax.recording import Recording
-from rotflex_jax.series import Series
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "Comparison",
-    "Discovery",
-    "Experiment",
-    "Exponential",
-    "Fit",
-    "Fleet",
-    "InputError",
-    "LatentTorque",
-    "LearnedTorqueResult",
-    "Limits",
-    "ManyStarts",
-    "Mechanism",
-    "Model",
-    "Recording",
-    "Series",
-    "SeriesFit",
-    "SmoothRK4",
-    "adaptive",
-    "basis",
-    "compare",
-    "data",
-    "discover",
-    "effects",
-    "enable_compilation_cache",
-    "enable_fast_loops",
-    "explore",
-    "export",
-    "fit",
-    "fleet",
-    "forward_regression",
-    "joints",
-    "kernels",
-    "latent_torque",
-    "learn_torque",
-    "least_squares",
-    "linearise",
-    "live",
-    "load",
-    "locate",
-    "many_starts",
-    "metrics",
-    "next_experiment",
-    "simulate",
-]

@@ -159,19 +159,34 @@ def test_effects_do_not_import_each_other() -> None:
 def test_importing_is_light_and_changes_nothing() -> None:
     program = """
 import json, os, sys
+import rotflex_jax as rf
+nothing = "jax" not in sys.modules
 import jax
 before = dict(jax.config.values), dict(os.environ)
-import rotflex_jax
+rf.fit, rf.joints.paper, rf.effects, rf.Recording, rf.load
 changed = before != (dict(jax.config.values), dict(os.environ))
-from rotflex_jax import effects, joints
-heavy = {"matplotlib", "pandas", "pysindy", "h5py", "numba", "pyarrow", "typer"} & set(sys.modules)
-print(json.dumps({"heavy": sorted(heavy), "changed": changed}))
+late = {"equinox", "optimistix", "scipy.linalg", "scipy.signal", "rotflex_jax.discover", "rotflex_jax.basis"}
+late |= {"matplotlib", "pandas", "pysindy", "h5py", "numba", "pyarrow", "typer"}
+loaded = sorted(late & set(sys.modules))
+print(json.dumps({"nothing": nothing, "loaded": loaded, "changed": changed}))
 """
     run = subprocess.run(
         [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr
-    assert json.loads(run.stdout) == {"heavy": [], "changed": False}
+    assert json.loads(run.stdout) == {"nothing": True, "loaded": [], "changed": False}
+
+
+def test_a_name_that_is_also_a_folder_stays_the_function() -> None:
+    program = """
+import rotflex_jax.fit.greybox, rotflex_jax.discover.loop, rotflex_jax.compare.method, rotflex_jax.fleet.task
+import rotflex_jax as rf
+print(rf.compare.__name__, rf.discover.__name__, rf.fleet.__name__, rf.fit.__name__)
+print(*(name for name in rf.__all__ if getattr(rf, name) is None))
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split() == ["compare", "discover", "fleet", "fit"]
 
 
 def test_version_is_the_same_everywhere() -> None:

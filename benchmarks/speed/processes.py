@@ -1,40 +1,71 @@
-"""A fit from a new process: importing, loading what was compiled before, reading nothing."""
+"""New processes, timed whole: what a command waits for beside its work."""
 
 from __future__ import annotations
 
+import json
+import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
+from typing import Any
 
-IMPORTS = """
-import rotflex_jax as rf; rf.enable_fast_loops(); rf.enable_compilation_cache()
-from speed.fits import recording, start, smooth
-rf.many_starts, rf.Recording
-"""
-COLD = (
-    IMPORTS
+BEGIN = "import rotflex_jax as rf; rf.enable_fast_loops(); rf.enable_compilation_cache(); "
+IMPORTS = BEGIN + "rf.fit, rf.Recording, rf.joints, rf.effects"
+# Start values a fifth to a half off, of the joint that the measurements are made on.
+FIT = (
+    BEGIN
     + """
-rf.many_starts(smooth(p=start(0.3, 1)), recording({seconds}), starts=1, short_seconds=None)
+import sys
+import numpy as np
+kept = np.load(sys.argv[1])
+joint = rf.joints.paper(hub_damping=0.006, joint_damping=0.003)
+joint = joint + rf.effects.CubicSpring(at="joint", stiffness=3.0)
 """
 )
+BUILT_IN = 'joint = joint + rf.effects.Coulomb(at="hub", level=0.04)'
+OWN = "from speed.machine import SmoothFriction; joint = joint + SmoothFriction(at='hub', level=0.04)"
+END = "\nrf.fit(joint, rf.Recording(u=kept['u'], y=kept['y'], Ts=float(kept['Ts'])))"
+
+
+def process(code: str, *arguments: str, cache: str) -> dict[str, Any]:
+    """A new Python: its seconds by the clock and of the processor, and the JSON of its last line, if any.
+
+    It may keep the byte code of what it imports, as an installed package does.
+    """
+    known = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    known["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    known["JAX_COMPILATION_CACHE_DIR"] = cache
+    used = lambda: sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])  # noqa: E731
+    began, worked = time.perf_counter(), used()
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True, env=known
+    )
+    said = json.loads(done.stdout.splitlines()[-1]) if done.stdout else {}
+    return {**said, "clock": time.perf_counter() - began, "processor": used() - worked}
 
 
 def cold(seconds: float) -> dict[str, float]:
-    """Whole processes, from start to fitted; the first may have to fill the cache of compiled code."""
-    first, *warm = [_process(COLD.format(seconds=seconds)) for _ in range(4)]
-    clock, worked = (min(column) for column in zip(*warm, strict=True))
-    return {
-        "whole process, first, seconds": first[0],
-        "whole process, warm cache, seconds": clock,
-        "whole process, warm cache, processor seconds": worked,
-        "importing alone, processor seconds": min(_process(IMPORTS)[1] for _ in range(2)),
-    }
+    """From the start of a process to a fit, with nothing compiled and with a warm cache; least of several."""
+    import numpy as np
 
+    from speed.fits import recording
 
-def _process(code: str) -> tuple[float, float]:
-    """Seconds of a process by the clock and of the processor."""
-    used = lambda: sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])  # noqa: E731
-    begin, worked = time.perf_counter(), used()
-    subprocess.run([sys.executable, "-c", code], check=True)
-    return time.perf_counter() - begin, used() - worked
+    made = recording(seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        file, cache = f"{folder}/recording.npz", f"{folder}/cache"
+        np.savez(file, u=made.u, y=made.y, Ts=made.Ts)
+        rounds = {
+            what: [process(FIT + effect + END, file, cache=cache) for _ in range(6)]
+            for what, effect in (("fit", BUILT_IN), ("fit with an effect of one's own", OWN))
+        }
+        jax = [process("import jax", cache=cache) for _ in range(4)]
+        imports = [process(IMPORTS, cache=cache) for _ in range(4)]
+    facts = {"fit, nothing compiled, seconds": rounds["fit"][0]["clock"]}
+    rounds |= {"importing": imports, "importing jax alone": jax}
+    for what, found in rounds.items():
+        facts[f"{what}, seconds"] = min(f["clock"] for f in found)
+        facts[f"{what}, processor seconds"] = min(f["processor"] for f in found)
+    return facts

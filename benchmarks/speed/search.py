@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
-from pathlib import Path
-from typing import Any
 
 import numpy as np
+
+from speed.processes import process
 
 # What is hidden in the records, 20 s at 500 Hz each, tuning seeds.
 HIDDEN = ((), (("cubic_spring", "joint"),), (("coulomb", "hub"),), (("lag", "input"),))
@@ -30,7 +25,7 @@ for path in sys.argv[1:]:
     rf.discover(rf.joints.paper(), train, test)
     rounds.append([time.perf_counter() - began, used() - worked])
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-print(json.dumps({"rounds": rounds, "processor": used(), "peak": peak}))
+print(json.dumps({"rounds": rounds, "peak": peak}))
 """
 
 
@@ -45,9 +40,9 @@ def searches(seconds: float) -> dict[str, float]:
             paths.append(f"{folder}/{k}.npz")
             np.savez(paths[-1], u=made["u"], y=made["y"], Ts=made["Ts"])
         one, cache = paths[1], f"{folder}/cache"
-        first, again = _process([one], cache), _process([one], cache)
+        first, again = process(PROCESS, one, cache=cache), process(PROCESS, one, cache=cache)
         # All of them twice: the second time everything is compiled and loaded.
-        every = _process([*paths, *paths], cache)
+        every = process(PROCESS, *paths, *paths, cache=cache)
     warm = every["rounds"][len(paths) :]
     return {
         "new process, nothing compiled, seconds": first["clock"],
@@ -59,17 +54,3 @@ def searches(seconds: float) -> dict[str, float]:
         "everything compiled, longest, seconds": max(r[0] for r in warm),
         "peak memory of one search in MB": again["peak"],
     }
-
-
-def _process(paths: list[str], cache: str) -> dict[str, Any]:
-    """What a new process says that searches these records, and its seconds by the clock."""
-    began = time.perf_counter()
-    known = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
-    done = subprocess.run(
-        [sys.executable, "-c", PROCESS, *paths],
-        check=True,
-        capture_output=True,
-        text=True,
-        env={**known, "JAX_COMPILATION_CACHE_DIR": cache},
-    )
-    return {**json.loads(done.stdout.splitlines()[-1]), "clock": time.perf_counter() - began}

@@ -1,9 +1,8 @@
-"""Fits: parameters of a mechanism, or weights of a basis, from recordings, with honest intervals."""
+"""Fits: parameters of a mechanism, or weights of a basis, from recordings, with honest intervals.
 
-from rotflex_jax.fit.forward_regression import forward_regression
-from rotflex_jax.fit.greybox import fit
-from rotflex_jax.fit.least_squares import least_squares
-from rotflex_jax.fit.many_starts import ManyStarts, many_starts
-from rotflex_jax.fit.series_fit import SeriesFit
+The two know nothing of each other, and a name is loaded when it is first asked for.
+"""
 
-__all__ = ["ManyStarts", "SeriesFit", "fit", "forward_regression", "least_squares", "many_starts"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,50 @@
+from . import (
+    adaptive as adaptive,
+    basis as basis,
+    data as data,
+    effects as effects,
+    export as export,
+    joints as joints,
+    kernels as kernels,
+    metrics as metrics,
+)
+from .compare import Comparison as Comparison, compare as compare
+from .data import load as load
+from .discover import (
+    Discovery as Discovery,
+    LearnedTorqueResult as LearnedTorqueResult,
+    discover as discover,
+    learn_torque as learn_torque,
+    locate as locate,
+)
+from .display import explore as explore, live as live
+from .errors import InputError as InputError
+from .experiment import Experiment as Experiment, Limits as Limits, next_experiment as next_experiment
+from .fastloops import (
+    enable_compilation_cache as enable_compilation_cache,
+    enable_fast_loops as enable_fast_loops,
+)
+from .fit import (
+    ManyStarts as ManyStarts,
+    SeriesFit as SeriesFit,
+    fit as fit,
+    forward_regression as forward_regression,
+    least_squares as least_squares,
+    many_starts as many_starts,
+)
+from .fit.fitted import Fit as Fit
+from .fleet import Fleet as Fleet, fleet as fleet
+from .latent import LatentTorque as LatentTorque, latent_torque as latent_torque
+from .mechanism import (
+    Exponential as Exponential,
+    Mechanism as Mechanism,
+    SmoothRK4 as SmoothRK4,
+    linearise as linearise,
+    simulate as simulate,
+)
+from .model import Model as Model
+from .recording import Recording as Recording
+from .series import Series as Series
+
+__version__: str
+__all__: list[str]
