@@ -23,7 +23,6 @@ from typing import Any
 import rotflex_jax
 
 HERE = Path(__file__).resolve().parent / "results"
-SUBSETS = ("lms", "rls", "pairs", "motion", "fit", "joint", "starts", "cold", "search", "growth")
 
 
 def main() -> None:
@@ -31,7 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="SUBSET")
+    parser.add_argument("--only", nargs="+", choices=list(SUBSET), default=list(SUBSET), metavar="SUBSET")
     parser.add_argument("--rounds", type=int, default=5, help="visits of every case")
     parser.add_argument("--visit", type=float, default=0.1, help="seconds of a visit")
     parser.add_argument("--quick", action="store_true", help="short records: to see whether it runs")
@@ -141,16 +140,34 @@ def _starts(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     return {**found, "facts": reached}
 
 
+def _others(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed.others import others
+
+    return {"facts": others(_seconds(chosen))}
+
+
 def _cold(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     from speed.processes import cold
 
     return {"facts": cold(_seconds(chosen))}
 
 
+def _devices(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed.devices import devices
+
+    return {"facts": devices(2.0, 8, 4) if chosen.quick else devices(10.0, 64, 16)}
+
+
 def _search(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     from speed.search import searches
 
     return {"facts": searches(6.0 if chosen.quick else 20.0)}
+
+
+def _fleet(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed.search import fleet
+
+    return {"facts": fleet(6.0, 1) if chosen.quick else fleet(20.0, 10)}
 
 
 def _growth(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
@@ -176,8 +193,11 @@ SUBSET: dict[str, Callable[[argparse.Namespace, Any], dict[str, Any]]] = {
     "fit": _fit,
     "joint": _joint,
     "starts": _starts,
+    "others": _others,
     "cold": _cold,
+    "devices": _devices,
     "search": _search,
+    "fleet": _fleet,
     "growth": _growth,
 }
 

@@ -1,6 +1,48 @@
-"""One thread for the linear algebra library: matrices here are small and many, and threads only wait."""
+"""The cores of this process, and one thread for linear algebra: matrices are small, and threads only wait."""
 
-from threadpoolctl import threadpool_limits
+import functools
+import os
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
-one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
-"""Decorator: inside the function linear algebra runs in one thread."""
+from threadpoolctl import ThreadpoolController
+
+Given = ParamSpec("Given")
+Returned = TypeVar("Returned")
+
+
+def one_thread(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
+    """Decorator: inside the function linear algebra runs in one thread."""
+
+    @functools.wraps(function)
+    def run(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        with _loaded().limit(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return run
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def keep_to_share(place: int, of: int) -> None:
+    """Keep this process, one of several alike, to cores of its own, where the system lets it.
+
+    Threads that wander between cores slow each other down. Call it before JAX computes, which begins as many
+    threads as it finds cores.
+    """
+    if hasattr(os, "sched_setaffinity"):
+        mine = sorted(os.sched_getaffinity(0))
+        size = max(1, len(mine) // of)
+        first = place * size % len(mine)
+        os.sched_setaffinity(0, mine[first : first + size])
+
+
+@functools.cache
+def _loaded() -> ThreadpoolController:
+    """The libraries of this process; to look for them takes as long as a small fit."""
+    import scipy.linalg  # noqa: F401 - JAX borrows its library, and only what is loaded can be held back
+
+    return ThreadpoolController()

@@ -14,15 +14,15 @@ import numpy as np
 import rotflex_jax as rf
 from rotflex_jax.devices import mesh_of, spread
 
-PROGRAM = Path(__file__).parent / "spread_rows.py"
-HERE = os.environ | {"PYTHONPATH": str(Path(rf.__path__[0]).parent)}
+HERE = Path(__file__).parent
+SURROUNDINGS = os.environ | {"PYTHONPATH": str(Path(rf.__path__[0]).parent)}
 ROWS = 11
 
 
-def run(*arguments: object) -> subprocess.Popen:
-    """The program in a process of its own, since the number of devices holds for a whole process."""
-    line = [sys.executable, str(PROGRAM), *map(str, arguments)]
-    return subprocess.Popen(line, env=HERE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def run(program: str, *arguments: object) -> subprocess.Popen:
+    """A program in a process of its own, since the number of devices holds for a whole process."""
+    line = [sys.executable, str(HERE / program), *map(str, arguments)]
+    return subprocess.Popen(line, env=SURROUNDINGS, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def said(process: subprocess.Popen) -> dict:
@@ -42,17 +42,24 @@ def assert_same(found: dict, counts: list[int]) -> None:
 
 
 def test_a_sweep_on_two_and_on_eight_devices() -> None:
-    assert_same(said(run()), [2, 8])
+    assert_same(said(run("spread_rows.py")), [2, 8])
 
 
 def test_a_sweep_over_two_processes() -> None:
     with socket.socket() as place:
         place.bind(("127.0.0.1", 0))
         port = place.getsockname()[1]
-    both = [run(process, port) for process in (0, 1)]
+    both = [run("spread_rows.py", process, port) for process in (0, 1)]
     first, second = (said(process) for process in both)
     assert_same(first, [4])
     assert first["spread"] == second["spread"]
+
+
+def test_fits_on_two_devices_end_where_those_on_one_do() -> None:
+    found = said(run("spread_fits.py"))
+    assert found["two"]["devices"] == [2]
+    for what in ("values", "std", "costs"):
+        np.testing.assert_allclose(found["two"][what], found["one"][what], rtol=1e-7, err_msg=what)
 
 
 def test_one_device_changes_nothing() -> None:

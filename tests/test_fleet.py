@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
+from rotflex_jax import threads
 from rotflex_jax.errors import InputError
 from rotflex_jax.fleet import Fleet, cluster, fleet, page, processes
 
@@ -278,6 +279,25 @@ def test_a_cluster_finishes_though_a_worker_is_killed(scheduler, tmp_path) -> No
     killer.join()
     assert answers(found) == answers(serial)
     assert len(running()) == len(files) + 1
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system places processes itself")
+@pytest.mark.parametrize(
+    ("of", "shares"),
+    [
+        (1, [{2, 3, 5, 7, 8}]),
+        (2, [{2, 3}, {5, 7}]),
+        (5, [{2}, {3}, {5}, {7}, {8}]),
+        (7, [{2}, {3}, {5}, {7}, {8}] * 2),
+    ],
+)
+def test_each_process_has_cores_of_its_own(monkeypatch, of, shares) -> None:
+    kept = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {2, 3, 5, 7, 8})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, chosen: kept.append(set(chosen)))
+    for place in range(of):
+        threads.keep_to_share(place, of)
+    assert kept == shares[:of]
 
 
 def test_the_number_of_processes_fits_the_machine(monkeypatch) -> None:

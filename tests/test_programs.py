@@ -184,11 +184,11 @@ def test_a_named_tuple_comes_back_from_disk_as_one(folder: Path) -> None:
     np.testing.assert_array_equal(found.twice, 2 * x)
 
 
-def test_a_compiler_without_the_older_emitters_compiles_as_it_likes(
+def test_a_compiler_without_these_choices_compiles_as_it_likes(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert programs._options() == programs._OLDER_EMITTERS  # this one has the choice
-    monkeypatch.setattr(programs, "_OLDER_EMITTERS", {"xla_no_such_option": False})
+    assert programs._options() == programs._FOR_COMPILER  # this one has the choice
+    monkeypatch.setattr(programs, "_FOR_COMPILER", {"xla_no_such_option": False})
     programs._options.cache_clear()
     assert programs._options() == {}
     np.testing.assert_array_equal(new()(2.0, np.ones(2, np.float32)), [2.0, 2.0])

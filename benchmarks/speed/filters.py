@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ from rotflex_jax.adaptive.objectives import batch, evaluate
 from rotflex_jax.adaptive.settings import Curve
 from rotflex_jax.adaptive.tune import loss_and_slopes
 from rotflex_jax.basis import Delays, Volterra
+from rotflex_jax.devices import mesh_of
 from rotflex_jax.precision import double_precision
 from speed import c_reference, peers
 from speed.rounds import Case
@@ -145,3 +147,21 @@ def pairs_cases(N: int) -> list[Case]:
         Case("1 pair: rotflex_jax value", value, N * NANO),
         Case("1 pair: rotflex_jax value and gradient", slopes, N * NANO),
     ]
+
+
+def sweep(N: int) -> Callable[[], None]:
+    """2000 pairs of step sizes, spread over all devices of the process."""
+    u, y = record(N)
+    basis = Volterra(Delays(5))
+    axes = np.geomspace(1e-4, 3e-3, 40), np.geomspace(1e-5, 5e-4, 50)
+    points = np.array(np.meshgrid(*axes)).reshape(2, -1).T
+    names, mesh = ("linear", "quadratic"), mesh_of()
+    with double_precision():
+        data = batch(basis, [Recording(u=u, y=y, Ts=0.001, channels="alpha")], "alpha", "mean_error")
+
+    def run() -> None:
+        with double_precision():
+            here = {"names": names, "build": _build(5), "objective": "mean_error", "mesh": mesh}
+            jax.block_until_ready(values_at(jnp.asarray(points), data, **here))
+
+    return run

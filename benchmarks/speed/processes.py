@@ -43,7 +43,8 @@ def process(code: str, *arguments: str, cache: str) -> dict[str, Any]:
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True, env=known
     )
-    said = json.loads(done.stdout.splitlines()[-1]) if done.stdout else {}
+    last = done.stdout.splitlines()[-1:]
+    said = json.loads(last[0]) if last and last[0].startswith("{") else {}
     return {**said, "clock": time.perf_counter() - began, "processor": used() - worked}
 
 

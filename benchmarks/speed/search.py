@@ -27,6 +27,43 @@ for path in sys.argv[1:]:
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 print(json.dumps({"rounds": rounds, "peak": peak}))
 """
+# What is hidden in the records of a fleet, as many of each.
+KINDS = (
+    (),
+    (("coulomb", "hub"),),
+    (("stribeck", "hub"),),
+    (("cubic_spring", "joint"),),
+    (("joint_play", "joint"),),
+    (("quadratic_drag", "arm"),),
+    (("gravity", "arm"),),
+    (("cogging", "hub"),),
+    (("lag", "input"),),
+    (("second_mode", "arm"),),
+)
+COMMAND = "import sys; from rotflex_jax.cli import main; sys.argv[0] = 'rotflex'; main()"
+
+
+def fleet(seconds: float, each: int) -> dict[str, float]:
+    """`rotflex discover FILES --each`, in the processes of this machine: nothing compiled, then all [s]."""
+    from arena.records import make_record
+
+    with tempfile.TemporaryDirectory() as folder:
+        files = []
+        for k in range(each * len(KINDS)):
+            made = make_record(KINDS[k % len(KINDS)], kind="noise", seed=2000 + k, seconds=seconds)
+            files.append(f"{folder}/{k:03d}.npz")
+            t = made["Ts"] * np.arange(len(made["u"]))
+            np.savez(files[-1], t=t, voltage=made["u"], theta=made["y"][:, 0], alpha=made["y"][:, 1])
+        runs = [
+            process(
+                COMMAND, "discover", *files, "--each", "--report", f"{folder}/{name}", cache=f"{folder}/cache"
+            )
+            for name in ("first", "again")
+        ]
+    facts = {"records": float(len(files))}
+    for what, run in zip(("nothing compiled", "warm cache"), runs, strict=True):
+        facts[f"{what}, seconds"], facts[f"{what}, processor seconds"] = run["clock"], run["processor"]
+    return facts
 
 
 def searches(seconds: float) -> dict[str, float]:

@@ -12,8 +12,11 @@ TITLES = {
     "fit": "A fit of eight parameters [ms]",
     "joint": "Joint fits [ms]",
     "starts": "Many starts [s]",
+    "others": "Packages that do it in another way, 10 s at 1 kHz",
     "cold": "From a new process",
+    "devices": "Two devices of one processor [s]",
     "search": "A search over the whole catalogue, 20 s at 500 Hz",
+    "fleet": "`rotflex discover FILES --each`, ten kinds of machine, 20 s at 500 Hz each",
     "growth": "Growth",
 }
 

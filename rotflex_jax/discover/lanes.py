@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.programs import kept
 from rotflex_jax.mechanism.tangents import Ways, outputs_with_slopes
 from rotflex_jax.precision import double_precision
+from rotflex_jax.threads import cores
 
 # Lanes per call for values alone, where lanes come nearly free. Slopes run one lane a call: their
 # directions fill the vector units, so more lanes would only take longer to compile.
@@ -180,4 +180,4 @@ def _side_by_side(run: Callable[[Any], Any], parts: list[Any]) -> list[Any]:
 
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count())
+    return ThreadPoolExecutor(cores())

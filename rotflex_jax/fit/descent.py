@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
+from jax.sharding import Mesh
 
+from rotflex_jax.devices import spread
 from rotflex_jax.fit.marquardt import BOUND
 from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations
 from rotflex_jax.fit.residuals import Coordinates, Data
@@ -33,19 +35,21 @@ UNSOLVED = "stopped: a step has no finite solution; the model diverges near thes
 
 @dataclasses.dataclass(frozen=True)
 class Moved:
-    """Which of the coordinates a fit moves; hashable, so it can be static.
+    """Which of the coordinates a fit moves, and what runs them; hashable, so it can be static.
 
     Attributes:
         coordinates: All of them.
         solver: Integration rule.
         free: Places of the free parameters.
         states: Whether first states are moved.
+        mesh: Devices that the recordings are shared out to; None for one device.
     """
 
     coordinates: Coordinates
     solver: Solver
     free: tuple[int, ...]
     states: bool
+    mesh: Mesh | None = None
 
     @functools.cached_property
     def columns(self) -> np.ndarray:
@@ -102,12 +106,13 @@ class Given(NamedTuple):
 def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
     """Sums over all recordings, by the M moved coordinates."""
 
-    def one(r: Any) -> Sums:
-        numbers, ways, samples = r
-        structure = moved.coordinates.structure
-        return normal_equations(structure, moved.solver, numbers, ways, Samples(*samples), given.scale)
+    def every(rows: Any, scale: jax.Array) -> Sums:
+        structure, solver = moved.coordinates.structure, moved.solver
+        one = lambda r: normal_equations(structure, solver, r[0], r[1], Samples(*r[2]), scale)  # noqa: E731
+        return jax.lax.map(one, rows)
 
-    found = jax.lax.map(one, (*moved.each(flat, given.gates, given.K), tuple(given.data)))
+    rows = (*moved.each(flat, given.gates, given.K), tuple(given.data))
+    found = spread(every, moved.mesh)(rows, given.scale)
     M, places = len(moved.index), jnp.asarray(moved.places)
     g = jnp.zeros(M, flat.dtype).at[places].add(found.g)
     H = jnp.zeros((M, M), flat.dtype).at[places[:, :, None], places[:, None, :]].add(found.H)
@@ -118,17 +123,18 @@ def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
 def residuals_and_slopes(moved: Moved, flat: jax.Array, given: Given) -> tuple[jax.Array, jax.Array]:
     """Scaled errors (R, N, C) and their slopes by the moved coordinates (R, N, C, M)."""
 
-    def one(r: Any) -> tuple[jax.Array, jax.Array]:
+    def one(r: Any, scale: jax.Array) -> tuple[jax.Array, jax.Array]:
         numbers, ways, samples, places = r
         structure = moved.coordinates.structure
         y_hat, J = outputs_with_slopes(structure, moved.solver, numbers, ways, Samples(*samples))
         seen = samples[2][:, None] > 0
-        e = jnp.where(seen, (samples[1] - y_hat) / given.scale[None], 0.0)
-        J = jnp.where(seen[..., None], -J / given.scale[None, :, None], 0.0)
+        e = jnp.where(seen, (samples[1] - y_hat) / scale[None], 0.0)
+        J = jnp.where(seen[..., None], -J / scale[None, :, None], 0.0)
         return e, jnp.zeros((*e.shape, len(moved.index)), e.dtype).at[:, :, places].set(J)
 
-    arguments = (*moved.each(flat, given.gates, given.K), tuple(given.data), jnp.asarray(moved.places))
-    return jax.lax.map(one, arguments)
+    rows = (*moved.each(flat, given.gates, given.K), tuple(given.data), jnp.asarray(moved.places))
+    every = lambda rows, scale: jax.lax.map(lambda r: one(r, scale), rows)  # noqa: E731
+    return spread(every, moved.mesh)(rows, given.scale)
 
 
 class Reached(NamedTuple):

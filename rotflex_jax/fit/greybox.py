@@ -1,11 +1,12 @@
 """The grey-box fit: parameters of the physics, first states and bounds, by Levenberg-Marquardt."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 
+from rotflex_jax.devices import mesh_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.descent import Moved, residuals_and_slopes
 from rotflex_jax.fit.estimates import report
@@ -37,6 +38,7 @@ def fit(
     window_seconds: float | None = None,
     max_steps: int = 60,
     minimiser: "Minimiser | None" = None,
+    devices: Sequence[Any] | None = None,
     progress: Progress | None = None,
     throw: bool = False,
 ) -> Fit:
@@ -64,6 +66,7 @@ def fit(
         max_steps: Most iterations of each descent; there are several, each with the scale of the one before.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
+        devices: Those that several recordings are shared out to; those of this process if None.
         progress: Called with a line of text now and then.
         throw: Raise instead of reporting a failure in `status`.
 
@@ -97,7 +100,8 @@ def fit(
     noise = sensor_noise(listed, model)
     flat = coordinates.flatten(m.values, first_states(model, listed))
     free = tuple(names.index(n) for n in m.free_names)
-    moved = Moved(coordinates, model.solver, free, first == "fitted")
+    mesh = mesh_of(devices) if len(listed) > 1 else None
+    moved = Moved(coordinates, model.solver, free, first == "fitted", mesh)
     task = Task(model, listed, moved, data, noise, first == "measured", max_steps, minimiser, say)
     with double_precision():
         end = task.run(flat, [process_noise])

@@ -1,12 +1,16 @@
 """The same fit from many starts: which numbers are the answer, and not the nearest dip."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Float
 
+from rotflex_jax.devices import mesh_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.marquardt import ENOUGH, ROUGHLY, Problem, Reached, descend
 from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
@@ -19,7 +23,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.threads import one_thread
 
 TOGETHER = 8
-"""Starts in one compiled call; progress is told between calls."""
+"""Starts of a device in one compiled call; progress is told between calls."""
 SAME = 1e-3
 """Costs that differ by less than this share belong to one minimum."""
 
@@ -73,6 +77,7 @@ def many_starts(
     keep: int = 8,
     max_steps: int = 60,
     seed: int = 0,
+    devices: Sequence[Any] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ManyStarts:
     """Fit the free parameters of a mechanism from many starts, and keep the best.
@@ -98,6 +103,7 @@ def many_starts(
         keep: How many of the best go on to the whole.
         max_steps: Most runs of one start in each stage.
         seed: Of the starts.
+        devices: Those that the starts are shared out to; those of this process if None.
         progress: Called with a line of text now and then.
 
     Returns:
@@ -131,16 +137,13 @@ def many_starts(
     x0 = np.broadcast_to(first_states(model, listed), (starts, len(listed), 2 * len(m.coordinates)))
     noise = sensor_noise(listed, model)
     say = progress or (lambda _: None)
+    stage = functools.partial(_stage, model, free, noise, max_steps, mesh_of(devices), say)
     short = _beginnings(listed, short_seconds)
     if short is not None:
-        found = _stage(
-            model, z, x0, short, free, noise, max_steps, ROUGHLY, f"{starts} starts, beginnings", say
-        )
+        found = stage(z, x0, short, ROUGHLY, f"{starts} starts, beginnings")
         best = np.argsort(found.cost)[:keep]
         z, x0 = np.asarray(found.z[best]), np.asarray(found.x0[best])
-    found = _stage(
-        model, z, x0, listed, free, noise, max_steps, ENOUGH, f"{len(z)} starts, whole recordings", say
-    )
+    found = stage(z, x0, listed, ENOUGH, f"{len(z)} starts, whole recordings")
     order = np.argsort(found.cost)
     if not np.isfinite(found.cost[order[0]]):
         raise InputError(
@@ -175,34 +178,37 @@ def _beginnings(recordings: list[Recording], seconds: float | None) -> list[Reco
 
 def _stage(
     model: Model,
-    z: np.ndarray,
-    x0: np.ndarray,
-    recordings: list[Recording],
     free: np.ndarray,
     noise: np.ndarray,
     most: int,
+    mesh: Mesh | None,
+    say: Callable[[str], None],
+    z: np.ndarray,
+    x0: np.ndarray,
+    recordings: list[Recording],
     enough: float,
     title: str,
-    say: Callable[[str], None],
 ) -> Reached:
     """All starts on some recordings; what is not finite costs infinitely much."""
-    parts = []
+    parts, mesh = [], mesh if len(z) > 1 else None
+    together = min(TOGETHER * (mesh.size if mesh else 1), len(z))
     with double_precision():
         data = stack(recordings, model)
         arrays = type(data)(*(jnp.asarray(part) for part in data))
         problem = Problem(jnp.asarray(model.mechanism.values), jnp.asarray(free), arrays, jnp.asarray(noise))
-        for at in range(0, len(z), TOGETHER):
-            pick = np.minimum(np.arange(at, at + min(TOGETHER, len(z))), len(z) - 1)
+        for at in range(0, len(z), together):
+            pick = np.minimum(np.arange(at, at + together), len(z) - 1)
             found = descend(
                 model.mechanism.structure,
                 model.solver,
+                mesh,
                 jnp.asarray(z[pick]),
                 jnp.asarray(x0[pick]),
                 problem,
                 most,
                 enough,
             )
-            real = min(TOGETHER, len(z) - at)
+            real = min(together, len(z) - at)
             parts.append([np.asarray(part)[:real] for part in found])
             done = Reached(*(np.concatenate(column) for column in zip(*parts, strict=True)))
             say(f"{title}: {len(done.cost)} done, least cost {np.nanmin(done.cost):.1f}")

@@ -6,8 +6,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import export
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from rotflex_jax.devices import spread
 from rotflex_jax.fit.normal_equations import Sums, moved_by, normal_equations
 from rotflex_jax.fit.residuals import Data
 from rotflex_jax.mechanism import Mechanism, Solver
@@ -68,29 +70,42 @@ class Reached(NamedTuple):
 export.register_namedtuple_serialization(Reached, serialized_name=f"{__name__}.Reached")
 
 
-@kept(static=2)
+@kept(static=3)
 def descend(
     structure: Mechanism,
     solver: Solver,
+    mesh: Mesh | None,
     z: Float[Array, "S K"],
     x0: Float[Array, "S R m"],
     problem: Problem,
     most: int,
     enough: float = ENOUGH,
 ) -> Reached:
-    """Where every start leads, one after the other.
+    """Where every start leads, on each device one after the other.
 
     Side by side they would wait for the slowest, and a run with all its sums fills a core as it is.
 
     Args:
         structure: Mechanism without numbers; static.
         solver: Integration rule; static.
+        mesh: Devices that the starts are shared out to; None for one device; static.
         z: Unconstrained coordinates of the free parameters at each start.
         x0: First positions and speeds at each start.
         problem: What they have in common.
         most: Most runs of each.
         enough: Share of the cost below which there is nothing more to gain.
     """
+    return spread(functools.partial(_every, structure, solver), mesh)((z, x0), problem, most, enough)
+
+
+def _every(
+    structure: Mechanism,
+    solver: Solver,
+    starts: tuple[Array, Array],
+    problem: Problem,
+    most: int,
+    enough: float,
+) -> Reached:
     transform = Transform.of(structure.parameter_specifications)
 
     def values(z: Array) -> Array:
@@ -115,7 +130,7 @@ def descend(
         end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < most), turn, first)
         return Reached(values(end.z), end.x0, jnp.sum(end.sums.cost), end.steps, end.z)
 
-    return jax.lax.map(one, (z, x0))
+    return jax.lax.map(one, starts)
 
 
 def _turn(sums: Any, enough: float, place: Place) -> Place:

@@ -17,6 +17,7 @@ from typing import Any
 from rotflex_jax.errors import InputError
 from rotflex_jax.fastloops import quicken
 from rotflex_jax.fleet.task import Record, Task, carry_out, record
+from rotflex_jax.threads import cores, keep_to_share
 
 # Times a recording may end its process before it is given up.
 TRIES = 3
@@ -38,7 +39,8 @@ def in_processes(jobs: Iterable[tuple[int, Task]], workers: int) -> Generator[tu
         InputError: No process could begin.
     """
     jobs = iter(jobs)
-    lanes = [_Lane(*job) for job in islice(jobs, workers)]
+    begun = list(islice(jobs, workers))
+    lanes = [_Lane(*job, share=(place, len(begun))) for place, job in enumerate(begun)]
     try:
         while lanes:
             ready = connection.wait([lane.line for lane in lanes])
@@ -63,19 +65,18 @@ def in_processes(jobs: Iterable[tuple[int, Task]], workers: int) -> Generator[tu
 
 def workers_here() -> int:
     """As many processes as this machine has cores and memory for."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # a system that does not tell
-        return cores
-    return max(1, min(cores, int(memory // ROOM)))
+        return cores()
+    return max(1, min(cores(), int(memory // ROOM)))
 
 
 class _Lane:
     """A process and the recording it is at."""
 
-    def __init__(self, number: int, task: Task) -> None:
-        self.number, self.task = number, task
+    def __init__(self, number: int, task: Task, share: tuple[int, int]) -> None:
+        self.number, self.task, self.share = number, task, share
         self.deaths, self.began = 0, False
         self._start()
 
@@ -83,7 +84,7 @@ class _Lane:
         # Spawned, since a fork of a process that has used JAX may hang.
         context = get_context("spawn")
         self.line, far = context.Pipe()
-        self.process = context.Process(target=_serve, args=(far, ROOM), daemon=True)
+        self.process = context.Process(target=_serve, args=(far, ROOM, self.share), daemon=True)
         self.process.start()
         far.close()  # so that the end of the process is the end of the line
 
@@ -126,9 +127,10 @@ class _Lane:
         return None
 
 
-def _serve(line: Any, room: float) -> None:
+def _serve(line: Any, room: float, share: tuple[int, int]) -> None:
     """The life of a worker process, until there is nothing more to do or it has grown too large."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; who started this one ends it
+    keep_to_share(*share)
     quicken()
     line.send(None)
     with contextlib.suppress(EOFError):

@@ -2,6 +2,8 @@
 
 XLA's newer way to emit fused operations takes as long over a loop of many small ones as all the rest of the
 compiler, and the loop runs no faster for it; so the older way is asked for, where this XLA has the choice.
+Nor is a program split for several threads to compile: that is more work in all, and programs compile side
+by side as it is.
 
 JAX's own cache on disk spares the compiler, but only once a program has been traced anew, and where a
 mechanism has thirty effects that takes longer than to run it. So the traced program is kept as well, under a
@@ -37,7 +39,7 @@ _SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
 _WRITES = importlib.util.find_spec("flatbuffers") is not None
 # With these JAX does more at each call than to run a program.
 _WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
-_OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
+_FOR_COMPILER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 _programs: list["Program"] = []
 
 
@@ -156,10 +158,10 @@ def _plain() -> bool:
 def _options() -> dict[str, Any]:
     """For the compiler; none where this XLA does not know them."""
     try:
-        jax.jit(lambda: 0, compiler_options=_OLDER_EMITTERS).lower().compile()
+        jax.jit(lambda: 0, compiler_options=_FOR_COMPILER).lower().compile()
     except jax.errors.JaxRuntimeError:
         return {}
-    return _OLDER_EMITTERS
+    return _FOR_COMPILER
 
 
 def _keeps() -> bool:

@@ -1,0 +1,87 @@
+"""Beside packages that do a like job in another way, or want an environment of their own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rotflex_jax import forward_regression, many_starts, simulate
+from rotflex_jax.basis import Delays, Volterra
+from speed.fits import recording, start
+from speed.machine import MOVED, smooth
+
+PEERS = ("jax-sysid==1.1.0", "sysidentpy==0.9.0")
+
+
+def others(seconds: float) -> dict[str, float]:
+    """Seconds by the clock, least of several, one after the other; errors reached beside them."""
+    r, p0 = recording(seconds), start(0.3, 1)
+    with tempfile.TemporaryDirectory() as folder:
+        file = f"{folder}/recording.npz"
+        np.savez(file, u=r.u, y=r.y, Ts=r.Ts, start=p0, moved=np.array(MOVED))
+        told = subprocess.run(
+            [_environment(), str(Path(__file__).with_name("elsewhere.py")), file],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+    fit_seconds, fit = _timed(lambda: many_starts(smooth(p=p0), r, starts=1, short_seconds=None), visits=20)
+    chosen_seconds, chosen = _timed(
+        lambda: forward_regression(Volterra(Delays(20)), r, "alpha", terms=10), visits=5
+    )
+    error = (simulate(fit.model.mechanism, r.u, r.Ts) - r.y) / (0.01 * np.std(r.y, axis=0))
+    left = (r.y[:, 1] - chosen.model.simulate(r)[:, 0])[20:]
+    return {
+        "rotflex_jax, a fit, compiled before, seconds": fit_seconds,
+        "rotflex_jax, cost from rest, in units of the noise": float(np.sum(error**2) / 2),
+        "rotflex_jax, ten of 231 regressors, seconds": chosen_seconds,
+        "rotflex_jax, error of the ten [rad]": float(np.sqrt(np.mean(left**2))),
+        **json.loads(told.splitlines()[-1]),
+        **{f"pysindy, degree {d}, its regression alone, seconds": _sindy(r, d) for d in (1, 2, 3)},
+    }
+
+
+def _sindy(r: Any, degree: int) -> float:
+    """Seconds of pysindy's sparse regression on both angles and their speeds."""
+    import pysindy
+
+    speeds = pysindy.SmoothedFiniteDifference()._differentiate(r.y, r.Ts)
+    states = np.hstack([r.y, speeds])
+
+    def regress() -> Any:
+        model = pysindy.SINDy(
+            optimizer=pysindy.STLSQ(threshold=0.1),
+            feature_library=pysindy.PolynomialLibrary(degree=degree),
+        )
+        return model.fit(states, t=r.Ts, u=r.u)
+
+    return _timed(regress, visits=5)[0]
+
+
+def _environment() -> str:
+    """Python of an environment with the peers; made once, which takes minutes."""
+    folder = Path(tempfile.gettempdir()) / "rotflex_jax_peers"
+    python = folder / "bin" / "python"
+    if not (folder / "complete").exists():
+        subprocess.run([sys.executable, "-m", "venv", "--clear", folder], check=True)
+        subprocess.run([python, "-m", "pip", "install", "--quiet", *PEERS], check=True)
+        (folder / "complete").touch()
+    return str(python)
+
+
+def _timed(run: Callable[[], Any], visits: int) -> tuple[float, Any]:
+    """Least seconds by the clock, compiling apart, and the result."""
+    times, found = [], run()
+    for _ in range(visits):
+        began = time.perf_counter()
+        found = run()
+        times.append(time.perf_counter() - began)
+    return min(times), found
