@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from rotflex_jax.fit.covariance import bandwidth, correlation_length, sandwich
+from rotflex_jax.fit.covariance import Part, bandwidth, by_recording, correlation_length, sandwich
 
 N, RUNS = 1000, 600
+
+
+def robust_covariance(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    return sandwich(by_recording(J, e, segments), J.shape[2])
 
 
 def regressors(seed: int = 0) -> np.ndarray:
@@ -28,7 +32,7 @@ def experiments(noise):
         b = H @ X[:, 0].T @ e
         left = (e - X[:, 0] @ b)[:, None]
         errors.append(b)
-        robust.append(sandwich(-X, left, np.zeros(N, int)))
+        robust.append(robust_covariance(-X, left, np.zeros(N, int)))
         plain.append(H * np.sum(left**2) / (N - 3))
     return np.array(errors), np.array(robust), np.array(plain)
 
@@ -74,8 +78,8 @@ def test_recordings_do_not_mix():
     # Correlated, so that the lags count.
     e = np.concatenate([lfilter([1.0], [1.0, -0.6], rng.normal(size=(n, 1)), axis=0) for n in (400, 600)])
     J = np.ones((1000, 1, 1))
-    whole = sandwich(J, e, np.zeros(1000, int))
-    parts = sandwich(J, e, np.repeat([0, 1], [400, 600]))
+    whole = robust_covariance(J, e, np.zeros(1000, int))
+    parts = robust_covariance(J, e, np.repeat([0, 1], [400, 600]))
     by_hand = 0.0
     for start, end in ((0, 400), (400, 1000)):
         g, width = e[start:end, 0], bandwidth(e[start:end])
@@ -87,13 +91,24 @@ def test_recordings_do_not_mix():
     assert whole[0, 0] != parts[0, 0]
 
 
+def test_what_a_recording_does_not_move_need_not_be_there():
+    """Two recordings with an offset of their own each: the same with and without the columns of zeros."""
+    rng = np.random.default_rng(8)
+    segments = np.repeat([0, 1], [400, 600])
+    slope, e = rng.normal(size=(1000, 2, 1)), rng.normal(size=(1000, 2))
+    offsets = np.broadcast_to((segments[:, None] == [0, 1])[:, None, :], (1000, 2, 2))
+    J = np.concatenate([slope, offsets], axis=2)
+    own = [Part(J[segments == k][:, :, [0, 1 + k]], e[segments == k], np.array([0, 1 + k])) for k in (0, 1)]
+    np.testing.assert_allclose(sandwich(own, 3), robust_covariance(J, e, segments), rtol=1e-10, atol=1e-18)
+
+
 def test_two_channels_may_be_correlated():
     """Residuals that are the same in both channels count once, not twice."""
     rng = np.random.default_rng(4)
     e = rng.normal(size=(4000, 1))
     J = np.ones((4000, 1, 1))
-    once = sandwich(J, e, np.zeros(4000, int))
-    twice = sandwich(np.tile(J, (1, 2, 1)), np.tile(e, (1, 2)), np.zeros(4000, int))
+    once = robust_covariance(J, e, np.zeros(4000, int))
+    twice = robust_covariance(np.tile(J, (1, 2, 1)), np.tile(e, (1, 2)), np.zeros(4000, int))
     np.testing.assert_allclose(twice, once, rtol=1e-10)
 
 
@@ -101,10 +116,12 @@ def test_scale_of_residuals_and_slopes():
     """Standard deviations follow the size of the residuals and the inverse of the slopes."""
     rng = np.random.default_rng(5)
     J, e = rng.normal(size=(500, 2, 3)), rng.normal(size=(500, 2))
-    one, zeros = sandwich(J, e, np.zeros(500, int)), np.zeros(500, int)
-    np.testing.assert_allclose(sandwich(J, 3 * e, zeros), 9 * one, rtol=1e-10)
+    one, zeros = robust_covariance(J, e, np.zeros(500, int)), np.zeros(500, int)
+    np.testing.assert_allclose(robust_covariance(J, 3 * e, zeros), 9 * one, rtol=1e-10)
     units = np.array([1.0, 0.05, 20.0])
-    np.testing.assert_allclose(sandwich(J * units, e, zeros), one / np.outer(units, units), rtol=1e-8)
+    np.testing.assert_allclose(
+        robust_covariance(J * units, e, zeros), one / np.outer(units, units), rtol=1e-8
+    )
 
 
 @pytest.mark.parametrize("a", [0.5, 0.9])

@@ -11,7 +11,7 @@ from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.discover.whiten import log_likelihood
-from rotflex_jax.fit.covariance import sandwich
+from rotflex_jax.fit.covariance import Part, sandwich
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Estimate
@@ -79,15 +79,12 @@ class Scribe:
         w = h.whitener(e[0], seen)
         W = h.whitener(J[0, : h.moved], seen)
         R, shared, each = len(h.x0), len(h.free), h.moved - len(h.free)
-        slopes = np.zeros((*w.shape, shared + R * each))
+        parts = []
         for r in range(R):
-            slopes[r, ..., :shared] = np.moveaxis(W[:shared, r], 0, -1)
-            here = slice(shared + r * each, shared + (r + 1) * each)
-            slopes[r, ..., here] = np.moveaxis(W[shared:, r], 0, -1)
-        inside = seen.ravel() > 0
-        C, D = w.shape[-1], slopes.shape[-1]
-        segments = np.repeat(np.arange(R), w.shape[1])[inside]
-        covariance = sandwich(slopes.reshape(-1, C, D)[inside], w.reshape(-1, C)[inside], segments)
+            inside, own = seen[r] > 0, shared + r * each + np.arange(each)
+            slopes = np.moveaxis(W[:, r], 0, -1)[inside]
+            parts.append(Part(slopes, w[r][inside], np.concatenate([np.arange(shared), own])))
+        covariance = sandwich(parts, shared + R * each)
         z = np.tile(h.z, (R, 1))
         if h.local:
             z[:, list(h.local)] = h.own

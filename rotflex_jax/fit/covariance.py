@@ -1,5 +1,8 @@
 """How sure an estimate is when the residuals are correlated in time, as those of a wrong model are."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 # Relative curvature below which a combination of parameters counts as not determined.
@@ -30,7 +33,36 @@ def bandwidth(e: np.ndarray) -> int:
     return max(correlation_length(e), min(round(np.sqrt(N)), N // 10), 1)
 
 
-def sandwich(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
+class Part(NamedTuple):
+    """Of one recording: slopes (n, C, d) of its scaled residuals (n, C), and the d parameters they are by."""
+
+    J: np.ndarray
+    e: np.ndarray
+    columns: np.ndarray
+
+
+def by_recording(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> list[Part]:
+    """The parts of slopes (N, C, D) and residuals (N, C) where every recording knows every parameter.
+
+    Args:
+        J: Derivative of the scaled residuals.
+        e: Scaled residuals.
+        segments: Number of the recording each sample belongs to (N,).
+    """
+    every = np.arange(J.shape[2])
+    return [Part(J[segments == s], e[segments == s], every) for s in np.unique(segments)]
+
+
+def curvature(parts: Sequence[Part], size: int) -> np.ndarray:
+    """Sum of J'J over all samples (size, size)."""
+    H = np.zeros((size, size))
+    for J, _, columns in parts:
+        flat = J.reshape(-1, len(columns))
+        H[np.ix_(columns, columns)] += flat.T @ flat
+    return H
+
+
+def sandwich(parts: Sequence[Part], size: int) -> np.ndarray:
     """Covariance of least-squares estimates that autocorrelation and unequal variance do not fool.
 
         H^-1 S H^-1,  H = sum J_k' J_k,  S = sum over lags of Bartlett-weighted products of J_k' e_k
@@ -40,9 +72,9 @@ def sandwich(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
     make narrow miss the truth too often: no combination has less variance than with white residuals.
 
     Args:
-        J: Derivative of the scaled residuals (N, C, D).
-        e: Scaled residuals (N, C).
-        segments: Number of the recording each sample belongs to (N,); products do not cross recordings.
+        parts: The recordings; products do not cross them. Memory and time are those of the slopes by what
+            each recording moves, so first states, which are a recording's own, cost nothing in the others.
+        size: Number of parameters D.
 
     Returns:
         Covariance (D, D); nan where the residuals are not finite, and for parameters that the data do not
@@ -51,29 +83,28 @@ def sandwich(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
     Source: Newey and West 1987, Econometrica 55; the larger of two variances: Angrist and Pischke,
     Mostly Harmless Econometrics, 2009, section 8.1.
     """
-    D = J.shape[2]
-    if not (np.isfinite(J).all() and np.isfinite(e).all()):
-        return np.full((D, D), np.nan)
-    H = np.einsum("nci,ncj->ij", J, J)
-    white = np.einsum("nci,cd,ndj->ij", J, e.T @ e / len(e), J, optimize=True)
-    scores = np.einsum("nci,nc->ni", J, e)
-    S = np.zeros((D, D))
-    for segment in np.unique(segments):
-        g = scores[segments == segment]
-        width = bandwidth(e[segments == segment])
+    if not all(np.isfinite(p.J).all() and np.isfinite(p.e).all() for p in parts):
+        return np.full((size, size), np.nan)
+    H, n = curvature(parts, size), sum(len(p.e) for p in parts)
+    alike = sum(p.e.T @ p.e for p in parts) / n
+    white, S = np.zeros((size, size)), np.zeros((size, size))
+    for J, e, columns in parts:
+        own = np.ix_(columns, columns)
+        white[own] += J.reshape(-1, len(columns)).T @ (alike @ J).reshape(-1, len(columns))
+        scores = np.einsum("nc,ncd->nd", e, J)
+        width, none = bandwidth(e), np.zeros((1, len(columns)))
         # Sums over all stretches of `width` samples give exactly the Bartlett kernel.
-        padded = np.concatenate([np.zeros((width, D)), g, np.zeros((width - 1, D))])
-        total = np.cumsum(padded, axis=0)
-        sums = total[width:] - total[:-width]
-        S += sums.T @ sums / width
+        total = np.cumsum(np.concatenate([none, scores, np.repeat(none, width - 1, axis=0)]), axis=0)
+        sums = total[1:].copy()
+        sums[width:] -= total[1:-width]
+        S[own] += sums.T @ sums / width
     # In units in which each parameter alone is as well determined as any other, an eigenvalue at the
     # level of rounding is a direction that the data do not see: no interval, rather than a narrow one.
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    eigenvalues, vectors = np.linalg.eigh(H / np.outer(size, size))
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     blind = eigenvalues < UNSEEN
-    inverse = (vectors / np.where(blind, np.inf, eigenvalues)) @ vectors.T / np.outer(size, size)
-    n, k = len(scores), D
-    robust, plain = (inverse @ M @ inverse * (n / max(n - k, 1)) for M in (S, white))
+    inverse = (vectors / np.where(blind, np.inf, eigenvalues)) @ vectors.T / np.outer(scale, scale)
+    robust, plain = (inverse @ M @ inverse * (n / max(n - size, 1)) for M in (S, white))
     covariance = _larger(robust, plain)
     lost = (np.abs(vectors[:, blind]) > 1e-3).any(axis=1) | (np.diag(H) <= 0)
     covariance[lost, :] = covariance[:, lost] = np.nan

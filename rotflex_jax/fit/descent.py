@@ -121,18 +121,17 @@ def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
 
 @kept(static=1)
 def residuals_and_slopes(moved: Moved, flat: jax.Array, given: Given) -> tuple[jax.Array, jax.Array]:
-    """Scaled errors (R, N, C) and their slopes by the moved coordinates (R, N, C, M)."""
+    """Scaled errors (R, N, C) and their slopes by what each recording moves (R, N, C, D)."""
 
     def one(r: Any, scale: jax.Array) -> tuple[jax.Array, jax.Array]:
-        numbers, ways, samples, places = r
+        numbers, ways, samples = r
         structure = moved.coordinates.structure
         y_hat, J = outputs_with_slopes(structure, moved.solver, numbers, ways, Samples(*samples))
         seen = samples[2][:, None] > 0
         e = jnp.where(seen, (samples[1] - y_hat) / scale[None], 0.0)
-        J = jnp.where(seen[..., None], -J / scale[None, :, None], 0.0)
-        return e, jnp.zeros((*e.shape, len(moved.index)), e.dtype).at[:, :, places].set(J)
+        return e, jnp.where(seen[..., None], -J / scale[None, :, None], 0.0)
 
-    rows = (*moved.each(flat, given.gates, given.K), tuple(given.data), jnp.asarray(moved.places))
+    rows = (*moved.each(flat, given.gates, given.K), tuple(given.data))
     every = lambda rows, scale: jax.lax.map(lambda r: one(r, scale), rows)  # noqa: E731
     return spread(every, moved.mesh)(rows, given.scale)
 

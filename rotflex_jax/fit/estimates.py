@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from rotflex_jax.fit.covariance import sandwich
+from rotflex_jax.fit.covariance import Part, curvature, sandwich
 from rotflex_jax.fit.fitted import Fit
 from rotflex_jax.fit.stages import Ended, Task
 from rotflex_jax.parameters import Estimate
@@ -18,21 +18,22 @@ def report(task: Task, end: Ended, e: jax.Array, J: jax.Array) -> Fit:
         task: What was fitted to what.
         end: The optimum.
         e: Scaled errors there (R, N, C).
-        J: Their slopes by the moved coordinates (R, N, C, M).
+        J: Their slopes by what each recording moves (R, N, C, D).
     """
     model, data, coordinates, index = task.model, task.data, task.moved.coordinates, task.moved.index
     m = model.mechanism
-    R, N, C = data.y.shape
-    seen = data.seen.ravel() > 0
-    residual = np.asarray(e).reshape(R * N, C)[seen]
-    slopes = -np.asarray(J).reshape(R * N, C, len(index))[seen]
-    segments = np.repeat(np.arange(R), N)[seen]
+    moved, seen = np.asarray(J), data.seen > 0
+    left = np.asarray(e)
+    parts = [
+        Part(-moved[r, seen[r]], left[r, seen[r]], columns) for r, columns in enumerate(task.moved.places)
+    ]
+    residual = np.concatenate([part.e for part in parts])
     each = range(coordinates.owning)
     z = np.tile(end.flat[: coordinates.parameters], (len(each), 1))
     for i in coordinates.local:
         z[:, i] = [end.flat[coordinates.local_index(r, i)] for r in each]
     values, stretch = coordinates.transform.physical(z)
-    covariance = sandwich(slopes, residual, segments)
+    covariance = sandwich(parts, len(index))
     row_of = {int(k): row for row, k in enumerate(index)}
     estimates, free, places = [], [], []
     local: dict[str, tuple[Estimate, ...]] = {}
@@ -54,6 +55,9 @@ def report(task: Task, end: Ended, e: jax.Array, J: jax.Array) -> Fit:
         free.append(name)
         places.append((rows, weights))
     natural = np.array([[a @ covariance[np.ix_(i, k)] @ b for k, b in places] for i, a in places])
+    together = np.zeros((len(index), len(places)))
+    for column, (rows, _) in enumerate(places):
+        together[rows, column] = 1.0
     deviation = np.sqrt(np.mean(residual**2, axis=0)) * np.asarray(end.given.scale)
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
     return Fit(
@@ -66,16 +70,15 @@ def report(task: Task, end: Ended, e: jax.Array, J: jax.Array) -> Fit:
         free_names=tuple(free),
         steps=end.steps,
         history=tuple(end.history),
-        weakest=_weakest(np.stack([slopes[:, :, rows].sum(axis=2) for rows, _ in places], axis=2), free),
+        weakest=_weakest(together.T @ curvature(parts, len(index)) @ together, free),
         local=local,
     )
 
 
-def _weakest(slopes: np.ndarray, names: list[str]) -> dict[str, float]:
+def _weakest(H: np.ndarray, names: list[str]) -> dict[str, float]:
     """The combination of parameters that the data determine least, its largest entry 1."""
-    if not np.isfinite(slopes).all():
+    if not np.isfinite(H).all():
         return {}
-    H = np.einsum("nci,ncj->ij", slopes, slopes)
     direction = np.linalg.eigh(H)[1][:, 0]
     direction = direction / direction[np.argmax(np.abs(direction))]
     return dict(zip(names, direction.tolist(), strict=True))

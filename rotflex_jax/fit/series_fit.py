@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.covariance import sandwich
+from rotflex_jax.fit.covariance import by_recording, sandwich
 from rotflex_jax.fit.linear import Solution
 from rotflex_jax.fit.rows import Rows
 from rotflex_jax.parameters import Estimate, Specification
@@ -127,7 +127,8 @@ def series_fit(
     # In the directions that the data determine, so that columns that depend on each other do no harm.
     along = phi @ solution.basis
     way = solution.basis * solution.shrink
-    own = way @ sandwich(along[:, None, :], e[:, None], rows.segments) @ way.T
+    parts = by_recording(along[:, None, :], e[:, None], rows.segments)
+    own = way @ sandwich(parts, along.shape[1]) @ way.T
     blind = np.linalg.norm(way * np.linalg.norm(along, axis=0), axis=1) == 0
     own[blind, :] = own[:, blind] = np.nan
     covariance = np.full((P, P), np.nan)
