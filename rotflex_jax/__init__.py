@@ -9,8 +9,31 @@ Importing the package changes no setting of JAX. A name is loaded when it is fir
 not wait for the search, the filters or a plot; `__init__.pyi` says which names there are and where they live.
 """
 
+import copyreg
+import importlib
+import importlib.util
+import sys
+from types import ModuleType
+from typing import Any
+
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
 __version__ = "0.1.0"
+
+_listed, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    """What the list has, or a part of the package that it does not have, such as `devices`."""
+    if name not in __all__ and importlib.util.find_spec(f"{__name__}.{name}"):
+        return importlib.import_module(f"{__name__}.{name}")
+    return _listed(name)
+
+
+def _by_name(module: ModuleType) -> tuple[Any, tuple[str]]:
+    return importlib.import_module, (module.__name__,)
+
+
+# A package with lazy names is of a class of its own, which cloudpickle would not take for a module: functions
+# of a notebook that name this one could not be sent to other processes.
+copyreg.pickle(type(sys.modules[__name__]), _by_name)

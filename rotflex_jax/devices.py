@@ -15,8 +15,9 @@ def mesh_of(devices: Sequence[Any] | None = None) -> Mesh | None:
     """A row of devices, for `spread`.
 
     Args:
-        devices: those of this process if None. With `jax.distributed`, `jax.devices()` are those of all
-            processes; then every process must make the same call with the same numbers.
+        devices: those of this process if None, unless `jax.default_device` names one. With
+            `jax.distributed`, `jax.devices()` are those of all processes; then every process must make the
+            same call with the same numbers.
 
     Returns:
         The mesh; None for a single device, which needs none.
@@ -24,6 +25,8 @@ def mesh_of(devices: Sequence[Any] | None = None) -> Mesh | None:
     >>> mesh_of(jax.devices()[:1]) is None
     True
     """
+    if devices is None and jax.config.values["jax_default_device"] is not None:
+        return None
     chosen = jax.local_devices() if devices is None else list(devices)
     return Mesh(np.array(chosen), (_ROWS,)) if len(chosen) > 1 else None
 
@@ -38,12 +41,17 @@ def spread(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any
     rows more than devices cost a second turn of all. Not for rows that take microseconds: sending
     them costs more.
 
+    Devices of one process do not wait for each other where they divide the rows. Otherwise, and over several
+    processes, all get the whole at the end; XLA ends a program where one waits for another longer than a
+    minute, so such rows must take alike.
+
     Args:
         function: of rows (K, ...) and of what all rows share; its results have one entry a row, (K, ...).
         mesh: from `mesh_of`; None leaves the function as it is.
 
     Returns:
-        A function whose results every process has as a whole.
+        A function whose results every process has as a whole; between devices of one process they may lie in
+        parts.
     """
     if mesh is None:
         return function
@@ -58,6 +66,9 @@ def spread(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any
             out_specs=PartitionSpec(_ROWS),
             check_vma=False,  # a scan inside begins with the same carry on all devices
         )(jax.tree.map(lambda x: jnp.asarray(x)[full], rows), *shared)
+        alone = all(device.process_index == jax.process_index() for device in mesh.devices.flat)
+        if alone and len(full) == K:
+            return parts
         whole = jax.lax.with_sharding_constraint(parts, NamedSharding(mesh, PartitionSpec()))
         return jax.tree.map(lambda x: x[:K], whole)
 

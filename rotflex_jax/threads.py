@@ -1,5 +1,6 @@
 """The cores of this process, and one thread for linear algebra: matrices are small, and threads only wait."""
 
+import contextlib
 import functools
 import os
 from collections.abc import Callable
@@ -35,9 +36,10 @@ def keep_to_share(place: int, of: int) -> None:
     """
     if hasattr(os, "sched_setaffinity"):
         mine = sorted(os.sched_getaffinity(0))
-        size = max(1, len(mine) // of)
-        first = place * size % len(mine)
-        os.sched_setaffinity(0, mine[first : first + size])
+        n, alone = len(mine), place % len(mine)
+        chosen = mine[place * n // of : (place + 1) * n // of] if of <= n else mine[alone : alone + 1]
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, chosen)
 
 
 @functools.cache

@@ -4,12 +4,14 @@ import json
 
 import jax
 import numpy as np
+import optimistix
 
 import rotflex_jax as rf
-from rotflex_jax.devices import spread
+from rotflex_jax.devices import mesh_of, spread
 from rotflex_jax.fit import descent, marquardt
 
 jax.config.update("jax_num_cpu_devices", 2)
+DOGLEG = optimistix.Dogleg(rtol=1e-9, atol=1e-9)
 at_work: list[int] = []
 
 
@@ -35,10 +37,22 @@ for devices in (jax.devices()[:1], None):
     at_work.clear()
     fitted = rf.fit(rf.joints.paper(), recordings, devices=devices)
     many = rf.many_starts(rf.joints.paper(), recordings, starts=5, short_seconds=None, devices=devices)
+    ports = {"window_seconds": 0.3, "local": ("hub.viscous.coefficient",)}
+    cut = rf.fit(rf.joints.paper(), recordings, devices=devices, minimiser=DOGLEG, **ports)
     found["one" if devices else "two"] = {
         "values": [e.value for e in fitted.parameters],
         "std": [e.std for e in fitted.parameters if e.free],
+        "cut": [e.value for e in cut.parameters],
         "costs": many.costs.tolist(),
         "devices": sorted(set(at_work)),
     }
+
+
+def alone(rows):
+    """Of four rows, two devices have two each: neither waits for the other."""
+    return jax.lax.map(lambda n: jax.lax.while_loop(lambda k: k < n, lambda k: k + 1, 0), rows)
+
+
+text = jax.jit(spread(alone, mesh_of())).lower(np.arange(4)).compile().as_text()
+found["waits"] = [word for word in ("all-gather", "all-reduce", "collective") if word in text]
 print(json.dumps(found))

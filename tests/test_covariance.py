@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from rotflex_jax.fit.covariance import Part, bandwidth, by_recording, correlation_length, sandwich
+from rotflex_jax.fit.covariance import Part, bandwidth, by_recording, correlation_length, curvature, sandwich
 
 N, RUNS = 1000, 600
 
 
 def robust_covariance(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> np.ndarray:
-    return sandwich(by_recording(J, e, segments), J.shape[2])
+    parts = by_recording(J, e, segments)
+    return sandwich(parts, curvature(parts, J.shape[2]))
 
 
 def regressors(seed: int = 0) -> np.ndarray:
@@ -99,7 +100,8 @@ def test_what_a_recording_does_not_move_need_not_be_there():
     offsets = np.broadcast_to((segments[:, None] == [0, 1])[:, None, :], (1000, 2, 2))
     J = np.concatenate([slope, offsets], axis=2)
     own = [Part(J[segments == k][:, :, [0, 1 + k]], e[segments == k], np.array([0, 1 + k])) for k in (0, 1)]
-    np.testing.assert_allclose(sandwich(own, 3), robust_covariance(J, e, segments), rtol=1e-10, atol=1e-18)
+    covariance = sandwich(own, curvature(own, 3))
+    np.testing.assert_allclose(covariance, robust_covariance(J, e, segments), rtol=1e-10, atol=1e-18)
 
 
 def test_two_channels_may_be_correlated():

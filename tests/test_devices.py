@@ -58,7 +58,8 @@ def test_a_sweep_over_two_processes() -> None:
 def test_fits_on_two_devices_end_where_those_on_one_do() -> None:
     found = said(run("spread_fits.py"))
     assert found["two"]["devices"] == [2]
-    for what in ("values", "std", "costs"):
+    assert found["waits"] == []
+    for what in ("values", "std", "costs", "cut"):
         np.testing.assert_allclose(found["two"][what], found["one"][what], rtol=1e-7, err_msg=what)
 
 

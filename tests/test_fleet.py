@@ -286,7 +286,7 @@ def test_a_cluster_finishes_though_a_worker_is_killed(scheduler, tmp_path) -> No
     ("of", "shares"),
     [
         (1, [{2, 3, 5, 7, 8}]),
-        (2, [{2, 3}, {5, 7}]),
+        (2, [{2, 3}, {5, 7, 8}]),
         (5, [{2}, {3}, {5}, {7}, {8}]),
         (7, [{2}, {3}, {5}, {7}, {8}] * 2),
     ],
@@ -298,6 +298,15 @@ def test_each_process_has_cores_of_its_own(monkeypatch, of, shares) -> None:
     for place in range(of):
         threads.keep_to_share(place, of)
     assert kept == shares[:of]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system places processes itself")
+def test_a_process_that_may_not_choose_its_cores_goes_on(monkeypatch) -> None:
+    def refused(_: int, chosen: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setaffinity", refused)
+    threads.keep_to_share(0, 2)
 
 
 def test_the_number_of_processes_fits_the_machine(monkeypatch) -> None:

@@ -10,6 +10,7 @@ import tomllib
 from importlib.resources import files
 from pathlib import Path
 
+import cloudpickle
 import pytest
 
 import rotflex_jax
@@ -187,6 +188,17 @@ print(*(name for name in rf.__all__ if getattr(rf, name) is None))
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     assert run.stdout.split() == ["compare", "discover", "fleet", "fit"]
+
+
+def test_the_package_goes_to_other_processes_by_its_name() -> None:
+    assert cloudpickle.loads(cloudpickle.dumps(rotflex_jax)) is rotflex_jax
+    assert cloudpickle.loads(cloudpickle.dumps(rotflex_jax.fit)) is rotflex_jax.fit
+
+
+def test_parts_that_no_list_names_are_found_too() -> None:
+    program = "import rotflex_jax as rf; print(rf.devices.mesh_of.__name__, hasattr(rf, 'no_such_part'))"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert run.stdout.split() == ["mesh_of", "False"], run.stderr
 
 
 def test_version_is_the_same_everywhere() -> None:

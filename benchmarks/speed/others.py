@@ -53,8 +53,7 @@ def _sindy(r: Any, degree: int) -> float:
     """Seconds of pysindy's sparse regression on both angles and their speeds."""
     import pysindy
 
-    speeds = pysindy.SmoothedFiniteDifference()._differentiate(r.y, r.Ts)
-    states = np.hstack([r.y, speeds])
+    states = np.hstack([r.y, np.gradient(r.y, r.Ts, axis=0)])
 
     def regress() -> Any:
         model = pysindy.SINDy(
@@ -68,7 +67,7 @@ def _sindy(r: Any, degree: int) -> float:
 
 def _environment() -> str:
     """Python of an environment with the peers; made once, which takes minutes."""
-    folder = Path(tempfile.gettempdir()) / "rotflex_jax_peers"
+    folder = Path(tempfile.gettempdir()) / "_".join(["rotflex_jax", *PEERS])
     python = folder / "bin" / "python"
     if not (folder / "complete").exists():
         subprocess.run([sys.executable, "-m", "venv", "--clear", folder], check=True)

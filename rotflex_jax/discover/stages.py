@@ -11,7 +11,7 @@ from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.discover.whiten import log_likelihood
-from rotflex_jax.fit.covariance import Part, sandwich
+from rotflex_jax.fit.covariance import Part, curvature, sandwich
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.model import Model
 from rotflex_jax.parameters import Estimate
@@ -84,7 +84,7 @@ class Scribe:
             inside, own = seen[r] > 0, shared + r * each + np.arange(each)
             slopes = np.moveaxis(W[:, r], 0, -1)[inside]
             parts.append(Part(slopes, w[r][inside], np.concatenate([np.arange(shared), own])))
-        covariance = sandwich(parts, shared + R * each)
+        covariance = sandwich(parts, curvature(parts, shared + R * each))
         z = np.tile(h.z, (R, 1))
         if h.local:
             z[:, list(h.local)] = h.own

@@ -54,7 +54,9 @@ def by_recording(J: np.ndarray, e: np.ndarray, segments: np.ndarray) -> list[Par
 
 
 def curvature(parts: Sequence[Part], size: int) -> np.ndarray:
-    """Sum of J'J over all samples (size, size)."""
+    """Sum of J'J over all samples, by `size` parameters; nan where a slope is not finite."""
+    if not all(np.isfinite(part.J).all() for part in parts):
+        return np.full((size, size), np.nan)
     H = np.zeros((size, size))
     for J, _, columns in parts:
         flat = J.reshape(-1, len(columns))
@@ -62,7 +64,7 @@ def curvature(parts: Sequence[Part], size: int) -> np.ndarray:
     return H
 
 
-def sandwich(parts: Sequence[Part], size: int) -> np.ndarray:
+def sandwich(parts: Sequence[Part], H: np.ndarray) -> np.ndarray:
     """Covariance of least-squares estimates that autocorrelation and unequal variance do not fool.
 
         H^-1 S H^-1,  H = sum J_k' J_k,  S = sum over lags of Bartlett-weighted products of J_k' e_k
@@ -74,7 +76,7 @@ def sandwich(parts: Sequence[Part], size: int) -> np.ndarray:
     Args:
         parts: The recordings; products do not cross them. Memory and time are those of the slopes by what
             each recording moves, so first states, which are a recording's own, cost nothing in the others.
-        size: Number of parameters D.
+        H: Their `curvature` (D, D).
 
     Returns:
         Covariance (D, D); nan where the residuals are not finite, and for parameters that the data do not
@@ -83,9 +85,9 @@ def sandwich(parts: Sequence[Part], size: int) -> np.ndarray:
     Source: Newey and West 1987, Econometrica 55; the larger of two variances: Angrist and Pischke,
     Mostly Harmless Econometrics, 2009, section 8.1.
     """
-    if not all(np.isfinite(p.J).all() and np.isfinite(p.e).all() for p in parts):
+    size, n = len(H), sum(len(p.e) for p in parts)
+    if not (np.isfinite(H).all() and all(np.isfinite(p.e).all() for p in parts)):
         return np.full((size, size), np.nan)
-    H, n = curvature(parts, size), sum(len(p.e) for p in parts)
     alike = sum(p.e.T @ p.e for p in parts) / n
     white, S = np.zeros((size, size)), np.zeros((size, size))
     for J, e, columns in parts:

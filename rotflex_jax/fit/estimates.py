@@ -22,18 +22,16 @@ def report(task: Task, end: Ended, e: jax.Array, J: jax.Array) -> Fit:
     """
     model, data, coordinates, index = task.model, task.data, task.moved.coordinates, task.moved.index
     m = model.mechanism
-    moved, seen = np.asarray(J), data.seen > 0
-    left = np.asarray(e)
-    parts = [
-        Part(-moved[r, seen[r]], left[r, seen[r]], columns) for r, columns in enumerate(task.moved.places)
-    ]
+    slopes, left, seen = np.asarray(J), np.asarray(e), data.seen > 0
+    parts = [Part(slopes[r, s], left[r, s], task.moved.places[r]) for r, s in enumerate(seen)]
     residual = np.concatenate([part.e for part in parts])
     each = range(coordinates.owning)
     z = np.tile(end.flat[: coordinates.parameters], (len(each), 1))
     for i in coordinates.local:
         z[:, i] = [end.flat[coordinates.local_index(r, i)] for r in each]
     values, stretch = coordinates.transform.physical(z)
-    covariance = sandwich(parts, len(index))
+    H = curvature(parts, len(index))
+    covariance = sandwich(parts, H)
     row_of = {int(k): row for row, k in enumerate(index)}
     estimates, free, places = [], [], []
     local: dict[str, tuple[Estimate, ...]] = {}
@@ -70,7 +68,7 @@ def report(task: Task, end: Ended, e: jax.Array, J: jax.Array) -> Fit:
         free_names=tuple(free),
         steps=end.steps,
         history=tuple(end.history),
-        weakest=_weakest(together.T @ curvature(parts, len(index)) @ together, free),
+        weakest=_weakest(together.T @ H @ together, free),
         local=local,
     )
 

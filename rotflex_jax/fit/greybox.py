@@ -66,7 +66,8 @@ def fit(
         max_steps: Most iterations of each descent; there are several, each with the scale of the one before.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
-        devices: Those that several recordings are shared out to; those of this process if None.
+        devices: Those of this process that several recordings are shared out to; all of them if None, unless
+            `jax.default_device` names one.
         progress: Called with a line of text now and then.
         throw: Raise instead of reporting a failure in `status`.
 

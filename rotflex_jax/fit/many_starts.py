@@ -103,7 +103,8 @@ def many_starts(
         keep: How many of the best go on to the whole.
         max_steps: Most runs of one start in each stage.
         seed: Of the starts.
-        devices: Those that the starts are shared out to; those of this process if None.
+        devices: Those of this process that the starts are shared out to; all of them if None, unless
+            `jax.default_device` names one.
         progress: Called with a line of text now and then.
 
     Returns:
@@ -137,7 +138,8 @@ def many_starts(
     x0 = np.broadcast_to(first_states(model, listed), (starts, len(listed), 2 * len(m.coordinates)))
     noise = sensor_noise(listed, model)
     say = progress or (lambda _: None)
-    stage = functools.partial(_stage, model, free, noise, max_steps, mesh_of(devices), say)
+    common = {"model": model, "free": free, "noise": noise, "most": max_steps, "say": say}
+    stage = functools.partial(_stage, mesh=mesh_of(devices), **common)
     short = _beginnings(listed, short_seconds)
     if short is not None:
         found = stage(z, x0, short, ROUGHLY, f"{starts} starts, beginnings")
@@ -177,21 +179,24 @@ def _beginnings(recordings: list[Recording], seconds: float | None) -> list[Reco
 
 
 def _stage(
+    z: np.ndarray,
+    x0: np.ndarray,
+    recordings: list[Recording],
+    enough: float,
+    title: str,
+    *,
     model: Model,
     free: np.ndarray,
     noise: np.ndarray,
     most: int,
     mesh: Mesh | None,
     say: Callable[[str], None],
-    z: np.ndarray,
-    x0: np.ndarray,
-    recordings: list[Recording],
-    enough: float,
-    title: str,
 ) -> Reached:
     """All starts on some recordings; what is not finite costs infinitely much."""
     parts, mesh = [], mesh if len(z) > 1 else None
-    together = min(TOGETHER * (mesh.size if mesh else 1), len(z))
+    # As many for each device, so that none waits for another: some take sixty runs where others take three.
+    size = mesh.size if mesh else 1
+    together = size * min(TOGETHER, -(-len(z) // size))
     with double_precision():
         data = stack(recordings, model)
         arrays = type(data)(*(jnp.asarray(part) for part in data))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.covariance import by_recording, sandwich
+from rotflex_jax.fit.covariance import by_recording, curvature, sandwich
 from rotflex_jax.fit.linear import Solution
 from rotflex_jax.fit.rows import Rows
 from rotflex_jax.parameters import Estimate, Specification
@@ -128,7 +128,7 @@ def series_fit(
     along = phi @ solution.basis
     way = solution.basis * solution.shrink
     parts = by_recording(along[:, None, :], e[:, None], rows.segments)
-    own = way @ sandwich(parts, along.shape[1]) @ way.T
+    own = way @ sandwich(parts, curvature(parts, along.shape[1])) @ way.T
     blind = np.linalg.norm(way * np.linalg.norm(along, axis=0), axis=1) == 0
     own[blind, :] = own[:, blind] = np.nan
     covariance = np.full((P, P), np.nan)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rotflex_jax import __version__
 from rotflex_jax.errors import InputError
 from rotflex_jax.fleet.task import Record, Search
 from rotflex_jax.model import Model
@@ -24,8 +25,6 @@ def digest_of_search(
     model: Model, search: Search, share: float, reading: Mapping[str, Any], places: Iterable[str]
 ) -> str:
     """Digest of all that the recordings have in common; the same in another process."""
-    from rotflex_jax import __version__  # set only after all modules are there
-
     m = model.mechanism
     physics = (m.coordinates, m.ports, m.effects, m.outputs, sorted(m.trusted), m.units)
     said = repr(

@@ -2,8 +2,8 @@
 
 XLA's newer way to emit fused operations takes as long over a loop of many small ones as all the rest of the
 compiler, and the loop runs no faster for it; so the older way is asked for, where this XLA has the choice.
-Nor is a program split for several threads to compile: that is more work in all, and programs compile side
-by side as it is.
+Nor is a program split for several threads to compile, which is more work in all: a search compiles its
+programs side by side as it is.
 
 JAX's own cache on disk spares the compiler, but only once a program has been traced anew, and where a
 mechanism has thirty effects that takes longer than to run it. So the traced program is kept as well, under a
@@ -11,6 +11,7 @@ name made of all that tracing depends on: the function, structure and solver, th
 arrays, the source of this package, the version and the settings of JAX. Whatever differs gives another name.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -156,12 +157,13 @@ def _plain() -> bool:
 
 @functools.cache
 def _options() -> dict[str, Any]:
-    """For the compiler; none where this XLA does not know them."""
-    try:
-        jax.jit(lambda: 0, compiler_options=_FOR_COMPILER).lower().compile()
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return _FOR_COMPILER
+    """For the compiler; those that this XLA knows."""
+    known = {}
+    for name, value in _FOR_COMPILER.items():
+        with contextlib.suppress(jax.errors.JaxRuntimeError):
+            jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+            known[name] = value
+    return known
 
 
 def _keeps() -> bool:
