@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +97,7 @@ class Transform:
         single, boxed, edge, way = self._kinds()
         span = np.where(boxed, self.upper - self.lower, 1.0)
         grown = way * np.exp(np.minimum(np.where(single, z, 0.0), 60.0))
-        share = np.exp(-np.logaddexp(0.0, -np.where(boxed, z, 0.0)))  # 1 / (1 + exp(-z)), never overflowing
+        share = scipy.special.expit(np.where(boxed, z, 0.0))
         p = np.where(single, edge + grown, z * self.typical)
         slope = np.where(single, grown, self.typical)
         return np.where(boxed, edge + span * share, p), np.where(boxed, span * share * (1 - share), slope)

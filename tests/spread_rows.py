@@ -17,11 +17,6 @@ from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.devices import mesh_of, spread
 from rotflex_jax.recording import Recording
 
-ALONE = len(sys.argv) == 1
-jax.config.update("jax_num_cpu_devices", 8 if ALONE else 2)
-if not ALONE:
-    jax.distributed.initialize(f"127.0.0.1:{sys.argv[2]}", num_processes=2, process_id=int(sys.argv[1]))
-
 # Neither two, four nor eight devices divide it.
 ROWS = 11
 
@@ -49,19 +44,29 @@ def where(devices: list) -> list[int]:
     return np.asarray(run(np.zeros((ROWS, 2)))).tolist()
 
 
-sets = {str(n): jax.devices()[:n] for n in ((2, 8) if ALONE else (4,))}
-plain = sweep(jax.local_devices()[:1])
-spreads = {n: sweep(devices) for n, devices in sets.items()}
-compiled = values_at._cache_size()
-again = {n: sweep(devices, 0.9) for n, devices in sets.items()}
-print(
-    json.dumps(
-        {
-            "plain": plain,
-            "spread": spreads,
-            "where": {n: where(devices) for n, devices in sets.items()},
-            "compiled_again": values_at._cache_size() - compiled,
-            "changed": all(again[n] != spreads[n] for n in sets),
-        }
+def main() -> None:
+    """The sweep on one device, and on all that there are."""
+    alone = len(sys.argv) == 1
+    jax.config.update("jax_num_cpu_devices", 8 if alone else 2)
+    if not alone:
+        jax.distributed.initialize(f"127.0.0.1:{sys.argv[2]}", num_processes=2, process_id=int(sys.argv[1]))
+    sets = {str(n): jax.devices()[:n] for n in ((2, 8) if alone else (4,))}
+    plain = sweep(jax.local_devices()[:1])
+    spreads = {n: sweep(devices) for n, devices in sets.items()}
+    compiled = values_at._cache_size()
+    again = {n: sweep(devices, 0.9) for n, devices in sets.items()}
+    print(
+        json.dumps(
+            {
+                "plain": plain,
+                "spread": spreads,
+                "where": {n: where(devices) for n, devices in sets.items()},
+                "compiled_again": values_at._cache_size() - compiled,
+                "changed": all(again[n] != spreads[n] for n in sets),
+            }
+        )
     )
-)
+
+
+if __name__ == "__main__":
+    main()

@@ -57,10 +57,14 @@ def test_a_sweep_over_two_processes() -> None:
 
 def test_fits_on_two_devices_end_where_those_on_one_do() -> None:
     found = said(run("spread_fits.py"))
-    assert found["two"]["devices"] == [2]
-    assert found["waits"] == []
+    assert (found["devices"], found["waits"]) == ([2], [])
     for what in ("values", "std", "costs", "cut"):
         np.testing.assert_allclose(found["two"][what], found["one"][what], rtol=1e-7, err_msg=what)
+
+
+def test_the_suite_itself_runs_on_one_device() -> None:
+    """Programs for several devices change that for a whole process, so they must not run when collected."""
+    assert len(jax.local_devices()) == 1
 
 
 def test_one_device_changes_nothing() -> None:
