@@ -162,10 +162,8 @@ def compare(
 
     with terminal.progress("Comparing") as step:
         result = rf.compare(train, wanted, mechanism=mechanism, test=test, progress=step)
-        page = None if report is None else result.report(report)
     _give(result, terminal.print_comparison, json_file)
-    if page is not None:
-        terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
+    _report(result, report, json_file)
 
 
 def effects(
@@ -197,23 +195,43 @@ def _discover(
 
     with terminal.progress("Searching for missing effects") as step:
         result = rf.discover(mechanism, train, test, progress=step)
-        page = None if report is None else result.report(report)
+    _give(result, terminal.print_discovery, json_file)
     if save_model is not None:
         result.save(save_model)
-    _give(result, terminal.print_discovery, json_file)
-    if page is not None:
-        terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
+    _report(result, report, json_file)
 
 
 def _give(result: Any, show: Callable[[Any], None], json_file: Path | None) -> None:
     """A result as JSON on stdout, or for a person and as JSON in a file."""
+    if json_file != given.STDOUT:
+        show(result)
+    if json_file is None:
+        return
     text = json.dumps(result.to_dict(), indent=2)
     if json_file == given.STDOUT:
-        print(text)
-        return
-    show(result)
-    if json_file is not None:
+        print(text, flush=True)
+    else:
         json_file.write_text(text + "\n", encoding="utf-8")
+
+
+def _report(result: Any, folder: Path | None, json_file: Path | None) -> None:
+    """Write the report, last of all: whatever fails in it costs nothing of a result given before.
+
+    Raises:
+        InputError: It could not be written, with the reason.
+    """
+    if folder is None:
+        return
+    try:
+        with terminal.progress("Writing the report"):
+            page = result.report(folder)
+    except Exception as error:
+        if isinstance(error, OSError):
+            reason = f"{error.filename or folder} cannot be used: {error.strerror or error}"
+        else:
+            reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"The report could not be written: {reason.rstrip('.')}.") from error
+    terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
 
 
 # In the order in which a newcomer needs them.

@@ -384,6 +384,42 @@ def test_json_on_stdout_stands_alone(run, search, recorded, tmp_path) -> None:
     assert "index.html" in err
 
 
+FAILURES = {
+    "full disk": (OSError(28, "No space left on device"), "No space left on device"),
+    "defect": (TypeError("Object of type bool is\nnot JSON serializable"), "TypeError: Object of type bool"),
+    "bad folder": (rf.InputError("page cannot hold the report; name another folder."), "name another folder"),
+}
+
+
+@pytest.mark.parametrize("command", ["demo", "discover", "compare"])
+@pytest.mark.parametrize("fault", FAILURES)
+def test_a_report_that_fails_costs_no_result(
+    fault, command, run, search, recorded, tmp_path, monkeypatch
+) -> None:
+    error, words = FAILURES[fault]
+    out, kept = tmp_path / "r.json", tmp_path / "model.json"
+
+    def broken(folder: Path) -> Path:
+        assert json.loads(out.read_text())["verdict"] == "found"  # given out before
+        raise error
+
+    def searched(*given, progress, **options) -> SimpleNamespace:
+        result = FakeSearch()("paper", [], [], progress) if command == "compare" else search(*given, progress)
+        save = lambda path: path.write_text("{}")  # noqa: E731
+        return SimpleNamespace(**vars(result) | {"report": broken, "save": save})
+
+    monkeypatch.setattr(rf, "compare" if command == "compare" else "discover", searched)
+    monkeypatch.setattr(terminal, "print_comparison", lambda result: print(result.sentence))
+    line = [command] if command == "demo" else [command, recorded]
+    line += ["--save-model", kept] if command == "discover" else []
+    status, told, err = run(*line, "--json", out, "--report", tmp_path / "page")
+    assert status == 2
+    assert "The rounds explain the record." in told and out.exists()
+    assert kept.exists() == (command == "discover")
+    assert_one_sentence("".join(err.splitlines(keepends=True)[-1:]), "report could not be written", words)
+    assert "Traceback" not in err
+
+
 def test_the_user_is_told_what_to_look_at(run, search, tmp_path) -> None:
     doubtful = write(tmp_path / "degrees.csv", DEMO * [1, 1, 180 / np.pi, 180 / np.pi])
     status, _, err = run("discover", doubtful, "--accept", "units")

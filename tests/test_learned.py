@@ -282,6 +282,14 @@ def test_a_model_that_lacks_nothing_stays_as_it_is(small_map):
     assert "No map" in str(found)
 
 
+@pytest.mark.slow
+def test_a_map_that_does_not_gain_surely_enough_is_told_in_plain_json(small_map, monkeypatch):
+    monkeypatch.setattr(learned, "SURE", np.inf)
+    found = taught({("coulomb", "hub"): {"level": 0.03}})
+    assert found.held_out_gain_nats > learned.GAIN and not found.kept
+    assert json.loads(json.dumps(found.to_dict()))["kept"] is False  # as a report writes it beside its page
+
+
 def test_ports_that_cannot_be_taught_are_told():
     rec = Recording(
         u=np.sin(np.arange(900.0)),

@@ -102,7 +102,7 @@ def learn_torque(
         if other.held_out > trial.held_out:
             mapped, trial = level, other
     gain, sure = lead(trial.blocks, base.blocks)
-    kept = gain > GAIN and sure > SURE and bool(np.all(trial.windows < 1.02 * base.windows))
+    kept = bool(gain > GAIN and sure > SURE and np.all(trial.windows < 1.02 * base.windows))
     say(f"learned torque: {gain:.0f} nat on held-out data, {'kept' if kept else 'not kept'}")
     scribe = Scribe(judge, away, model.solver)
     before = _bare(scribe.stage(base, s.calibrations), at)
