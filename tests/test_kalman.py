@@ -1,5 +1,6 @@
 """The steady gain against SciPy's Riccati solver, and its process noise against quadrature."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -100,6 +101,36 @@ def test_more_disturbance_trusts_the_sensor_more():
     q = np.geomspace(1e-10, 1e3, 8)
     K = kalman_gains(joint, [{"hub": v} for v in q], np.array([1e-4]), 0.01)[:, 0, 0]
     assert (np.diff(K) > 0).all() and K[0] > 0 and 0.99 < K[-1] < 1
+
+
+SPINNING = (
+    dataclasses.replace(single_inertia(0.002, damping=0.001), outputs={"tacho": ("hub", "speed")}),
+    # The angle that both share is the one that nothing shows.
+    dataclasses.replace(
+        paper(hub_damping=0.004, joint_damping=0.003),
+        outputs={"motor": ("hub", "speed"), "tip": ("arm", "speed")},
+    ),
+)
+
+
+@pytest.mark.parametrize("machine", SPINNING, ids=["inertia", "joint"])
+def test_an_angle_that_no_sensor_shows_has_the_gain_that_the_filter_tends_to(machine):
+    """Against the covariance filter run step by step: its gain comes to rest, its variance never does."""
+    Ts, intensity, noise = 0.01, {"hub": 1e-5}, np.full(len(machine.channels), 0.01)
+    space, n = linearise(machine), len(machine.coordinates)
+    inertia = M if n == 2 else np.array([[0.002]])
+    g = np.concatenate([np.zeros(n), np.linalg.solve(inertia, np.eye(n)[0])])
+    Ad, C, Q = expm(space.A * Ts), space.C, 1e-5 * quadrature(space.A, g, Ts)
+    P, K, variance = Q, np.zeros((2 * n, n)), []
+    for _ in range(20_000):
+        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(noise**2))
+        P = Ad @ (P - K @ C @ P) @ Ad.T + Q
+        variance.append(P[0, 0])
+    assert variance[-1] > 1.5 * variance[10_000] > 2 * variance[5_000]
+    found = kalman_gains(machine, [intensity, {}], noise, Ts)
+    scale = np.abs(K).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(found[0] / scale, K / scale, atol=1e-6)
+    np.testing.assert_array_equal(found[1], 0.0)
 
 
 def test_memories_are_not_corrected():

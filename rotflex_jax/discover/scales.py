@@ -23,6 +23,8 @@ def motion(
     layout = Layout.of(mechanism.structure)
     rows = np.array(layout.output_rows)
     is_position = np.any(rows[:, : layout.n] != 0, axis=1)
+    if not is_position.any():
+        return {}
     width = max(2 * round(smooth / Ts / 2) + 1, 5)
     width = min(width, len(y) - 1 + len(y) % 2)
     C = rows[is_position, : layout.n]

@@ -85,7 +85,9 @@ def kalman_gains(
         x+ = Ad (x + K e) + Bd u,   K = P C' (C P C' + R)^-1,   P from the discrete Riccati equation
 
     The Riccati equations of all intensities are solved together by doubling (Chu, Fan, Lin and Wang,
-    Int. J. Control 77, 2004), each step of which doubles the horizon.
+    Int. J. Control 77, 2004), each step of which doubles the horizon, until `P C'` rests. That is all that
+    the gain has of `P`: a position of which there are sensors of speed only integrates the noise, and its
+    variance grows for ever, while its covariance with what the sensors show, and so its gain, has a limit.
 
     Args:
         mechanism: Its linear part is used.
@@ -114,7 +116,8 @@ def kalman_gains(
         grown = P + At @ P @ W @ A
         A, G = A @ W @ A, G + A @ W @ G @ At
         grown = (grown + np.swapaxes(grown, 1, 2)) / 2
-        done = np.max(np.abs(grown - P)) <= 1e-12 * np.max(np.abs(grown))
+        shown = grown @ ss.C.T
+        done = np.max(np.abs(shown - P @ ss.C.T)) <= 1e-12 * np.max(np.abs(shown))
         P = grown
         if done:
             break
