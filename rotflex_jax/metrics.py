@@ -9,7 +9,7 @@ name, or two arrays, time first, and gives one number per column.
 array([0.5, 0. ])
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -26,6 +26,17 @@ class Measured(Protocol):
     def y(self) -> np.ndarray: ...  # noqa: D102
     @property
     def channels(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def n_init(self) -> int: ...  # noqa: D102
+
+
+class Sampled(Protocol):
+    """What the layout of windows depends on."""
+
+    @property
+    def N(self) -> int: ...  # noqa: D102
+    @property
+    def Ts(self) -> float: ...  # noqa: D102
     @property
     def n_init(self) -> int: ...  # noqa: D102
 
@@ -164,3 +175,52 @@ def max_error(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = No
     3.0
     """
     return _score(lambda y, e: np.max(np.abs(e), axis=0), y, y_hat, n_init)
+
+
+def window_starts(recording: Sampled, seconds: float) -> tuple[np.ndarray, int]:
+    """First samples of the windows of a recording, and the longest window's length [samples].
+
+    Args:
+        recording: What is cut.
+        seconds: Length of a window [s], twice `n_init` at least; a rest no longer than that joins the
+            last.
+    """
+    N, m = recording.N, recording.n_init
+    width = min(N, max(round(seconds / recording.Ts), 2 * m))
+    starts = np.arange(0, max(N - 2 * m, 1), width)
+    return starts, max(width, N - int(starts[-1]))
+
+
+def counted(recording: Sampled, seconds: float) -> np.ndarray:
+    """Which samples (N,) an error in windows counts: not the first `n_init` of each, which a run may see."""
+    starts, _ = window_starts(recording, seconds)
+    counts = np.ones(recording.N, bool)
+    counts[(starts[:, None] + np.arange(recording.n_init)).ravel()] = False
+    return counts
+
+
+def windowed_rmse(
+    recordings: Sequence[Sampled],
+    measured: Sequence[np.ndarray],
+    simulated: Sequence[np.ndarray],
+    seconds: float,
+) -> np.ndarray:
+    """Root mean square error (C,) of free runs that start anew every few seconds, of all recordings together.
+
+    The one definition for searches, comparisons, reports and sliders. A run is as `simulate_windows` of a
+    model makes it: anew are the positions and speeds, not what the voltage has been before.
+
+    Args:
+        recordings: They lay out the windows.
+        measured: Their outputs (N, C), in the order of the model [unit of the channel].
+        simulated: The runs, same shapes.
+        seconds: Length of the windows [s].
+
+    Returns:
+        One value per column [unit of the channel].
+    """
+    total, count = 0.0, 0
+    for recording, y, y_hat in zip(recordings, measured, simulated, strict=True):
+        e = (np.asarray(y, float) - np.asarray(y_hat, float))[counted(recording, seconds)]
+        total, count = total + np.sum(e**2, axis=0), count + len(e)
+    return np.sqrt(total / max(count, 1))

@@ -23,8 +23,10 @@ from rotflex_jax.mechanism.assembly import driven_voltage, effects_of, rest_stat
 from rotflex_jax.mechanism.initial import initial_states
 from rotflex_jax.mechanism.movable import check_movable
 from rotflex_jax.mechanism.programs import Program, kept
+from rotflex_jax.metrics import window_starts
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.quality import ACCEPTABLE
 
 _free, _predict = Program(free_run, static=2), Program(predictor_run, static=2)
 
@@ -107,6 +109,14 @@ class Model:
         gates[[i for i, _ in acting]] = 0.0
         return v, dataclasses.replace(self, gates=tuple(gates.tolist()))
 
+    def driven(self, recording: Recording) -> tuple["Model", Recording]:
+        """The model behind its effects of actuation, and the recording with the voltage these make of it.
+
+        In a part of that recording no delay, lag or drift begins anew.
+        """
+        v, inner = self._behind_actuation(recording)
+        return inner, dataclasses.replace(recording, u=v, accept=ACCEPTABLE)
+
     def _starts(
         self, u: np.ndarray, y: np.ndarray, Ts: float, hidden: np.ndarray | None = None
     ) -> np.ndarray:
@@ -170,7 +180,7 @@ class Model:
 
         Args:
             recording: Its voltage drives the model.
-            seconds: Length of a window [s]; a rest shorter than twice `n_init` joins the last one.
+            seconds: Length of a window [s]; a rest no longer than twice `n_init` joins the last one.
         """
         y = self.measured(recording).astype(float)
         u, inner = self._behind_actuation(recording)
@@ -222,11 +232,3 @@ class Model:
                 jnp.asarray(float(recording.Ts)),
             )
             return np.asarray(run[1])
-
-
-def window_starts(recording: Recording, seconds: float) -> tuple[np.ndarray, int]:
-    """First samples of the windows, and the longest window's length [samples]."""
-    N, m = recording.N, recording.n_init
-    width = min(N, max(round(seconds / recording.Ts), 2 * m))
-    starts = np.arange(0, max(N - 2 * m, 1), width)
-    return starts, max(width, N - int(starts[-1]))

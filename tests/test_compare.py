@@ -14,8 +14,9 @@ from arena.records import make_record
 from rotflex_jax import cli, fastloops
 from rotflex_jax.compare import ARX, METHODS, QUICK, Comparison, Fitted, Method, physics, register
 from rotflex_jax.compare.arx import Difference, least_squares
-from rotflex_jax.compare.judged import blinded
+from rotflex_jax.compare.judged import blinded, windowed_runs
 from rotflex_jax.discover import Discovery
+from rotflex_jax.mechanism import simulate
 from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
@@ -128,6 +129,46 @@ def test_windows_start_anew() -> None:
     expected = np.sqrt(np.mean((np.concatenate(windowed) - test.y)[judged] ** 2, axis=0))
     assert list(row.rmse_windows.values()) == pytest.approx(expected.tolist())
     assert row.rmse_windows["theta"] < row.rmse["theta"]
+
+
+def test_a_window_has_the_voltage_of_the_whole_recording() -> None:
+    """The plant is the bare joint under a voltage shifted by hand; a model with that delay is exact."""
+    Ts, late, noise = 0.004, 25, 1e-4
+    rng, parts = np.random.default_rng(3), []
+    for N in (1500, 1500):
+        u = np.convolve(rng.normal(size=N), np.ones(20) / 4, mode="same")
+        y = simulate(rf.joints.paper(), np.concatenate([np.full(late, u[0]), u[:-late]]), Ts)
+        parts.append(Recording(u=u, y=y + noise * rng.normal(size=y.shape), Ts=Ts, accept=("units",)))
+    joint = rf.joints.paper() + rf.effects.Delay(time=late * Ts)
+    table = rf.compare(parts[0], ["textbook"], mechanism=joint, test=parts[1], window_seconds=1.0)
+    row, (test,) = table["textbook"], table.test
+    for channel, error in row.rmse_windows.items():
+        assert error < 2 * noise, channel
+        assert max(row.horizon.rmse[channel]) < 3 * noise, channel
+    # As in a search: the same runs of the same model give the same number.
+    run = Model(joint).simulate_windows(test, 1.0)
+    short = rf.metrics.windowed_rmse([test], [test.y], [run], 1.0)
+    assert list(row.rmse_windows.values()) == pytest.approx(short.tolist())
+
+
+def test_windows_are_blind_and_those_of_a_black_box_recordings_by_themselves() -> None:
+    test, shown = recorded(2.0), []
+
+    def run(recording: Recording, seconds: float | None = None) -> np.ndarray:
+        shown.append(recording.y)
+        return level(recording)
+
+    assert 50 < test.n_init < 125
+    (alone,) = windowed_runs(SimpleNamespace(simulate=run), [test], 0.5)
+    assert [len(y) for y in shown] == [250] * 4
+    np.testing.assert_array_equal(alone, np.repeat(test.y[::250], 250, axis=0))
+    cut = np.concatenate(shown)
+    shown.clear()
+    windowed_runs(SimpleNamespace(simulate_windows=run), [test], 0.5)
+    for y in (cut, *shown):
+        by_window, measured = y.reshape(4, 250, 2), test.y.reshape(4, 250, 2)
+        np.testing.assert_array_equal(by_window[:, : test.n_init], measured[:, : test.n_init])
+        assert not np.ptp(by_window[:, test.n_init - 1 :], axis=1).any()
 
 
 def test_a_method_cannot_cheat() -> None:

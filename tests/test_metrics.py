@@ -55,6 +55,25 @@ def test_recording_brings_its_channels_and_its_initial_samples(name: str) -> Non
     np.testing.assert_array_equal(list(values.values()), metric(recording.y, y_hat, recording.n_init))
 
 
+def test_errors_in_windows_by_hand() -> None:
+    """Windows of 20 samples, of which 8 are seen; a rest of 16 joins the last, and a rest of 17 does not."""
+    starts = {56: [0, 20], 57: [0, 20, 40]}
+    rng, recordings, runs = np.random.default_rng(0), [], []
+    for N, begin in starts.items():
+        r = Recording(u=rng.normal(size=N), y=0.1 * rng.normal(size=(N, 2)), Ts=0.1, n_init=8, accept="short")
+        assert metrics.window_starts(r, 2.0)[0].tolist() == begin
+        e = np.full((N, 2), np.nan)  # what a model has seen counts in no way
+        for k, (i, j) in enumerate(zip(begin, [*begin[1:], N], strict=True)):
+            e[i + 8 : j] = [k + 1.0, -0.5]
+        np.testing.assert_array_equal(metrics.counted(r, 2.0), np.isfinite(e[:, 0]))
+        recordings.append(r)
+        runs.append(r.y - e)
+    # 12 errors of 1 and 28 of 2; then 12 of 1, 12 of 2 and 9 of 3.
+    squares = (12 * 1 + 28 * 4) + (12 * 1 + 12 * 4 + 9 * 9)
+    found = metrics.windowed_rmse(recordings, [r.y for r in recordings], runs, 2.0)
+    np.testing.assert_allclose(found, [np.sqrt(squares / (40 + 33)), 0.5], rtol=1e-12)
+
+
 def test_single_precision_stays_single() -> None:
     assert metrics.rmse(Y.astype(np.float32), (Y - E).astype(np.float32)).dtype == np.float32
 

@@ -9,15 +9,14 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 import rotflex_jax as rf
 from arena.hidden import ABSORBED, DEFAULTS, SHAPES
 from arena.laws import Place
 from arena.records import make_record
 from arena.scoring import parameter_errors, renamed, scored, visible
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.model import Model, window_starts
+from rotflex_jax.metrics import windowed_rmse
+from rotflex_jax.model import Model
 
 SPLIT, WINDOW, FS = 0.7, 2.0, 500.0
 BOTH = ["theta", "alpha"]
@@ -42,11 +41,9 @@ def textbook(channels: Sequence[str] = BOTH) -> rf.Mechanism:
 
 def windows_error(model: Model, test: rf.Recording) -> dict[str, float]:
     """Root mean square error of short free runs per channel, what a run may see not counted."""
-    counts = np.ones(test.N, bool)
-    for start in window_starts(test, WINDOW)[0]:
-        counts[start : start + test.n_init] = False
-    e = (model.measured(test) - model.simulate_windows(test, WINDOW))[counts]
-    return dict(zip(model.mechanism.channels, np.sqrt(np.mean(e**2, axis=0)).tolist(), strict=True))
+    run = model.simulate_windows(test, WINDOW)
+    rms = windowed_rmse([test], [model.measured(test)], [run], WINDOW)
+    return dict(zip(model.mechanism.channels, rms.tolist(), strict=True))
 
 
 def oracle(places: list[Place], train: rf.Recording, test: rf.Recording) -> dict[str, Any]:

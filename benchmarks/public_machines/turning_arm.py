@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 import rotflex_jax as rf
 from public_machines.free_runs import error, fitted
 from public_machines.rounds import Say, estimates, labels, told
@@ -54,6 +52,7 @@ def _errors(model: rf.Model, tests: dict[str, rf.Recording]) -> dict[str, Any]:
         for name, test in tests.items()
         for channel, error in rf.metrics.rmse(test, model.simulate(test)).items()
     }
-    e = np.concatenate([model.simulate_windows(t, 2.0) - t.y for t in tests.values()])
-    short = 1e3 * np.sqrt(np.mean(e**2, axis=0))
+    unseen = list(tests.values())
+    runs = [model.simulate_windows(t, 2.0) for t in unseen]
+    short = 1e3 * rf.metrics.windowed_rmse(unseen, [model.measured(t) for t in unseen], runs, 2.0)
     return {"free run": free, "windows": dict(zip(model.mechanism.channels, short.tolist(), strict=True))}

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rotflex_jax.compare.judged import free_runs, windows
+from rotflex_jax.compare.judged import free_runs
 from rotflex_jax.compare.method import Simulator
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
@@ -28,19 +28,15 @@ def one_period(recordings: Sequence[Recording], what: str) -> None:
         )
 
 
-def free_run_cost(
-    simulator: Simulator, recordings: Sequence[Recording], seconds: float | None = None
-) -> float:
+def free_run_cost(simulator: Simulator, recordings: Sequence[Recording]) -> float:
     """Mean over the channels of the log of the free-run error; infinite where a run diverges.
 
     Args:
         simulator: What is judged.
-        recordings: What decides.
-        seconds: Run anew every so many seconds [s]; one run over each if None.
+        recordings: What decides; one run over each.
     """
-    pieces = list(recordings) if seconds is None else [w for r in recordings for w in windows(r, seconds)]
     with np.errstate(all="ignore"):
-        runs = free_runs(simulator, pieces)
-        e = np.concatenate([(r.y - y_hat)[r.n_init :] for r, y_hat in zip(pieces, runs, strict=True)])
+        runs = free_runs(simulator, recordings)
+        e = np.concatenate([(r.y - y_hat)[r.n_init :] for r, y_hat in zip(recordings, runs, strict=True)])
         cost = float(np.mean(np.log(np.sqrt(np.mean(e**2, axis=0)) + 1e-300)))
     return np.inf if np.isnan(cost) else cost

@@ -8,6 +8,7 @@ import numpy as np
 
 from rotflex_jax.compare.judged import free_runs
 from rotflex_jax.compare.method import Simulator
+from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
 POINTS = 16
@@ -48,11 +49,16 @@ def pieces(recordings: Sequence[Recording], seconds: float) -> list[Recording]:
 def against_horizon(simulator: Simulator, recordings: Sequence[Recording], seconds: float) -> Horizon:
     """Error against the horizon, in stretches of time that grow with it.
 
+    The voltage drives a grey box over the whole recording, as in windows (`judged.windowed_runs`).
+
     Args:
         simulator: What is judged.
         recordings: Held-out recordings, of one sampling period.
         seconds: How far ahead [s].
     """
+    if isinstance(simulator, Model):
+        pairs = [simulator.driven(r) for r in recordings]
+        simulator, recordings = pairs[0][0], [r for _, r in pairs]
     parts = pieces(recordings, seconds)
     runs = free_runs(simulator, parts)
     ahead = min(r.N - r.n_init for r in parts)

@@ -9,7 +9,6 @@ import numpy as np
 from rotflex_jax import metrics
 from rotflex_jax.compare.method import Simulator
 from rotflex_jax.errors import InputError
-from rotflex_jax.model import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
 
@@ -17,31 +16,59 @@ from rotflex_jax.recording.quality import ACCEPTABLE
 BEYOND = 100.0
 
 
-def blinded(recording: Recording) -> Recording:
-    """The recording with its outputs held from sample `n_init` on: all that a model may look at."""
-    y = recording.y.copy()
-    y[recording.n_init :] = y[recording.n_init - 1]
-    return dataclasses.replace(recording, y=y, accept=ACCEPTABLE)
+def blinded(recording: Recording, seconds: float | None = None) -> Recording:
+    """The recording with its outputs held where a model may not look.
 
-
-def windows(recording: Recording, seconds: float) -> tuple[Recording, ...]:
-    """The recording cut into windows; a rest too short to judge joins the last."""
-    starts = window_starts(recording, seconds)[0].tolist()
-    pairs = zip(starts, [*starts[1:], recording.N], strict=True)
-    return tuple(recording.slice(i, j) for i, j in pairs)
+    Args:
+        recording: What is simulated.
+        seconds: Length of the windows, of each of which a model may look at the first `n_init` samples [s];
+            at those of the recording alone if None.
+    """
+    k = np.arange(recording.N)
+    hidden = k >= recording.n_init if seconds is None else metrics.counted(recording, seconds)
+    last = np.maximum.accumulate(np.where(hidden, 0, k))
+    return dataclasses.replace(recording, y=recording.y[last], accept=ACCEPTABLE)
 
 
 def free_runs(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[np.ndarray, ...]:
     """One free run (N, C) over each recording, none of which can look beyond `n_init`."""
+    return tuple(_checked(simulator.simulate(blinded(r)), r) for r in recordings)
+
+
+def _checked(run: np.ndarray, recording: Recording) -> np.ndarray:
+    y_hat = np.asarray(run, float)
+    if y_hat.shape != recording.y.shape:
+        raise InputError(
+            f"The free run has the shape {y_hat.shape}, but {recording.y.shape} is needed; "
+            "simulate every sample and channel of the recording."
+        )
+    return y_hat
+
+
+def windowed_runs(
+    simulator: Simulator, recordings: Sequence[Recording], seconds: float
+) -> tuple[np.ndarray, ...]:
+    """Free runs (N, C) over each recording that start anew every few seconds, as a search has them.
+
+    A simulator that has `simulate_windows`, as every grey box, does it itself: the voltage drives it over the
+    whole recording, and a delay, a lag or a drift goes on from window to window. What a black box
+    (difference equation, state space, series) knows of the past is in the first samples of a recording,
+    from which it works out its state or the input before: it runs over each window as a recording by itself.
+
+    Args:
+        simulator: It sees the input and the first `n_init` samples of each window.
+        recordings: What it simulates.
+        seconds: Length of the windows [s].
+    """
+    whole = getattr(simulator, "simulate_windows", None)
+    if whole is not None:
+        return tuple(_checked(whole(blinded(r, seconds), seconds), r) for r in recordings)
     runs = []
-    for recording in recordings:
-        y_hat = np.asarray(simulator.simulate(blinded(recording)), float)
-        if y_hat.shape != recording.y.shape:
-            raise InputError(
-                f"The free run has the shape {y_hat.shape}, but {recording.y.shape} is needed; "
-                "simulate every sample and channel of the recording."
-            )
-        runs.append(y_hat)
+    for r in recordings:
+        starts = metrics.window_starts(r, seconds)[0].tolist()
+        pieces = [r.slice(i, j) for i, j in zip(starts, [*starts[1:], r.N], strict=True)]
+        pieces = [dataclasses.replace(piece, n_init=r.n_init) for piece in pieces]
+        runs.append(np.concatenate(free_runs(simulator, pieces)))
     return tuple(runs)
 
 
@@ -94,3 +121,13 @@ def errors(recordings: Sequence[Recording], runs: Sequence[np.ndarray]) -> dict[
             name: dict(zip(recordings[0].channels, formula(y, y_hat).tolist(), strict=True))
             for name, formula in formulas.items()
         }
+
+
+def windowed_errors(
+    simulator: Simulator, recordings: Sequence[Recording], seconds: float
+) -> dict[str, float]:
+    """Channel -> root mean square error of `windowed_runs`, over all recordings together."""
+    runs = windowed_runs(simulator, recordings, seconds)
+    with np.errstate(all="ignore"):
+        rms = metrics.windowed_rmse(recordings, [r.y for r in recordings], runs, seconds)
+    return dict(zip(recordings[0].channels, rms.tolist(), strict=True))

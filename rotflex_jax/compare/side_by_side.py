@@ -8,7 +8,14 @@ import numpy as np
 
 from rotflex_jax import joints
 from rotflex_jax.compare.horizon import against_horizon
-from rotflex_jax.compare.judged import errors, free_runs, left_the_range, one_step, seconds_of, windows
+from rotflex_jax.compare.judged import (
+    errors,
+    free_runs,
+    left_the_range,
+    one_step,
+    seconds_of,
+    windowed_errors,
+)
 from rotflex_jax.compare.method import Method, Progress, chosen
 from rotflex_jax.compare.table import Comparison, Row
 from rotflex_jax.errors import InputError
@@ -100,8 +107,6 @@ def _row(
             simulator=fitted.simulator,
         )
         runs = free_runs(fitted.simulator, test)
-        pieces = [piece for r in test for piece in windows(r, seconds)]
-        short = errors(pieces, free_runs(fitted.simulator, pieces))
         ahead = {} if fitted.predict is None else errors(test, one_step(fitted.predict, test))["rmse"]
         reason = left_the_range(runs, test, _reach((*train, *test)))
         return dataclasses.replace(
@@ -109,7 +114,7 @@ def _row(
             status="diverged" if reason else "ok",
             reason=reason,
             **errors(test, runs),
-            rmse_windows=short["rmse"],
+            rmse_windows=windowed_errors(fitted.simulator, test, seconds),
             rmse_one_step=ahead,
             horizon=against_horizon(fitted.simulator, test, seconds),
             simulate_seconds=seconds_of(fitted.simulator, test),

@@ -10,7 +10,8 @@ from rotflex_jax.discover.lanes import Bench
 from rotflex_jax.discover.refit import Judge
 from rotflex_jax.discover.supermodel import Place
 from rotflex_jax.fit.residuals import Data
-from rotflex_jax.model import Model, window_starts
+from rotflex_jax.metrics import windowed_rmse
+from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 
 # Log-likelihoods are compared block by block, so that their scatter tells what is chance.
@@ -84,14 +85,8 @@ class Away:
     def windows(self, runs: Sequence[np.ndarray]) -> np.ndarray:
         """Root mean square error per channel of short free runs, their first samples not counted."""
         data = self.judge.bench.data
-        total, count = np.zeros(data.y.shape[-1]), 0
-        for r, recording in enumerate(self.recordings):
-            counts = np.ones(recording.N, bool)
-            for start in window_starts(recording, self.seconds)[0]:
-                counts[start : start + recording.n_init] = False
-            e = (data.y[r, : recording.N] - runs[r])[counts]
-            total, count = total + np.sum(e**2, axis=0), count + len(e)
-        return np.sqrt(total / max(count, 1))
+        measured = [y[: r.N] for y, r in zip(data.y, self.recordings, strict=True)]
+        return windowed_rmse(self.recordings, measured, runs, self.seconds)
 
 
 def held_out(away: Away, h: Hypothesis, near: Trial | None = None) -> Trial:

@@ -9,7 +9,7 @@ from rotflex_jax.discover.places import Finding, in_frequency, in_time, in_view,
 from rotflex_jax.discover.result import Where
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.model import window_starts
+from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 
 LEVEL = 0.05

@@ -4,8 +4,6 @@ import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import numpy as np
-
 from rotflex_jax.discover.result import Discovery
 from rotflex_jax.display.markup import card, paragraph, table
 from rotflex_jax.display.overlay import overlay
@@ -13,7 +11,8 @@ from rotflex_jax.effects.kinds import Effect, Linear
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.fit.fitted import Fit
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.model import Model, window_starts
+from rotflex_jax.metrics import windowed_rmse
+from rotflex_jax.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.wording import effect_label, plain_number, readable, unit_text
 
@@ -137,14 +136,9 @@ class Explorer:
 
     def _errors(self, model: Model) -> dict[str, float]:
         """Root mean square error of short free runs, what a run may see not counted."""
-        squares = []
-        for r in self._test:
-            counts = np.ones(r.N, bool)
-            for start in window_starts(r, self._seconds)[0]:
-                counts[start : start + r.n_init] = False
-            e = model.measured(r) - model.simulate_windows(r, self._seconds)
-            squares.append(e[counts] ** 2)
-        rms = np.sqrt(np.mean(np.concatenate(squares), axis=0))
+        measured = [model.measured(r) for r in self._test]
+        runs = [model.simulate_windows(r, self._seconds) for r in self._test]
+        rms = windowed_rmse(self._test, measured, runs, self._seconds)
         return dict(zip(model.mechanism.channels, rms.tolist(), strict=True))
 
     def _show(self) -> None:

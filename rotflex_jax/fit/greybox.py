@@ -16,7 +16,8 @@ from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.fit.stages import Task
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.linearise import inverse_mass, linearise
-from rotflex_jax.model import Model, window_starts
+from rotflex_jax.metrics import window_starts
+from rotflex_jax.model import Model
 from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
 from rotflex_jax.threads import one_thread

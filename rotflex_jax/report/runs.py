@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from rotflex_jax.discover.result import Discovery, Stage
-from rotflex_jax.model import window_starts
+from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.style import (
     BASELINE,
