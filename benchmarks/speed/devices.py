@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-import time
-from collections.abc import Callable
 
 from speed.processes import process
 
@@ -20,10 +18,10 @@ def devices(seconds: float, starts: int, recordings: int) -> dict[str, float]:
             for count in (1, 2):
                 code = WORK.format(count=count, seconds=seconds, starts=starts, recordings=recordings)
                 found = process(code, cache=cache)
-                for what, least in found.items():
+                for what, seconds_here in found.items():
                     if what not in ("clock", "processor"):
                         name = f"{what}, {count} device{'s' * (count > 1)}, seconds"
-                        facts[name] = min(least, facts.get(name, least))
+                        facts[name] = min(seconds_here, facts.get(name, seconds_here))
     for name in [n for n in facts if "1 device," in n]:
         what = name.partition(", 1 device")[0]
         facts[f"{what}, gain of the second device"] = facts[name] / facts[f"{what}, 2 devices, seconds"]
@@ -40,25 +38,16 @@ def work(count: int, seconds: float, starts: int, recordings: int) -> None:
     jax.config.update("jax_num_cpu_devices", count)
     from speed import filters, fits
     from speed.machine import smooth
+    from speed.rounds import least
 
     several = [fits.recording(seconds, seed) for seed in range(recordings)]
     joint = smooth(p=fits.start(0.3, 1))
     sweep = filters.sweep(round(1000 * seconds))
     found = {
-        "2000 pairs of step sizes": _least(sweep),
-        f"{starts} starts": _least(
-            lambda: rf.many_starts(smooth(), several[0], starts=starts, short_seconds=None)
-        ),
-        f"a fit of {recordings} recordings": _least(lambda: rf.fit(joint, several)),
+        "2000 pairs of step sizes": least(sweep, 3)[0],
+        f"{starts} starts": least(
+            lambda: rf.many_starts(smooth(), several[0], starts=starts, short_seconds=None), 3
+        )[0],
+        f"a fit of {recordings} recordings": least(lambda: rf.fit(joint, several), 3)[0],
     }
     print(json.dumps(found))
-
-
-def _least(run: Callable[[], object]) -> float:
-    """Seconds by the clock, after compiling."""
-    times = []
-    for _ in range(4):
-        began = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - began)
-    return min(times[1:])

@@ -6,8 +6,6 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from rotflex_jax import forward_regression, many_starts, simulate
 from rotflex_jax.basis import Delays, Volterra
 from speed.fits import recording, start
 from speed.machine import MOVED, smooth
+from speed.rounds import least
 
 PEERS = ("jax-sysid==1.1.0", "sysidentpy==0.9.0")
 
@@ -33,8 +32,8 @@ def others(seconds: float) -> dict[str, float]:
             capture_output=True,
             text=True,
         ).stdout
-    fit_seconds, fit = _timed(lambda: many_starts(smooth(p=p0), r, starts=1, short_seconds=None), visits=20)
-    chosen_seconds, chosen = _timed(
+    fit_seconds, fit = least(lambda: many_starts(smooth(p=p0), r, starts=1, short_seconds=None), visits=20)
+    chosen_seconds, chosen = least(
         lambda: forward_regression(Volterra(Delays(20)), r, "alpha", terms=10), visits=5
     )
     error = (simulate(fit.model.mechanism, r.u, r.Ts) - r.y) / (0.01 * np.std(r.y, axis=0))
@@ -62,7 +61,7 @@ def _sindy(r: Any, degree: int) -> float:
         )
         return model.fit(states, t=r.Ts, u=r.u)
 
-    return _timed(regress, visits=5)[0]
+    return least(regress, visits=5)[0]
 
 
 def _environment() -> str:
@@ -74,13 +73,3 @@ def _environment() -> str:
         subprocess.run([python, "-m", "pip", "install", "--quiet", *PEERS], check=True)
         (folder / "complete").touch()
     return str(python)
-
-
-def _timed(run: Callable[[], Any], visits: int) -> tuple[float, Any]:
-    """Least seconds by the clock, compiling apart, and the result."""
-    times, found = [], run()
-    for _ in range(visits):
-        began = time.perf_counter()
-        found = run()
-        times.append(time.perf_counter() - began)
-    return min(times), found

@@ -106,13 +106,11 @@ class Given(NamedTuple):
 def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
     """Sums over all recordings, by the M moved coordinates."""
 
-    def every(rows: Any, scale: jax.Array) -> Sums:
-        structure, solver = moved.coordinates.structure, moved.solver
-        one = lambda r: normal_equations(structure, solver, r[0], r[1], Samples(*r[2]), scale)  # noqa: E731
-        return jax.lax.map(one, rows)
+    def one(numbers: Numbers, ways: Ways, samples: Samples, scale: jax.Array) -> Sums:
+        structure = moved.coordinates.structure
+        return normal_equations(structure, moved.solver, numbers, ways, samples, scale)
 
-    rows = (*moved.each(flat, given.gates, given.K), tuple(given.data))
-    found = spread(every, moved.mesh)(rows, given.scale)
+    found = _each_recording(one, moved, flat, given)
     M, places = len(moved.index), jnp.asarray(moved.places)
     g = jnp.zeros(M, flat.dtype).at[places].add(found.g)
     H = jnp.zeros((M, M), flat.dtype).at[places[:, :, None], places[:, None, :]].add(found.H)
@@ -123,16 +121,22 @@ def sums(moved: Moved, flat: jax.Array, given: Given) -> Sums:
 def residuals_and_slopes(moved: Moved, flat: jax.Array, given: Given) -> tuple[jax.Array, jax.Array]:
     """Scaled errors (R, N, C) and their slopes by what each recording moves (R, N, C, D)."""
 
-    def one(r: Any, scale: jax.Array) -> tuple[jax.Array, jax.Array]:
-        numbers, ways, samples = r
-        structure = moved.coordinates.structure
-        y_hat, J = outputs_with_slopes(structure, moved.solver, numbers, ways, Samples(*samples))
-        seen = samples[2][:, None] > 0
-        e = jnp.where(seen, (samples[1] - y_hat) / scale[None], 0.0)
+    def one(numbers: Numbers, ways: Ways, samples: Samples, scale: jax.Array) -> tuple[jax.Array, jax.Array]:
+        y_hat, J = outputs_with_slopes(moved.coordinates.structure, moved.solver, numbers, ways, samples)
+        seen = samples.seen[:, None] > 0
+        e = jnp.where(seen, (samples.y - y_hat) / scale[None], 0.0)
         return e, jnp.where(seen[..., None], -J / scale[None, :, None], 0.0)
 
+    return _each_recording(one, moved, flat, given)
+
+
+def _each_recording(one: Callable[..., Any], moved: Moved, flat: jax.Array, given: Given) -> Any:
+    """`one` of the numbers, directions, samples and scale of each recording, along a leading axis."""
+
+    def every(rows: Any, scale: jax.Array) -> Any:
+        return jax.lax.map(lambda r: one(r[0], r[1], Samples(*r[2]), scale), rows)
+
     rows = (*moved.each(flat, given.gates, given.K), tuple(given.data))
-    every = lambda rows, scale: jax.lax.map(lambda r: one(r, scale), rows)  # noqa: E731
     return spread(every, moved.mesh)(rows, given.scale)
 
 

@@ -138,8 +138,9 @@ def many_starts(
     x0 = np.broadcast_to(first_states(model, listed), (starts, len(listed), 2 * len(m.coordinates)))
     noise = sensor_noise(listed, model)
     say = progress or (lambda _: None)
-    common = {"model": model, "free": free, "noise": noise, "most": max_steps, "say": say}
-    stage = functools.partial(_stage, mesh=mesh_of(devices), **common)
+    stage = functools.partial(
+        _stage, model=model, free=free, noise=noise, most=max_steps, mesh=mesh_of(devices), say=say
+    )
     short = _beginnings(listed, short_seconds)
     if short is not None:
         found = stage(z, x0, short, ROUGHLY, f"{starts} starts, beginnings")
