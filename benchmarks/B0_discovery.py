@@ -85,7 +85,7 @@ def key(job: Job) -> str:
 
 def prepare() -> None:
     """Settings of a process, ahead of JAX."""
-    from rotflex_jax.fastloops import enable_fast_loops
+    from rotflex_jax.runtime.xla import enable_fast_loops
 
     enable_fast_loops()
 

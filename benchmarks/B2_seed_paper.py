@@ -80,7 +80,7 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     """Compute what is missing, save after each table, print what agrees."""
     a = arguments()
-    from rotflex_jax.fastloops import enable_fast_loops
+    from rotflex_jax.runtime.xla import enable_fast_loops
 
     enable_fast_loops()
     from B0_discovery import provenance, save

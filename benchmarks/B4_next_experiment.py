@@ -28,10 +28,10 @@ rf.enable_compilation_cache()
 
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.experiment import Experiment, Limits, next_experiment
-from rotflex_jax.experiment.contest import other_shapes
-from rotflex_jax.experiment.hypotheses import Hypothesis, hypothesis
-from rotflex_jax.experiment.imitation import best_imitation
-from rotflex_jax.experiment.menu import standard_inputs
+from rotflex_jax.experiment.discrimination import starts_with_other_shapes
+from rotflex_jax.experiment.rival_fit import best_rival_fit
+from rotflex_jax.experiment.rival_model import RivalModel, rival_model
+from rotflex_jax.experiment.standard_inputs import standard_inputs
 
 TS, SECONDS = 0.002, 20.0
 LIMITS = Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
@@ -62,16 +62,16 @@ def recorded(truth: tuple, numbers: dict, seed: int, played: np.ndarray | None =
     return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena")
 
 
-def evidence(h: Hypothesis, rec: rf.Recording, noise: np.ndarray) -> tuple[float, bool]:
+def evidence(rival: RivalModel, rec: rf.Recording, noise: np.ndarray) -> tuple[float, bool]:
     """Log-likelihood of a recording less half of BIC's penalty [nat], and whether the fit converged.
 
     Gaussian, the deviation of each channel re-estimated, constants left out. First state, offset, bias and
     every number of the machine are fitted to this recording, from several shapes of the effect.
     """
-    found = best_imitation(h, rec.u, rec.y, TS, [h.start, *other_shapes(h)])
-    errors = np.mean(np.square(found.remainder * noise), axis=0)
+    found = best_rival_fit(rival, rec.u, rec.y, TS, [rival.start, *starts_with_other_shapes(rival)])
+    errors = np.mean(np.square(found.residuals * noise), axis=0)
     fit = -0.5 * rec.N * float(np.sum(np.log(errors)))
-    return fit - 0.5 * len(found.numbers) * float(np.log(rec.y.size)), found.converged
+    return fit - 0.5 * len(found.unknowns) * float(np.log(rec.y.size)), found.converged
 
 
 def margin(e: Experiment, model: rf.Model, truth: tuple, rival: tuple, rec: rf.Recording) -> dict:
@@ -80,7 +80,7 @@ def margin(e: Experiment, model: rf.Model, truth: tuple, rival: tuple, rec: rf.R
     found = []
     for me, other in ((truth, rival), (rival, truth)):
         effect = CATALOG[me[0]](at=me[1], **e.numbers["@".join(me)])
-        found.append(evidence(hypothesis(model, effect, other, {}, noise, TS), rec, noise))
+        found.append(evidence(rival_model(model, effect, other, {}, noise, TS), rec, noise))
     (mine, one), (its, two) = found
     return {"margin": mine - its, "converged": one and two}
 

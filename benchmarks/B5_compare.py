@@ -21,8 +21,8 @@ from collections.abc import Callable
 
 import rotflex_jax as rf
 from rotflex_jax.compare import METHODS, QUICK, Comparison
-from rotflex_jax.report.comparison_figures import overlays, ranks
-from rotflex_jax.report.page import save
+from rotflex_jax.compare.figures import overlays, ranks
+from rotflex_jax.text.templates import write_files
 
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE / "results" / "B5"
@@ -105,7 +105,7 @@ def draw(name: str) -> None:
         elapsed_s=sum(part.elapsed_s for part in parts),
     )
     text = json.dumps(result.to_dict(), indent=1) + "\n"
-    save(RESULTS, {f"{name}.json": text, f"{name}.md": result.to_markdown()})
+    write_files(RESULTS, {f"{name}.json": text, f"{name}.md": result.to_markdown()})
     for label, figure in (("ranks", ranks(result)), ("overlays", overlays(result))):
         figure.savefig(RESULTS / f"{name}_{label}.png", dpi=80)
     result.report(KEPT / name)
@@ -160,7 +160,7 @@ def main() -> None:
             print(f"{name}: left out, {error}", flush=True)
     for name in sets:
         draw(name)
-    save(RESULTS, {"summary.md": summary()})
+    write_files(RESULTS, {"summary.md": summary()})
 
 
 if __name__ == "__main__":

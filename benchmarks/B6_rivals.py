@@ -58,8 +58,8 @@ def one(job: Job) -> dict[str, Any]:
     from arena.rivals import RIVALS
     from arena.scoring import scored, visible
     from arena.trial import SPLIT, recording, windows_error
-    from rotflex_jax.discover.room import make_room
     from rotflex_jax.effects import CATALOG
+    from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 
     row: dict[str, Any] = dict(job)
     try:
@@ -73,7 +73,7 @@ def one(job: Job) -> dict[str, Any]:
         row.update(scored(wanted, answer.rounds, [[] for _ in answer.rounds], verdict))
         row.update(wanted=[list(p) for p in wanted], verdict=verdict, note=answer.note)
         row["rounds"] = [{"effect": e, "port": p, "equivalent": []} for e, p in answer.rounds]
-        make_room()
+        clear_compilation_caches()
         model = rf.joints.paper()
         for name, port in answer.rounds:
             model = model + CATALOG[name](at=port)

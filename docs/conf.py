@@ -48,6 +48,7 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False  # sizes of arrays would be read as markup
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
@@ -60,6 +61,6 @@ copybutton_exclude = ".linenos, .gp, .go"
 # Types of other packages, and of annotations that are no names: there is nothing here to link to.
 nitpick_ignore_regex = [
     ("py:.*", r"(numpy|jax|jaxlib|jaxtyping|collections|pathlib|os|rich|matplotlib|typing|pandas)\b.*"),
-    ("py:.*", r"ndarray|Figure|Minimiser|dict.*|tuple.*"),
-    ("py:class", r"'[A-Za-z0-9 -]*'|[A-Z]( [A-Z])*"),  # sizes of arrays
+    ("py:.*", r"ndarray|Figure|Minimiser|EffectClass|EffectType|.*\.Effect(Class|Type)|dict.*|tuple.*"),
+    ("py:class", r"'[A-Za-z0-9_*. -]*'?|[A-Z]( [A-Z])*"),  # sizes of arrays
 ]

@@ -24,7 +24,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import rotflex_jax as rf
-from rotflex_jax.discover.looks import missing_acceleration
+from rotflex_jax.discover.conditions import missing_acceleration
 from rotflex_jax.report import figures
 
 # Two settings of JAX that make this notebook several times quicker. Models run in double precision

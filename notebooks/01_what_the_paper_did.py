@@ -25,8 +25,8 @@ import numpy as np
 import rotflex_jax as rf
 from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.fit import least_squares
-from rotflex_jax.reproduce import Settings, reproduce, signals
-from rotflex_jax.reproduce.figures import pictures
+from rotflex_jax.reproduce import Settings, records, reproduce
+from rotflex_jax.reproduce.figures import FIGURES
 from rotflex_jax.reproduce.plants import SCENARIOS, plant, response
 
 # Models run in double precision by themselves; seeds are settings.
@@ -55,7 +55,7 @@ for row in Settings.table():
 settings = Settings()
 print(SCENARIOS[settings.scenario].about)
 result = reproduce(settings)
-drawn = pictures(result)
+drawn = FIGURES.pictures(result)
 
 # %%
 drawn["figure_07"].figure
@@ -92,7 +92,7 @@ drawn["figure_09"].figure
 
 # %%
 basis = Volterra(Delays(settings.memory))
-u = signals.filtered_noise(settings, 2000, 7)
+u = records.filtered_noise(settings, 2000, 7)
 quadratic = {}
 for name in ("S1", "S6"):
     mirrored = [
@@ -141,7 +141,7 @@ drawn["trap"].figure
 # input. They agree with those from the data, and switching effects off one by one says who makes what.
 
 # %%
-print(result.bridge)
+print(result.kernels)
 drawn["kernels"].figure
 
 # %% [markdown]
@@ -170,7 +170,7 @@ assert np.argmax([r.pulses[1] for r in result.rows]) == 0
 kernels = lms.series.kernels()
 plateau = kernels[0] + 2 * np.sum(kernels[1]) + 4 * np.sum(kernels[2])
 assert np.allclose(lms.pulse_hat[0][9:15], plateau)  # five samples after the pulse began
-assert result.trap.online < result.trap.least_squares < 1 < result.trap.frozen
-agreement = result.bridge.physics.against(result.bridge.data)
+assert result.short_memory.online < result.short_memory.least_squares < 1 < result.short_memory.frozen
+agreement = result.kernels.physics.against(result.kernels.data)
 assert max(agreement.relative) < 0.03
 print("All claims hold.")

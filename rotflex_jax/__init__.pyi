@@ -8,6 +8,7 @@ from . import (
     kernels as kernels,
     metrics as metrics,
 )
+from .batch import Fleet as Fleet, fleet as fleet
 from .compare import Comparison as Comparison, compare as compare
 from .data import load as load
 from .discover import (
@@ -17,14 +18,10 @@ from .discover import (
     learn_torque as learn_torque,
     locate as locate,
 )
-from .display import explore as explore, live as live
 from .errors import InputError as InputError
 from .experiment import Experiment as Experiment, Limits as Limits, next_experiment as next_experiment
-from .fastloops import (
-    enable_compilation_cache as enable_compilation_cache,
-    enable_fast_loops as enable_fast_loops,
-)
 from .fit import (
+    Fit as Fit,
     ManyStarts as ManyStarts,
     SeriesFit as SeriesFit,
     fit as fit,
@@ -32,8 +29,6 @@ from .fit import (
     least_squares as least_squares,
     many_starts as many_starts,
 )
-from .fit.fitted import Fit as Fit
-from .fleet import Fleet as Fleet, fleet as fleet
 from .latent import LatentTorque as LatentTorque, latent_torque as latent_torque
 from .mechanism import (
     Exponential as Exponential,
@@ -42,9 +37,14 @@ from .mechanism import (
     linearise as linearise,
     simulate as simulate,
 )
-from .model import Model as Model
+from .models.model import Model as Model
+from .models.series import Series as Series
+from .notebook import explore as explore, live as live
 from .recording import Recording as Recording
-from .series import Series as Series
+from .runtime.xla import (
+    enable_compilation_cache as enable_compilation_cache,
+    enable_fast_loops as enable_fast_loops,
+)
 
 __version__: str
 __all__: list[str]

@@ -1,11 +1,11 @@
-"""The one error a user meets on bad input, and the import of what is optional."""
+"""The error for bad input, and the import of optional packages."""
 
 import importlib
 from types import ModuleType
 
 
 class InputError(ValueError):
-    """Bad input, told in one sentence: what was given, what is needed, what to do.
+    """Bad input, described in one sentence: what was given, what is needed, what to do.
 
     >>> raise InputError("Argument `Ts` must be positive [s], but is 0.")
     Traceback (most recent call last):
@@ -19,7 +19,7 @@ def optional(module: str, purpose: str) -> ModuleType:
 
     Args:
         module: name of the module.
-        purpose: what the user wanted, to begin the sentence of the error.
+        purpose: what the user wanted; the first words of the error.
 
     Returns:
         The imported module.
@@ -27,10 +27,10 @@ def optional(module: str, purpose: str) -> ModuleType:
     Raises:
         InputError: the package is not installed.
 
-    >>> optional("no_such_package", "Reading a stone tablet")
+    >>> optional("no_such_package", "Reading a spreadsheet")
     Traceback (most recent call last):
         ...
-    rotflex_jax.errors.InputError: Reading a stone tablet needs the package no_such_package, \
+    rotflex_jax.errors.InputError: Reading a spreadsheet needs the package no_such_package, \
 which is not installed; install it with `pip install "rotflex_jax[all]"`.
     """
     try:

@@ -1,7 +1,7 @@
-"""How far a model is from the measurement, per channel, after the samples that it may see.
+"""Errors of a model, per channel, after the samples that it may see.
 
-Every metric takes either a recording and what a model made of it, and gives one number per channel
-name, or two arrays, time first, and gives one number per column.
+Every metric takes either a recording and the output of a model, and gives one number per channel name, or
+two arrays, time first, and gives one number per column.
 
 >>> import numpy as np
 >>> y = np.array([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]])
@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from jaxtyping import Bool, Int, Real
 
 from rotflex_jax.errors import InputError
 
@@ -23,13 +23,14 @@ class Measured(Protocol):
     """What a metric needs of a recording."""
 
     @property
-    def y(self) -> np.ndarray: ...  # noqa: D102
+    def y(self) -> Real[np.ndarray, "N C"]: ...  # noqa: D102
     @property
     def channels(self) -> tuple[str, ...]: ...  # noqa: D102
     @property
     def n_init(self) -> int: ...  # noqa: D102
 
 
+@runtime_checkable
 class Sampled(Protocol):
     """What the layout of windows depends on."""
 
@@ -41,10 +42,14 @@ class Sampled(Protocol):
     def n_init(self) -> int: ...  # noqa: D102
 
 
+Outputs = Real[Any, "N *C"] | Sequence[Any]
+"""An array of NumPy or JAX, time first, or a list."""
+
+
 def _score(
     formula: Callable[[np.ndarray, np.ndarray], Any],
-    y: Measured | ArrayLike,
-    y_hat: ArrayLike,
+    y: Measured | Outputs,
+    y_hat: Outputs,
     n_init: int | None,
 ) -> Any:
     """Applies `formula(y, e)`, with `e = y - y_hat`, to the samples from `n_init` on."""
@@ -83,7 +88,7 @@ def _relative(y: np.ndarray, e: np.ndarray) -> Any:
     return _ratio(_rms(y, e), np.std(y, axis=0))
 
 
-def rmse(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+def rmse(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> Any:
     """Root mean square error.
 
     rmse = sqrt(mean(e^2)),  e = y - y_hat
@@ -105,7 +110,7 @@ def rmse(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -
     return _score(_rms, y, y_hat, n_init)
 
 
-def nrmse(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+def nrmse(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> Any:
     """Root mean square error relative to the standard deviation of the measurement [-].
 
     nrmse = norm(e) / norm(y - mean(y))
@@ -119,7 +124,7 @@ def nrmse(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) 
     return _score(_relative, y, y_hat, n_init)
 
 
-def fit_percent(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+def fit_percent(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> Any:
     """Share of the measurement that the model explains [%].
 
     fit = 100 (1 - norm(e) / norm(y - mean(y)))
@@ -133,7 +138,7 @@ def fit_percent(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = 
     return _score(lambda y, e: 100.0 * (1.0 - _relative(y, e)), y, y_hat, n_init)
 
 
-def vaf(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+def vaf(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> Any:
     """Variance accounted for [%].
 
     vaf = 100 (1 - var(e) / var(y))
@@ -145,13 +150,13 @@ def vaf(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) ->
     100.0
     """
 
-    def formula(y: np.ndarray, e: np.ndarray) -> Any:
+    def formula(y: Outputs, e: Outputs) -> Any:
         return 100.0 * (1.0 - _ratio(np.var(e, axis=0), np.var(y, axis=0)))
 
     return _score(formula, y, y_hat, n_init)
 
 
-def mae(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+def mae(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> Any:
     """Mean absolute error [unit of the channel].
 
     mae = mean(abs(e))
@@ -164,7 +169,7 @@ def mae(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) ->
     return _score(lambda y, e: np.mean(np.abs(e), axis=0), y, y_hat, n_init)
 
 
-def max_error(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = None) -> Any:
+def max_error(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> Any:
     """Largest absolute error [unit of the channel].
 
     max_error = max(abs(e))
@@ -177,7 +182,7 @@ def max_error(y: Measured | ArrayLike, y_hat: ArrayLike, n_init: int | None = No
     return _score(lambda y, e: np.max(np.abs(e), axis=0), y, y_hat, n_init)
 
 
-def window_starts(recording: Sampled, seconds: float) -> tuple[np.ndarray, int]:
+def window_starts(recording: Sampled, seconds: float) -> tuple[Int[np.ndarray, " W"], int]:
     """First samples of the windows of a recording, and the longest window's length [samples].
 
     Args:
@@ -191,8 +196,8 @@ def window_starts(recording: Sampled, seconds: float) -> tuple[np.ndarray, int]:
     return starts, max(width, N - int(starts[-1]))
 
 
-def counted(recording: Sampled, seconds: float) -> np.ndarray:
-    """Which samples (N,) an error in windows counts: not the first `n_init` of each, which a run may see."""
+def counted(recording: Sampled, seconds: float) -> Bool[np.ndarray, " N"]:
+    """Which samples count in an error over windows: not the first `n_init` of each, which a run may see."""
     starts, _ = window_starts(recording, seconds)
     counts = np.ones(recording.N, bool)
     counts[(starts[:, None] + np.arange(recording.n_init)).ravel()] = False
@@ -201,18 +206,18 @@ def counted(recording: Sampled, seconds: float) -> np.ndarray:
 
 def windowed_rmse(
     recordings: Sequence[Sampled],
-    measured: Sequence[np.ndarray],
-    simulated: Sequence[np.ndarray],
+    measured: Sequence[Real[np.ndarray, "_ C"]],
+    simulated: Sequence[Real[np.ndarray, "_ C"]],
     seconds: float,
-) -> np.ndarray:
-    """Root mean square error (C,) of free runs that start anew every few seconds, of all recordings together.
+) -> Real[np.ndarray, " C"]:
+    """Root mean square error of free runs that start again every few seconds, over all recordings together.
 
-    The one definition for searches, comparisons, reports and sliders. A run is as `simulate_windows` of a
-    model makes it: anew are the positions and speeds, not what the voltage has been before.
+    A run is that of `simulate_windows` of a model: every window starts at its own positions and speeds, but
+    with the voltage that came before it.
 
     Args:
-        recordings: They lay out the windows.
-        measured: Their outputs (N, C), in the order of the model [unit of the channel].
+        recordings: They determine the windows.
+        measured: Their outputs, in the order of the model [unit of the channel].
         simulated: The runs, same shapes.
         seconds: Length of the windows [s].
 

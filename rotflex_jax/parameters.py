@@ -1,7 +1,7 @@
-"""What a parameter is: a number with a unit, bounds and a typical size, and how a fit moves it.
+"""Parameters: numbers with a unit, bounds and a typical size, and the coordinates in which they are fitted.
 
-An effect declares its parameters with `parameter(...)`; a fit moves unconstrained coordinates `z`
-and `Transform` carries them to physical values, so that a bound can never be left.
+An effect declares its parameters with `parameter(...)`; a fit varies unconstrained coordinates `z`, and
+`Transform` maps them to physical values, so that no bound is ever crossed.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
+from jaxtyping import Array, Bool, Float, Real
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Specification:
 
     Attributes:
         unit: SI unit as people write it, "" where there is none.
-        typical: Size [unit] at which the parameter is usually met; sets the scale of a fit.
+        typical: Usual size [unit]; sets the scale of a fit.
         lower: Values below are impossible [unit].
         upper: Values above are impossible [unit].
         physical: Range [unit] a healthy machine lies in; an estimate outside is flagged, not forbidden.
@@ -46,7 +47,7 @@ def specifications(owner: Any) -> dict[str, Specification]:
     """Name -> `Specification` of every parameter of a dataclass (class or instance), in order.
 
     A parameter whose value is None belongs to a part that the instance lacks and is left out. An instance
-    with as many parameters as its shape asks for tells them by a method `own_specifications`.
+    whose number of parameters depends on its shape has a method `own_specifications`.
     """
     own = getattr(owner, "own_specifications", None)
     if own and not isinstance(owner, type):
@@ -61,14 +62,13 @@ def specifications(owner: Any) -> dict[str, Specification]:
 class Transform:
     """Unconstrained `z` <-> physical `p`, elementwise, by the bounds of each parameter.
 
-    One with a lower bound moves as `p = lower + exp(z)`, with an upper bound as `p = upper - exp(z)`, with
-    both on a logistic curve, one that is free as `p = typical z`. A step of one in `z` is always a
-    sizeable step in `p`.
+    With a lower bound `p = lower + exp(z)`, with an upper bound `p = upper - exp(z)`, with both a logistic
+    curve, without bounds `p = typical z`. A step of one in `z` is always a sizeable step in `p`.
     """
 
-    lower: np.ndarray
-    upper: np.ndarray
-    typical: np.ndarray
+    lower: Float[np.ndarray, " P"]
+    upper: Float[np.ndarray, " P"]
+    typical: Float[np.ndarray, " P"]
 
     @classmethod
     def of(cls, specs: Sequence[Specification]) -> "Transform":
@@ -76,13 +76,17 @@ class Transform:
         columns = ("lower", "upper", "typical")
         return cls(*(np.array([getattr(s, c) for s in specs], dtype=float) for c in columns))
 
-    def _kinds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Which have one bound, which have two, the bound (of two the lower), and the way away from it."""
+    def _kinds(
+        self,
+    ) -> tuple[
+        Bool[np.ndarray, " P"], Bool[np.ndarray, " P"], Float[np.ndarray, " P"], Float[np.ndarray, " P"]
+    ]:
+        """Which have one bound, which have two, the bound (of two the lower), and the direction inwards."""
         low, high = np.isfinite(self.lower), np.isfinite(self.upper)
         edge = np.where(low, self.lower, np.where(high, self.upper, 0.0))
         return low != high, low & high, edge, np.where(low, 1.0, -1.0)
 
-    def constrain(self, z: jax.Array) -> jax.Array:
+    def constrain(self, z: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
         """Physical values [declared units] of the unconstrained coordinates."""
         single, boxed, edge, way = self._kinds()
         low, sign = jnp.asarray(edge, z.dtype), jnp.asarray(way, z.dtype)
@@ -92,8 +96,10 @@ class Transform:
         p = jnp.where(jnp.asarray(single), low + sign * grown, z * jnp.asarray(self.typical, z.dtype))
         return jnp.where(jnp.asarray(boxed), low + span * jax.nn.sigmoid(z), p)
 
-    def physical(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Outside of traced code: `constrain(z)` for z of shape (..., P), and its derivative."""
+    def physical(
+        self, z: Float[np.ndarray, "*batch P"]
+    ) -> tuple[Float[np.ndarray, "*batch P"], Float[np.ndarray, "*batch P"]]:
+        """Outside traced code: `constrain(z)` and its derivative."""
         single, boxed, edge, way = self._kinds()
         span = np.where(boxed, self.upper - self.lower, 1.0)
         grown = way * np.exp(np.minimum(np.where(single, z, 0.0), 60.0))
@@ -102,7 +108,7 @@ class Transform:
         slope = np.where(single, grown, self.typical)
         return np.where(boxed, edge + span * share, p), np.where(boxed, span * share * (1 - share), slope)
 
-    def unconstrain(self, p: np.ndarray) -> np.ndarray:
+    def unconstrain(self, p: Real[np.ndarray, "*batch P"]) -> Float[np.ndarray, "*batch P"]:
         """Unconstrained coordinates of physical values; a value on its bound starts just inside."""
         p = np.asarray(p, dtype=float)
         single, boxed, edge, way = self._kinds()
@@ -116,7 +122,7 @@ class Transform:
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """One fitted (or trusted) parameter.
+    """One fitted or trusted parameter.
 
     Attributes:
         name: Full name, `port.effect.parameter`.
@@ -138,7 +144,7 @@ class Estimate:
 
     @classmethod
     def of(cls, name: str, value: float, std: float, spec: Specification, note: str = "") -> "Estimate":
-        """A fitted parameter with its 95 % interval and what its numbers say of themselves."""
+        """A fitted parameter with its 95 % interval and remarks on its value."""
         low, high = spec.physical
         remarks = [note] if note else []
         if not low <= value <= high:

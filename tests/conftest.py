@@ -1,16 +1,20 @@
-"""A strict JAX session, and the measured recordings where they are at hand."""
+"""A strict JAX session, types checked at run time, and the measured recordings where they are available."""
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
+import jaxtyping
 import pytest
 
-from rotflex_jax.data.datasets import DATASETS, FOLDER_VARIABLE, load_dataset
-from rotflex_jax.discover.room import make_room
-from rotflex_jax.fastloops import enable_compilation_cache
+from rotflex_jax.data.datasets import DATASETS, FOLDER_VARIABLE, find, load_dataset
+from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
+from rotflex_jax.runtime.xla import enable_compilation_cache
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -23,9 +27,9 @@ if BESIDE.is_dir():
 
 
 @pytest.fixture(autouse=True, scope="module")
-def room() -> Iterator[None]:
-    """A process that runs all tests would hold more compiled code than the system has room for."""
-    make_room()
+def memory_maps() -> Iterator[None]:
+    """A process that runs all tests would hold more compiled code than the system allows."""
+    clear_compilation_caches()
     yield
 
 
@@ -35,9 +39,31 @@ def measured() -> Callable[[str], list[Recording]]:
 
     def load(name: str) -> list[Recording]:
         folder = Path(os.environ.get(FOLDER_VARIABLE) or os.devnull)
-        missing = [file.name for file in DATASETS[name].files if not (folder / file.name).is_file()]
+        missing = [file.name for file in DATASETS[name].files if not find(file, folder)]
         if missing:
             pytest.skip(f"{FOLDER_VARIABLE} names no folder with {missing[0]}")
         return load_dataset(name)
 
     return load
+
+
+_raises = pytest.raises
+
+
+@contextlib.contextmanager
+def _raises_unchecked(*arguments: Any, **options: Any) -> Iterator[Any]:
+    """`pytest.raises`, without the check of types where the package itself refuses wrong arguments."""
+    refused = arguments[:1] == (InputError,)
+    try:
+        jaxtyping.config.update("jaxtyping_disable", refused)
+        with _raises(*arguments, **options) as caught:
+            yield caught
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def _raises_or_call(*arguments: Any, **options: Any) -> Any:
+    return _raises(*arguments, **options) if len(arguments) > 1 else _raises_unchecked(*arguments, **options)
+
+
+pytest.raises = _raises_or_call

@@ -9,8 +9,8 @@ import numpy as np
 import optimistix
 
 import rotflex_jax as rf
-from rotflex_jax.devices import mesh_of, spread
-from rotflex_jax.fit import descent, marquardt
+from rotflex_jax.fit import many_starts, problem
+from rotflex_jax.runtime.xla import mesh_of, spread
 
 DOGLEG = optimistix.Dogleg(rtol=1e-9, atol=1e-9)
 
@@ -62,7 +62,7 @@ def main() -> None:
         at_work.append(mesh.size if mesh else 1)
         return spread(function, mesh)
 
-    descent.spread = marquardt.spread = watched
+    problem.spread = many_starts.spread = watched
     recordings = recorded()
     one = fitted(recordings, jax.devices()[:1])
     at_work.clear()

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax.adaptive import LMS
-from rotflex_jax.adaptive.grid import grid
-from rotflex_jax.adaptive.judged import values_at
+from rotflex_jax.adaptive.objectives import values_at
+from rotflex_jax.adaptive.tuning import grid
 from rotflex_jax.basis import Delays, Volterra
-from rotflex_jax.devices import mesh_of, spread
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import mesh_of, spread
 
 # Neither two, four nor eight devices divide it.
 ROWS = 11

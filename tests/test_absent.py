@@ -12,12 +12,16 @@ import pytest
 import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, Mechanism, kalman_gains, predictor_run, simulate
-from rotflex_jax.mechanism.absent import Numbers, Samples, absent_slopes, run_slopes
-from rotflex_jax.mechanism.assembly import Layout, driven_voltage, rest_state
+from rotflex_jax.mechanism.assembly import Layout, motor_voltage, rest_state
 from rotflex_jax.mechanism.roles import search_places
-from rotflex_jax.mechanism.sensors import read_outputs
-from rotflex_jax.mechanism.simulate import PredictorStep
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.sensitivities import (
+    RecordingSamples,
+    RunParameters,
+    inactive_sensitivities,
+    predictor_jacobians,
+)
+from rotflex_jax.mechanism.simulate import PredictorStep, read_outputs
+from rotflex_jax.runtime.xla import double_precision
 
 Ts, N = 0.004, 150
 SOLVER = Exponential(passes=2)
@@ -58,8 +62,8 @@ class Case:
     baseline: Mechanism
     full: Mechanism
     present: list[int]
-    numbers: Numbers
-    samples: Samples
+    numbers: RunParameters
+    samples: RecordingSamples
     names: list[str]
     dvalues: np.ndarray
     dgates: np.ndarray
@@ -69,7 +73,7 @@ class Case:
         structure, n, s = self.full.structure, self.numbers, self.samples
         step, mechanism = PredictorStep(structure, SOLVER), structure.with_values(values)
         constants = (SOLVER.prepare(structure, values, gates, s.Ts), n.K)
-        inputs = (driven_voltage(mechanism, gates, s.u, s.Ts), s.y, s.seen)
+        inputs = (motor_voltage(mechanism, gates, s.u, s.Ts), s.y, s.seen)
         X = jax.lax.scan(lambda x, w: (step(x, w, constants), x), n.x0, inputs)[1]
         return read_outputs(mechanism, gates, X.T).T
 
@@ -117,8 +121,8 @@ def case_of(case: str) -> Case:
     x0[:4] = [0.1, 0.01, 0.2, -0.1]
     gates = [1.0 if i < first or e.amplitudes else 0.0 for i, e in enumerate(full.effects)]
     with double_precision():
-        numbers = Numbers(*map(jnp.asarray, (full.values, np.array(gates), x0, K)))
-        samples = Samples(*map(jnp.asarray, (u, y, 1.0 * (rng.random(N) < 0.9), Ts)))
+        numbers = RunParameters(*map(jnp.asarray, (full.values, np.array(gates), x0, K)))
+        samples = RecordingSamples(*map(jnp.asarray, (u, y, 1.0 * (rng.random(N) < 0.9), Ts)))
     return Case(baseline, full, present, numbers, samples, listed, np.array(dvalues), np.array(dgates))
 
 
@@ -129,11 +133,11 @@ def found(case: str) -> np.ndarray:
     with double_precision():
         present = jnp.array(c.present)
         values, gates = jnp.asarray(c.baseline.values), jnp.ones(len(c.baseline.effects))
-        mine = Numbers(values, gates, c.numbers.x0[present], c.numbers.K[present])
-        slopes = jax.jit(run_slopes, static_argnums=(0, 1), compiler_options=ROUGH)
+        mine = RunParameters(values, gates, c.numbers.x0[present], c.numbers.K[present])
+        slopes = jax.jit(predictor_jacobians, static_argnums=(0, 1), compiler_options=ROUGH)
         A = slopes(c.baseline.structure, SOLVER, mine, c.samples)
         assert A.shape == (N, len(present), len(present))
-        along = jax.jit(absent_slopes, static_argnums=(0, 1), compiler_options=ROUGH)
+        along = jax.jit(inactive_sensitivities, static_argnums=(0, 1), compiler_options=ROUGH)
         ways = (jnp.asarray(c.dvalues), jnp.asarray(c.dgates))
         return np.asarray(along(c.full.structure, SOLVER, c.numbers, c.samples, present, A, *ways))
 

@@ -7,8 +7,8 @@ import pytest
 from adaptive_records import coloured, lags, noisy_record, volterra
 
 from rotflex_jax.adaptive import LMS, NLMS, RLS, AffineProjection, Kalman, fixed_point, run
-from rotflex_jax.adaptive.apa import solve
 from rotflex_jax.adaptive.filter import Weights
+from rotflex_jax.adaptive.lms import solve
 from rotflex_jax.errors import InputError
 
 

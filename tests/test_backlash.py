@@ -1,5 +1,7 @@
 """Play in the gear: closed forms, an event-driven solver, the arena's gear, and the score of a search."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,15 +13,12 @@ from arena import plant as arena
 from arena.laws import laws
 from arena.records import make_record
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.lanes import Bench
-from rotflex_jax.discover.refit import Judge
-from rotflex_jax.discover.scales import scales
-from rotflex_jax.discover.score import scores
-from rotflex_jax.discover.supermodel import build
-from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.score_test import scores
+from rotflex_jax.discover.supermodel import EffectLocation, build, scales
+from rotflex_jax.discover.whitening import Whitener
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.greybox import torque_scale
-from rotflex_jax.fit.residuals import stack
+from rotflex_jax.fit.dataset import prepare
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.mechanism import (
     Exponential,
@@ -30,12 +29,13 @@ from rotflex_jax.mechanism import (
     simulate,
     simulate_states,
 )
-from rotflex_jax.model import Model
+from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
-from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision
 
-PLACE, NOISE = ("backlash", "hub"), np.array([5.4e-4, 5.4e-4])
+PLACE, NOISE = EffectLocation("backlash", "hub"), np.array([5.4e-4, 5.4e-4])
 Ts, GAP, SHARE = 0.002, 0.0055, 0.7
 J, EMF, RESISTANCE = 0.002, 0.00767 * 70, 2.6
 GAIN = EMF / RESISTANCE  # torque per volt, and with EMF the loss per speed
@@ -284,34 +284,33 @@ def test_a_search_meets_play_at_its_size():
     )
     recording = Recording(u=made["u"], y=made["y"], Ts=made["Ts"], accept=("units",))
     model = Model(paper(hub_damping=0.004, joint_damping=0.003))
-    data = stack([recording], model)
-    torque = torque_scale(model.mechanism, data)
+    dataset = dataclasses.replace(prepare(model, [recording]), noise=NOISE)
     wanted = [(fx.Backlash, "hub"), (fx.Lag, "input"), (fx.Coulomb, "hub")]
-    s = build(model.mechanism, wanted, scales(model, [recording], torque))
+    s = build(model.mechanism, wanted, scales(model, [recording], dataset.torque_scale))
     gaps = [p[0][0] for p in s.candidates[PLACE].probes]
     np.testing.assert_allclose(np.diff(np.log2(sorted(gaps))), 1.0)
     assert min(gaps) < GAP / 10 and max(gaps) > 4 * GAP and min(abs(np.log2(g / GAP)) for g in gaps) > 0.1
 
-    judge = Judge(Bench(s, Exponential(), data), NOISE, torque, ("hub", "joint"))
+    problem = LikelihoodProblem.of(s, Exponential(), dataset, ("hub", "joint"))
     h = Hypothesis(
-        places=(),
+        locations=(),
         free=tuple(s.baseline_free),
         local=(),
         z=Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values),
-        own=np.zeros((1, 0)),
+        local_z=np.zeros((1, 0)),
         x0=np.zeros((1, 4)),
-        K=np.zeros((0,)),
+        K=np.zeros((1, Layout.of(s.mechanism.structure).size, 2)),
         process_noise={},
         whitener=Whitener(np.ones((2, 1)), np.diag(1 / NOISE)),
     )
-    h = judge.with_process_noise(h, {"hub": 0.0, "joint": 0.0})
-    off, on = (s.part(s.gates(places)).mechanism for places in ((), (PLACE,)))
-    gentle = s.probed(s.gates(()), [c for c in s.candidates.values() if not c.sudden]).mechanism
+    h = problem.with_process_noise(h, {"hub": 0.0, "joint": 0.0})
+    off, on = (s.active(s.gates(locations)).mechanism for locations in ((), (PLACE,)))
+    gentle = s.with_family(s.gates(()), [c for c in s.candidates.values() if not c.threshold]).mechanism
     assert not any(isinstance(e, fx.Gear) for e in (*off.effects, *gentle.effects))
     assert any(isinstance(e, fx.Gear) for e in on.effects)
-    assert h.seated(judge.bench, (PLACE,)).shape == (1, 6)
+    assert h.initial_state_for(s, (PLACE,)).shape == (1, 6)
 
-    best, *others = scores(judge, h)
-    assert best.place == PLACE and best.nats > 2 * max(o.nats for o in others) and best.excited
-    assert 1 / 2 < best.start[0] / GAP < 2
-    assert {o.place for o in others} == {("lag", "input"), ("coulomb", "hub")}
+    best, *others = scores(problem, h)
+    assert best.location == PLACE and best.nats > 2 * max(o.nats for o in others) and best.excited
+    assert 1 / 2 < best.start.values[0] / GAP < 2
+    assert {o.location for o in others} == {("lag", "input"), ("coulomb", "hub")}

@@ -189,7 +189,7 @@ def test_other_values_compile_nothing() -> None:
         (lambda: Volterra(Delays(2), 3).kernels(np.ones(10), 1000), "give a smaller `length`"),
         (lambda: Volterra(Delays(2)).weights({3: np.zeros((2, 2, 2))}), "kernel of degree 3 was given"),
         (lambda: Volterra(Delays(2)).weights({2: np.zeros((2, 3))}), "2 axes of one length"),
-        (lambda: Volterra(Delays(2)).weights({1: np.ones(3)}), "outside of what the bank spans by 58 %"),
+        (lambda: Volterra(Delays(2)).weights({1: np.ones(3)}), "outside the span of the bank by 58 %"),
         (lambda: Volterra(Delays(2)).step_sizes({1: 0.1}), "for the degrees 1, but the basis also has 0"),
     ],
 )

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from rotflex_jax.basis import Orthonormal, Volterra, minimum_nmse
 from rotflex_jax.errors import InputError
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 
 def noise(N: int, seed: int = 0) -> np.ndarray:
@@ -135,7 +135,7 @@ def test_a_gradient_goes_through_the_poles() -> None:
     ("make", "sentence"),
     [
         (lambda: Orthonormal(()), "must list finite numbers, at least one"),
-        (lambda: Orthonormal((1.0,)), "inside of the unit circle, but 1 has the modulus 1"),
+        (lambda: Orthonormal((1.0,)), "inside the unit circle, but 1 has the modulus 1"),
         (lambda: Orthonormal((0.9 + 0.9j, 0.9 - 0.9j)), "has the modulus 1.27"),
         (lambda: Orthonormal((0.5 + 0.1j,)), r"needs its conjugate, but 0\.5\+0\.1j has none"),
         (lambda: Orthonormal((0.5 + 0.1j, 0.5 + 0.1j)), "needs its conjugate"),

@@ -9,17 +9,16 @@ import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate, simulate_states
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.mechanism.blocks import BLOCK, WORTH
-from rotflex_jax.mechanism.linearise import linearise
-from rotflex_jax.mechanism.propagate import states
+from rotflex_jax.mechanism.linear import linearise
+from rotflex_jax.mechanism.scan import BLOCK_SAMPLES, BLOCKED_FROM_SAMPLES, states
 from rotflex_jax.mechanism.simulate import FreeStep
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 Ts = 0.002
 JOINT = paper(hub_damping=0.01, joint_damping=0.002, inductance=2e-4)
 
 
-@pytest.mark.parametrize("N", [WORTH, WORTH + BLOCK // 2 + 1])
+@pytest.mark.parametrize("N", [BLOCKED_FROM_SAMPLES, BLOCKED_FROM_SAMPLES + BLOCK_SAMPLES // 2 + 1])
 def test_a_long_run_is_the_recursion_of_the_matrix_exponential(N: int) -> None:
     u, x = np.random.default_rng(0).normal(size=N), np.array([0.1, -0.02, 0.5, 0.3, 0.05])
     E, B = linearise(JOINT).discretise(Ts)
@@ -32,7 +31,7 @@ def test_a_long_run_is_the_recursion_of_the_matrix_exponential(N: int) -> None:
 
 @pytest.mark.parametrize("solver", [Exponential(), Exponential(substeps=2, between="smooth")])
 def test_slopes_through_blocks_are_those_of_the_scan(solver: Exponential) -> None:
-    structure, u = JOINT.structure, np.random.default_rng(1).normal(size=WORTH + 3)
+    structure, u = JOINT.structure, np.random.default_rng(1).normal(size=BLOCKED_FROM_SAMPLES + 3)
     step = FreeStep(structure, solver)
     assert step.linear and not FreeStep((JOINT + fx.Coulomb("hub", 0.01)).structure, solver).linear
     with double_precision():

@@ -16,9 +16,12 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax import cli, fastloops, terminal
+from rotflex_jax.cli import app, terminal
 from rotflex_jax.data.datasets import DATASETS
-from rotflex_jax.model import Model
+from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.models.model import Model
+from rotflex_jax.runtime import xla
+from rotflex_jax.text.numbers import digits
 
 NAMES = ("t", "voltage", "theta", "alpha")
 DEMO_WHOLE = np.loadtxt(
@@ -35,8 +38,8 @@ HERE = os.environ | {"PYTHONPATH": str(Path(rf.__path__[0]).parent)}
 @pytest.fixture(autouse=True)
 def no_global_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the program sets up for its own process must not leak into the other tests."""
-    monkeypatch.setattr(fastloops, "enable_fast_loops", lambda: True)
-    monkeypatch.setattr(fastloops, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
 
 
 @pytest.fixture
@@ -45,7 +48,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 
     def run(*arguments: object) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as left:
-            cli.main([str(argument) for argument in arguments])
+            app.main([str(argument) for argument in arguments])
         assert isinstance(left.value.code, int)
         return left.value.code, *capsys.readouterr()
 
@@ -260,7 +263,7 @@ def test_simulate_tells_errors_and_saves(run, recorded, tmp_path) -> None:
     y_hat = Model(mechanism).simulate(recording)
     np.testing.assert_allclose(table[:, 4:], y_hat, atol=1e-6)
     degrees = np.rad2deg(rf.metrics.rmse(recording.y, y_hat, recording.n_init))
-    assert all(terminal.number(value) in out for value in degrees)
+    assert all(digits(value) in out for value in degrees)
     theta, alpha = rf.metrics.fit_percent(recording.y, y_hat, recording.n_init)
     assert f"Fit, where 100 % is perfect: theta {theta:.1f} %, alpha {alpha:.1f} %" in out
 
@@ -271,7 +274,7 @@ def test_check_tells_what_is_in_a_file_and_refuses_a_wrong_sign(run, recorded, t
     assert "600 samples, 1.2 s at 500 Hz" in out
     ends = np.rad2deg([DEMO[:, 2].min(), DEMO[:, 2].max()])
     (row,) = (line.split() for line in out.splitlines() if line.startswith("theta "))
-    assert row[:4] == ["theta", "deg", *(terminal.number(end) for end in ends)]
+    assert row[:4] == ["theta", "deg", *(digits(end) for end in ends)]
     assert "note: Channel 'theta' is quantised" in out and "note: 1.2 s are little for a search" in out
     assert "The signs of theta and alpha are those of paper." in out
     status, _, err = run("check", write(tmp_path / "turned.csv", DEMO * [1, 1, 1, -1]))
@@ -304,7 +307,7 @@ class FakeSearch:
             stage=stage,
         )
         return SimpleNamespace(
-            verdict="found",
+            verdict=Verdict.FOUND,
             sentence="The rounds explain the record.",
             train=train,
             test=test,
@@ -344,7 +347,7 @@ def test_discover_splits_each_file(run, search, recorded, tmp_path) -> None:
         "FOUND",
         "the hub meets friction [N m]",
         "0.028 .. 0.032",
-        "cannot tell it from: stribeck at hub",
+        "cannot distinguish it from: stribeck at hub",
         "5.73",
         "reversals",
         "a [note] to read",
@@ -430,9 +433,9 @@ def test_the_user_is_told_what_to_look_at(run, search, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        (None, f"--xla_backend_extra_options={fastloops._OPTION}=262144"),
-        ("--xla_a=1", f"--xla_a=1 --xla_backend_extra_options={fastloops._OPTION}=262144"),
-        (f"--xla_backend_extra_options={fastloops._OPTION}=7",) * 2,
+        (None, f"--xla_backend_extra_options={xla._OPTION}=262144"),
+        ("--xla_a=1", f"--xla_a=1 --xla_backend_extra_options={xla._OPTION}=262144"),
+        (f"--xla_backend_extra_options={xla._OPTION}=7",) * 2,
         ("flags.txt",) * 2,
     ],
 )
@@ -441,14 +444,14 @@ def test_fast_loops_keep_the_users_flags(before, after, monkeypatch) -> None:
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     if before is not None:
         monkeypatch.setenv("XLA_FLAGS", before)
-    assert fastloops.enable_fast_loops() is (before != "flags.txt")
+    assert xla.enable_fast_loops() is (before != "flags.txt")
     assert os.environ["XLA_FLAGS"] == after
 
 
 def test_compilation_cache_is_filled_and_spares_a_folder_that_was_chosen(tmp_path: Path) -> None:
     program = """
 import sys
-from rotflex_jax.fastloops import enable_compilation_cache
+from rotflex_jax.runtime.xla import enable_compilation_cache
 print(enable_compilation_cache(sys.argv[1]))
 import jax
 jax.jit(lambda x: x + 1)(1.0)

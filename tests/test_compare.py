@@ -11,14 +11,15 @@ import pytest
 
 import rotflex_jax as rf
 from arena.records import make_record
-from rotflex_jax import cli, fastloops
+from rotflex_jax.cli import app
 from rotflex_jax.compare import ARX, METHODS, QUICK, Comparison, Fitted, Method, physics, register
-from rotflex_jax.compare.arx import Difference, least_squares
-from rotflex_jax.compare.judged import blinded, windowed_runs
+from rotflex_jax.compare.arx import DifferenceEquation, fit_difference_equation
+from rotflex_jax.compare.evaluation import hide_outputs, windowed_runs
 from rotflex_jax.discover import Discovery
 from rotflex_jax.mechanism import simulate
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime import xla
 
 FITTED = ("textbook", "linear", "grey_box", "grey_box_predictor", "arx")
 
@@ -164,7 +165,7 @@ def test_windows_are_blind_and_those_of_a_black_box_recordings_by_themselves() -
     np.testing.assert_array_equal(alone, np.repeat(test.y[::250], 250, axis=0))
     cut = np.concatenate(shown)
     shown.clear()
-    windowed_runs(SimpleNamespace(simulate_windows=run), [test], 0.5)
+    windowed_runs(SimpleNamespace(simulate=run, simulate_windows=run), [test], 0.5)
     for y in (cut, *shown):
         by_window, measured = y.reshape(4, 250, 2), test.y.reshape(4, 250, 2)
         np.testing.assert_array_equal(by_window[:, : test.n_init], measured[:, : test.n_init])
@@ -175,7 +176,7 @@ def test_a_method_cannot_cheat() -> None:
     cheat = Told("cheat", run=lambda recording: recording.y)
     table = rf.compare(recorded(), [cheat])
     assert table["cheat"].rmse["theta"] > 100 * table.noise_floor["theta"]
-    seen = blinded(table.test[0])
+    seen = hide_outputs(table.test[0])
     m = seen.n_init
     np.testing.assert_array_equal(seen.y[:m], table.test[0].y[:m])
     assert np.ptp(seen.y[m:], axis=0).tolist() == [0, 0]
@@ -186,7 +187,7 @@ def test_what_goes_wrong_is_a_row() -> None:
         raise ArithmeticError("the matrix\nhas no inverse")
 
     growing = np.array([[[1.5, 0.0]], [[0.0, 1.5]]])
-    unstable = Difference(A=growing, B=np.ones((2, 1)), Ts=0.002)
+    unstable = DifferenceEquation(A=growing, B=np.ones((2, 1)), Ts=0.002)
     table = rf.compare(
         recorded(),
         [
@@ -283,7 +284,7 @@ def test_discovered_finds_what_the_grey_box_lacks(monkeypatch) -> None:
 
 
 def test_least_squares_finds_the_equation_behind_clean_data() -> None:
-    truth = Difference(
+    truth = DifferenceEquation(
         A=np.array([[[-0.8, 0.1], [1.6, 0.0]], [[0.0, -0.7], [0.2, 1.3]]]),
         B=np.array([[0.1, 0.2], [0.0, -0.3]]),
         Ts=0.01,
@@ -292,7 +293,7 @@ def test_least_squares_finds_the_equation_behind_clean_data() -> None:
     blank = Recording(u=u, y=np.zeros((400, 2)), Ts=0.01, accept=("constant",))
     m = blank.n_init  # up to there the run is not the equation's own
     record = Recording(u=u[m:], y=truth.simulate(blank)[m:], Ts=0.01)
-    found = least_squares([record], 2)
+    found = fit_difference_equation([record], 2)
     np.testing.assert_allclose(found.A, truth.A, atol=1e-10)
     np.testing.assert_allclose(found.B, truth.B, atol=1e-10)
     table = rf.compare(record, [ARX(orders=(1, 2))])
@@ -387,12 +388,12 @@ def run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., tuple[int, str, str]]:
     """The command line in this process: exit status, stdout, stderr."""
-    monkeypatch.setattr(fastloops, "enable_fast_loops", lambda: True)
-    monkeypatch.setattr(fastloops, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
 
     def run(*arguments: object) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as left:
-            cli.main([str(argument) for argument in arguments])
+            app.main([str(argument) for argument in arguments])
         assert isinstance(left.value.code, int)
         return left.value.code, *capsys.readouterr()
 

@@ -8,11 +8,10 @@ import scipy.signal
 
 import rotflex_jax as rf
 from rotflex_jax.basis import Volterra
-from rotflex_jax.basis.averages import Averages
+from rotflex_jax.basis.bank import Averages
 from rotflex_jax.compare import ARX, AdaptiveSeries, BatchSeries, LinearStateSpace, Subspace
-from rotflex_jax.compare.output_error import refined
-from rotflex_jax.compare.series_run import products, responses
-from rotflex_jax.compare.subspace import subspace
+from rotflex_jax.compare.linear_models import refined, subspace
+from rotflex_jax.compare.series import bank_outputs, monomials
 from rotflex_jax.recording import Recording
 
 Ts = 0.01
@@ -96,7 +95,7 @@ def test_wide_taps_are_means_of_the_delays() -> None:
 def test_products_are_those_of_the_basis() -> None:
     basis = Volterra(Averages(3, 2), 3)
     u = np.random.default_rng(0).normal(size=80)
-    np.testing.assert_allclose(products(basis, responses(basis.bank, u)), basis.regressors(u), atol=1e-12)
+    np.testing.assert_allclose(monomials(basis, bank_outputs(basis.bank, u)), basis.regressors(u), atol=1e-12)
 
 
 def volterra_plant(seed: int, integrates: bool = False, N: int = 3000, noise: float = 0.01) -> Recording:
@@ -124,10 +123,10 @@ def test_a_volterra_plant_is_found_with_its_memory(integrates: bool) -> None:
 
 
 def test_weights_and_past_of_a_series_are_those_of_the_plant() -> None:
-    from rotflex_jax.compare.series_rows import choose
+    from rotflex_jax.compare.series import select_series
 
     train, test = volterra_plant(1), volterra_plant(2, noise=0.0)
-    series = choose([Volterra(Averages(3, 4))], [train], 0, 0.7).series
+    series = select_series([Volterra(Averages(3, 4))], [train], 0, 0.7).series
     truth = dict.fromkeys(series.basis.names, 0.0)
     names = list(series.basis.names)
     for name, w in zip(

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax import cli, fastloops
+from rotflex_jax.cli import app
 from rotflex_jax.compare import Comparison, Fitted
-from rotflex_jax.compare.horizon import against_horizon, pieces
-from rotflex_jax.model import Model
+from rotflex_jax.compare.evaluation import errors_by_horizon, horizon_segments
+from rotflex_jax.compare.figures import drawn, horizons, overlays, ranks, spectra
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.report.comparison_figures import drawn, horizons, overlays, ranks, spectra
+from rotflex_jax.runtime import xla
 
 
 def recorded(N: int = 1200, seed: int = 0) -> Recording:
@@ -79,13 +80,13 @@ def test_error_grows_with_the_horizon_as_it_was_made_to(table: Comparison) -> No
         np.testing.assert_allclose(told.rmse[channel], expected, atol=5 * noise)
     assert told.seconds[-1] == pytest.approx(table.window_seconds)
     (test,) = table.test
-    assert told.runs == len(pieces([test], table.window_seconds)) > 3
+    assert told.runs == len(horizon_segments([test], table.window_seconds)) > 3
 
 
 def test_a_free_run_cannot_look_ahead_at_any_horizon() -> None:
     test = recorded()
     cheat = SimpleNamespace(simulate=lambda r: r.y)
-    told = against_horizon(cheat, [test], 2.0)
+    told = errors_by_horizon(cheat, [test], 2.0)
     assert min(told.rmse["theta"][5:]) > 1e-2
 
 
@@ -159,25 +160,25 @@ def test_the_page_is_complete_and_safe(table: Comparison, tmp_path) -> None:
         table.report(tmp_path / "file")
 
 
-def test_a_page_where_nothing_came_through(tmp_path) -> None:
+def test_a_page_where_every_method_failed(tmp_path) -> None:
     text = rf.compare(recorded(), [Fails()]).report(tmp_path).read_text(encoding="utf-8")
-    assert "No method came through" in text and "no inverse" in text
+    assert "No method gave a result" in text and "no inverse" in text
 
 
 def test_the_command_writes_the_page(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(fastloops, "enable_fast_loops", lambda: True)
-    monkeypatch.setattr(fastloops, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
     record, file = recorded(600), tmp_path / "run.csv"
     columns = np.c_[record.t, record.u, record.y]
     np.savetxt(file, columns, delimiter=",", header="t,voltage,theta,alpha", comments="")
     line = ["compare", str(file), "--report", str(tmp_path / "page")]
     with pytest.raises(SystemExit) as left:
-        cli.main([*line, "--methods", "arx,subspace"])
+        app.main([*line, "--methods", "arx,subspace"])
     assert left.value.code == 0
     assert "comparison.html" in capsys.readouterr().out
     assert (tmp_path / "page" / "comparison.html").exists()
     with pytest.raises(SystemExit) as left:
-        cli.main([*line, "--methods", "arx", "--quick"])
+        app.main([*line, "--methods", "arx", "--quick"])
     assert left.value.code == 2
     assert "--quick and --methods" in capsys.readouterr().err
 

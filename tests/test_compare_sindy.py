@@ -11,9 +11,8 @@ import scipy.signal
 
 import rotflex_jax as rf
 from rotflex_jax.compare import SINDy
-from rotflex_jax.compare.smoothing import smooth, smoothed_input
-from rotflex_jax.compare.sparse_runs import Piece, refined
-from rotflex_jax.compare.sparse_terms import SparseLaw, Terms, motions
+from rotflex_jax.compare.sindy import smoothed_derivatives, smoothed_input
+from rotflex_jax.compare.sparse_law import Piece, SparseLaw, Terms, motions, refined
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 
@@ -81,12 +80,12 @@ def test_the_weights_are_those_of_pysindy_called_directly() -> None:
 def test_smoothing_gives_speed_and_acceleration(kind: tuple[str, float]) -> None:
     t = Ts * np.arange(600)
     record = Recording(u=np.cos(t), y=np.sin(3 * t), Ts=Ts, channels="q")
-    q, v, a = smooth(record, kind).T[:, 40:-40]
+    q, v, a = smoothed_derivatives(record, kind).T[:, 40:-40]
     np.testing.assert_allclose(q, np.sin(3 * t)[40:-40], atol=2e-3)
     np.testing.assert_allclose(v, 3 * np.cos(3 * t)[40:-40], atol=1e-2)
     np.testing.assert_allclose(a, -9 * np.sin(3 * t)[40:-40], atol=0.2)
     with pytest.raises(InputError, match="savgol"):
-        smooth(record, ("wavelet", 3))
+        smoothed_derivatives(record, ("wavelet", 3))
 
 
 @pytest.mark.parametrize("width", [9, 31])
@@ -98,11 +97,11 @@ def test_the_input_is_seen_through_the_same_smoothing(width: int) -> None:
     inside = slice(width, -width)
     for y, order in ((speed, 1), (place, 2)):
         record = Recording(u=u, y=y, Ts=Ts, channels="q")
-        rate = smooth(record, ("savgol", width))[:, order]
+        rate = smoothed_derivatives(record, ("savgol", width))[:, order]
         np.testing.assert_allclose(
             rate[inside], smoothed_input(record, ("savgol", width), order)[inside], atol=1e-10
         )
-        spline = smooth(record, ("spline", 12.0))[:, order][60:-60]
+        spline = smoothed_derivatives(record, ("spline", 12.0))[:, order][60:-60]
         seen = smoothed_input(record, ("spline", 12.0), order)[60:-60]
         assert np.std(spline - seen) < 0.1 * np.std(spline)
 
@@ -113,7 +112,7 @@ def test_numbers_refined_for_free_runs_are_those_of_the_pendulum() -> None:
     W = np.zeros((len(terms.names), 1))
     for name, w in true.items():
         W[terms.names.index(name)] = 1.15 * w
-    states = smooth(record, ("savgol", 5))
+    states = smoothed_derivatives(record, ("savgol", 5))
     pieces = [Piece(states[k, :2], record.u[k : k + 200], record.y[k : k + 200]) for k in (100, 400, 700)]
     found = dict(zip(terms.names, refined(terms, W, pieces, Ts)[:, 0], strict=True))
     assert {n: found[n] for n in true} == pytest.approx(true, rel=0.02)

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from rotflex_jax.fit.covariance import Part, bandwidth, by_recording, correlation_length, curvature, sandwich
+from rotflex_jax.fit.inference import (
+    RecordingSlopes,
+    bandwidth,
+    by_recording,
+    correlation_length,
+    curvature,
+    sandwich,
+)
 
 N, RUNS = 1000, 600
 
@@ -99,7 +106,10 @@ def test_what_a_recording_does_not_move_need_not_be_there():
     slope, e = rng.normal(size=(1000, 2, 1)), rng.normal(size=(1000, 2))
     offsets = np.broadcast_to((segments[:, None] == [0, 1])[:, None, :], (1000, 2, 2))
     J = np.concatenate([slope, offsets], axis=2)
-    own = [Part(J[segments == k][:, :, [0, 1 + k]], e[segments == k], np.array([0, 1 + k])) for k in (0, 1)]
+    own = [
+        RecordingSlopes(J[segments == k][:, :, [0, 1 + k]], e[segments == k], np.array([0, 1 + k]))
+        for k in (0, 1)
+    ]
     covariance = sandwich(own, curvature(own, 3))
     np.testing.assert_allclose(covariance, robust_covariance(J, e, segments), rtol=1e-10, atol=1e-18)
 

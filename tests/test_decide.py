@@ -4,30 +4,32 @@ import dataclasses
 
 import numpy as np
 import pytest
-import small_bench as sb
+import small_problem as sp
 
-from rotflex_jax.discover import decide
-from rotflex_jax.discover.decide import admissible, choose, lead, told_apart
-from rotflex_jax.discover.heldout import Away, Trial, held_out, in_blocks
+from rotflex_jax.discover import selection
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.refit import levenberg_marquardt
-from rotflex_jax.discover.whiten import Whitener
-from rotflex_jax.fit.residuals import Data, first_states
-from rotflex_jax.model import Model
+from rotflex_jax.discover.selection import admissible, choose, distinguished, paired_gain
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, in_blocks, validate
+from rotflex_jax.discover.whitening import Whitener
+from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.recording import Recording
 
 # 60 s at 50 Hz: 120 blocks of 25 samples, on either side.
 N, BLOCKS = 3000, 120
-DATA = Data(np.zeros((1, N)), np.zeros((1, N, 2)), np.ones((1, N)), np.array([0.02]))
+DATA = StackedRecordings(np.zeros((1, N)), np.zeros((1, N, 2)), np.ones((1, N)), np.array([0.02]))
 NOISE = np.array([1e-3, 1e-3])
 COMMON = np.random.default_rng(0).normal(size=BLOCKS) * 50
 
 
-def trial(place, held_out=0.0, train=0.0, windows=2.0, scatter=0.0, seed=1, numbers=1) -> Trial:
+def trial(
+    location, held_out=0.0, train=0.0, windows=2.0, scatter=0.0, seed=1, numbers=1
+) -> ValidatedHypothesis:
     """A trial whose blocks lead those of the base by so many nats in all.
 
     Args:
-        place: What it adds.
+        location: What it adds.
         held_out: Lead over the base on held-out data [nat].
         train: The same on training data [nat].
         windows: Error of short free runs, in units of the noise.
@@ -39,31 +41,31 @@ def trial(place, held_out=0.0, train=0.0, windows=2.0, scatter=0.0, seed=1, numb
     pattern = scatter * (pattern - pattern.mean()) / pattern.std()
     blocks = COMMON + held_out / BLOCKS + pattern
     densities = np.repeat((COMMON[::-1] + train / BLOCKS + pattern) / 25, 25)[None]
-    zeros = np.zeros(0)
     white = Whitener(np.ones((2, 1)), np.eye(2))
-    h = Hypothesis((), (), (), zeros, zeros, zeros, zeros, {}, white, densities)
-    return Trial(h, blocks, h, windows * NOISE, place, numbers)
+    none = np.zeros((1, 0))
+    h = Hypothesis((), (), (), np.zeros(0), none, none, np.zeros((1, 0, 2)), {}, white, densities)
+    return ValidatedHypothesis(h, blocks, h, windows * NOISE, location, numbers)
 
 
 BASE = trial(None, windows=10.0)
-COULOMB, STRIBECK = ("coulomb", "hub"), ("stribeck", "hub")
-DRAG, ARM = ("quadratic_drag", "hub"), ("coulomb", "arm")
+COULOMB, STRIBECK, DRAG = (EffectLocation(e, "hub") for e in ("coulomb", "stribeck", "quadratic_drag"))
+ARM = EffectLocation("coulomb", "arm")
 
 
 def test_a_lead_is_paired():
     """What scatters in both alike does not count."""
     d = np.array([1.0, 2.0, 3.0, 2.0])
     common = 1000 * np.random.default_rng(3).normal(size=4)
-    nats, z = lead(common + d, common)
+    nats, z = paired_gain(common + d, common)
     assert nats == pytest.approx(8.0)
     assert z == pytest.approx(8.0 / (np.std(d, ddof=1) * 2))
-    assert lead(common, common + d)[1] == pytest.approx(-z)
-    assert lead(np.array([5.0]), np.array([1.0])) == (4.0, 0.0)  # one block cannot tell a scatter
+    assert paired_gain(common, common + d)[1] == pytest.approx(-z)
+    assert paired_gain(np.array([5.0]), np.array([1.0])) == (4.0, 0.0)  # one block cannot tell a scatter
 
 
 def test_a_lead_of_z_two_is_rare_where_there_is_none():
     rng = np.random.default_rng(4)
-    z = np.array([lead(rng.normal(size=40), rng.normal(size=40))[1] for _ in range(2000)])
+    z = np.array([paired_gain(rng.normal(size=40), rng.normal(size=40))[1] for _ in range(2000)])
     assert np.mean(z > 2) == pytest.approx(0.026, abs=0.012)  # Student's t, 39 degrees of freedom
 
 
@@ -71,7 +73,7 @@ def test_blocks_of_half_a_second():
     """The rest joins its neighbour; unseen samples and other recordings stay out."""
     seen = np.zeros((2, 130))
     seen[0, :130], seen[1, :99] = 1, 1
-    data = Data(seen, np.zeros((2, 130, 2)), seen, np.array([0.01, 0.02]))
+    data = StackedRecordings(seen, np.zeros((2, 130, 2)), seen, np.array([0.01, 0.02]))
     density = np.arange(260.0).reshape(2, 130)
     first, second = density
     expected = [first[:50].sum(), first[50:130].sum()]  # 50 samples are half a second
@@ -85,11 +87,11 @@ GOOD = {"held_out": 200.0, "train": 200.0, "windows": 5.0, "scatter": 0.5}
 @pytest.mark.parametrize(
     "spoilt",
     [
-        {"held_out": decide.HELD_OUT_NATS - 1, "scatter": 0.0},
+        {"held_out": selection.HELD_OUT_NATS - 1, "scatter": 0.0},
         {"held_out": -50.0},
-        {"held_out": 20.0, "scatter": 20.0 / decide.HELD_OUT_Z / np.sqrt(BLOCKS) * 1.1},
-        {"train": decide.TRAIN_NATS + 0.5 * np.log(2 * N) - 1, "scatter": 0.0},
-        {"train": 20.0, "held_out": 2000.0, "scatter": 20.0 / decide.TRAIN_Z / np.sqrt(BLOCKS) * 1.1},
+        {"held_out": 20.0, "scatter": 20.0 / selection.HELD_OUT_Z / np.sqrt(BLOCKS) * 1.1},
+        {"train": selection.TRAIN_NATS + 0.5 * np.log(2 * N) - 1, "scatter": 0.0},
+        {"train": 20.0, "held_out": 2000.0, "scatter": 20.0 / selection.TRAIN_Z / np.sqrt(BLOCKS) * 1.1},
         {"numbers": 60},
         {"windows": 10.0 * np.exp(0.05)},
         {"windows": 10.0},
@@ -112,9 +114,9 @@ def test_one_doubt_is_enough_to_refuse(spoilt):
 
 def test_near_the_noise_free_runs_need_not_get_better():
     near = trial(None, windows=1.1)
-    same = {**GOOD, "windows": 1.1 * np.exp(0.5 * decide.WINDOWS_WORSE)}
+    same = {**GOOD, "windows": 1.1 * np.exp(0.5 * selection.WINDOWS_WORSE)}
     assert admissible(trial(COULOMB, **same), near, DATA, NOISE)
-    worse = {**GOOD, "windows": 1.1 * np.exp(2 * decide.WINDOWS_WORSE)}
+    worse = {**GOOD, "windows": 1.1 * np.exp(2 * selection.WINDOWS_WORSE)}
     assert not admissible(trial(COULOMB, **worse), near, DATA, NOISE)
 
 
@@ -131,9 +133,9 @@ def test_what_cannot_be_told_apart_is_named_together():
     """The difference of the two is smaller than its scatter over the blocks."""
     best = trial(DRAG, **GOOD | {"held_out": 210.0, "train": 210.0}, seed=1)
     close = trial(ARM, **GOOD | {"held_out": 200.0, "train": 200.0, "scatter": 3.0}, seed=2)
-    assert lead(best.blocks, close.blocks)[0] == pytest.approx(10.0)
-    far = trial(("gravity", "arm"), **GOOD | {"held_out": 100.0, "train": 100.0}, seed=3)
-    refused = trial(("dead_zone", "input"), **GOOD | {"train": 0.0}, seed=4)
+    assert paired_gain(best.blocks, close.blocks)[0] == pytest.approx(10.0)
+    far = trial(EffectLocation("gravity", "arm"), **GOOD | {"held_out": 100.0, "train": 100.0}, seed=3)
+    refused = trial(EffectLocation("dead_zone", "input"), **GOOD | {"train": 0.0}, seed=4)
     winner, rivals = choose([far, close, refused, best], BASE, DATA, NOISE)
     assert winner is best and rivals == [close]
     # The same difference without scatter is beyond doubt.
@@ -156,10 +158,10 @@ def test_a_rival_need_not_pass_what_the_winner_passed():
 def test_both_sides_tell_apart():
     best = trial(DRAG, **GOOD | {"held_out": 201.0, "train": 400.0, "scatter": 1.0})
     close = trial(ARM, **GOOD | {"scatter": 1.0}, seed=2)
-    assert lead(best.blocks, close.blocks)[1] < decide.SEPARATE_Z
-    assert told_apart(best, close, DATA)
+    assert paired_gain(best.blocks, close.blocks)[1] < selection.SEPARATE_Z
+    assert distinguished(best, close, DATA)
     same = trial(DRAG, **GOOD | {"held_out": 201.0, "scatter": 1.0})
-    assert not told_apart(same, close, DATA)
+    assert not distinguished(same, close, DATA)
 
 
 def test_the_simpler_effect_wins_unless_the_richer_earns_it():
@@ -185,65 +187,65 @@ def test_the_simpler_effect_wins_unless_the_richer_earns_it():
 @pytest.fixture(scope="module")
 def sides():
     """Trained baseline, and the held-out side: the same machine, other inputs, other offsets."""
-    train = sb.judge(sb.recordings(sb.records(0.0)))
-    unseen = sb.recordings(sb.records(0.0, (31, 32)))
-    away = Away(sb.judge(unseen), unseen, first_states(Model(sb.baseline()), unseen), 0.8)
-    h = sb.fitted(train)
-    return train, h, away
+    train = sp.problem(sp.recordings(sp.records(0.0)))
+    unseen = sp.recordings(sp.records(0.0, (31, 32)))
+    validation = ValidationSet(sp.problem(unseen), 0.8)
+    h = sp.fitted(train)
+    return train, h, validation
 
 
 def test_held_out_likelihood_of_the_truth(sides):
-    train, h, away = sides
-    found = held_out(away, h)
+    train, h, validation = sides
+    found = validate(validation, h)
     assert found.blocks.shape == (6,)  # 1.6 s each: three blocks, the rest in the last
     # What the trained covariance promises per sample, within its scatter.
-    promised = h.log_likelihood / np.sum(train.bench.data.seen)
-    per_sample = found.held_out / np.sum(away.judge.bench.data.seen)
+    promised = h.log_likelihood / np.sum(train.seen)
+    per_sample = found.log_likelihood / np.sum(validation.problem.seen)
     assert per_sample == pytest.approx(promised, abs=0.2)
     # Physics stays, offsets and first states are each recording's own.
     np.testing.assert_array_equal(found.adapted.z, h.z)
     assert found.adapted.whitener is h.whitener
-    bias = away.judge.bench.supermodel.parameter_indices(("voltage_offset", "input"))[0]
-    offsets = found.adapted.values(away.judge.bench)[:, bias]
+    bias = validation.problem.supermodel.parameter_indices(EffectLocation("voltage_offset", "input"))[0]
+    offsets = found.adapted.values(validation.problem.supermodel)[:, bias]
     np.testing.assert_allclose(offsets, [0.02, -0.02], atol=0.01)
-    np.testing.assert_allclose(found.windows, sb.NOISE, rtol=0.6)
+    np.testing.assert_allclose(found.window_rmse, sp.NOISE, rtol=0.6)
 
 
 def test_wrong_physics_is_less_likely_on_held_out_data(sides):
-    _, h, away = sides
-    i = away.judge.bench.supermodel.mechanism.parameter_names.index("joint.spring.stiffness")
+    _, h, validation = sides
+    i = validation.problem.supermodel.mechanism.parameter_names.index("joint.spring.stiffness")
     z = h.z.copy()
     z[i] += np.log(1.05)
-    wrong = held_out(away, dataclasses.replace(h, z=z))
-    right = held_out(away, h)
-    nats, z_score = lead(right.blocks, wrong.blocks)
+    wrong = validate(validation, dataclasses.replace(h, z=z))
+    right = validate(validation, h)
+    nats, z_score = paired_gain(right.blocks, wrong.blocks)
     assert nats > 100 and z_score > 2
-    assert (wrong.windows > right.windows).all()
+    assert (wrong.window_rmse > right.window_rmse).all()
 
 
 def test_friction_that_is_there_is_admitted_and_friction_that_is_not_is_refused(sides):
     for level, expected in ((0.02, True), (0.0, False)):
-        train = sb.judge(sb.recordings(sb.records(level)))
-        unseen = sb.recordings(sb.records(level, (31, 32)))
-        away = Away(sb.judge(unseen), unseen, first_states(Model(sb.baseline()), unseen), 0.8)
-        h = sb.fitted(train)
-        i = train.bench.supermodel.parameter_indices(sb.HUB)[0]
+        train = sp.problem(sp.recordings(sp.records(level)))
+        unseen = sp.recordings(sp.records(level, (31, 32)))
+        validation = ValidationSet(sp.problem(unseen), 0.8)
+        h = sp.fitted(train)
+        i = train.supermodel.parameter_indices(sp.HUB)[0]
         z = h.z.copy()
         z[i] = np.log(0.005)
-        more = dataclasses.replace(h, places=(*h.places, sb.HUB), free=(*h.free, i), z=z)
+        more = dataclasses.replace(h, locations=(*h.locations, sp.HUB), free=(*h.free, i), z=z)
         more = levenberg_marquardt(train, [more])[0]
-        added = dataclasses.replace(held_out(away, more), place=sb.HUB, numbers=1)
-        assert admissible(added, held_out(away, h), train.bench.data, sb.NOISE) is expected
+        added = dataclasses.replace(validate(validation, more), location=sp.HUB, parameter_count=1)
+        assert admissible(added, validate(validation, h), train.dataset.data, sp.NOISE) is expected
 
 
 def test_errors_of_windows_leave_out_what_a_model_has_seen(sides):
-    _, _, away = sides
+    _, _, validation = sides
     runs = []
-    for r in away.recordings:
+    for r in validation.problem.dataset.recordings:
         run = r.y.copy()
         in_window = np.arange(r.N) % 320
         run[in_window < r.n_init] += 7.0  # seen: does not count
         run[in_window >= r.n_init] += [0.03, -0.04]
         runs.append(run)
-    assert all(isinstance(r, Recording) and r.N == 640 for r in away.recordings)
-    np.testing.assert_allclose(away.windows(runs), [0.03, 0.04])
+    assert all(isinstance(r, Recording) and r.N == 640 for r in validation.problem.dataset.recordings)
+    np.testing.assert_allclose(validation.window_rmse(runs), [0.03, 0.04])

@@ -15,10 +15,11 @@ from test_report import NOISE, moved, photographed, two_rounds
 
 import rotflex_jax as rf
 from rotflex_jax.compare.table import Comparison, Row
-from rotflex_jax.discover.milestone import milestone
-from rotflex_jax.display.drawing import Panel, bars, signals, staircase
-from rotflex_jax.display.live import Live, live
-from rotflex_jax.fit.fitted import Fit
+from rotflex_jax.discover.search import milestone
+from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.fit.result import Fit
+from rotflex_jax.notebook.live import Live, live
+from rotflex_jax.text.svg import Panel, bars, signals, staircase
 
 
 def read(html: str) -> str:
@@ -67,9 +68,9 @@ def test_a_discovery_shows_verdict_rounds_errors_and_doubts() -> None:
     found = two_rounds()
     text = read(found._repr_html_())
     for expected in (
-        "Found, but not told apart",
+        "Found, but not distinguished from others",
         "coulomb at hub",
-        "not told from stribeck at hub",
+        "not distinguished from stribeck at hub",
         "τ = −stiffness · position³",
         "78 % of the theta error",
         "sensor noise",
@@ -82,7 +83,7 @@ def test_a_discovery_shows_verdict_rounds_errors_and_doubts() -> None:
 
 
 def test_a_discovery_without_a_round_is_shown_too() -> None:
-    found = dataclasses.replace(two_rounds(), rounds=(), verdict="nothing_missing")
+    found = dataclasses.replace(two_rounds(), rounds=(), verdict=Verdict.NOTHING_MISSING)
     assert "Nothing is missing" in read(found._repr_html_())
 
 

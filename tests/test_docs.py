@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax import cli
+from rotflex_jax.cli import app
 from rotflex_jax.effects import CATALOG, LearnedTorque
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -69,7 +69,7 @@ def command(*arguments: str) -> None:
     """The command line; its sentence on stderr as an error."""
     said = io.StringIO()
     with contextlib.redirect_stderr(said), pytest.raises(SystemExit) as left:
-        cli.main(arguments)
+        app.main(arguments)
     assert left.value.code == 2
     raise rf.InputError(said.getvalue().strip())
 
@@ -217,15 +217,17 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
 
 
 def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
-    from rotflex_jax.discover import decide, verdict
+    from rotflex_jax.discover import end_state, result, selection
 
     text = (DOCS / "method.md").read_text()
-    rows = dict(re.findall(r"\| ([\d.]+) \| `decide\.(\w+)` \|", text))
-    assert {name: getattr(decide, name) for name in rows.values()} == {n: float(v) for v, n in rows.items()}
+    rows = dict(re.findall(r"\| ([\d.]+) \| `selection\.(\w+)` \|", text))
+    assert {name: getattr(selection, name) for name in rows.values()} == {
+        n: float(v) for v, n in rows.items()
+    }
     assert len(rows) == 4
-    assert f"within {verdict.NEAR_FLOOR:g} times the noise" in text
-    assert f"less than {verdict.NATS_PER_NUMBER:g} nat" in text
-    assert decide.SEPARATE_Z == 2.0 and "less than two deviations" in text
+    assert f"within {result.NEAR_FLOOR:g} times the noise" in text
+    assert f"less than {end_state.NATS_PER_SAMPLE:g} nat" in text
+    assert selection.SEPARATE_Z == 2.0 and "less than two standard deviations" in text
 
 
 def test_the_catalogue_shows_every_effect_with_all_its_parameters() -> None:

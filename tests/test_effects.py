@@ -59,7 +59,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.parameters import specifications
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 CLASSES = [CATALOG[name] for name in sorted(CATALOG)]
 SCALES = [
@@ -382,10 +382,10 @@ def test_what_may_be_negative():
 
 def test_every_file_registers_and_knows_no_sibling():
     folder = Path(effects.__file__).parent
-    apart = {"__init__", "kinds", "stamp", "catalogue", "learned"}
+    apart = {"__init__", "base", "labels", "learned"}
     registered = {c.__module__.rpartition(".")[2] for c in CLASSES}
     assert {f.stem for f in folder.glob("*.py")} - apart == registered
-    allowed = {"effects.kinds", "effects.catalogue", "parameters", "errors"}
+    allowed = {"effects.base", "parameters", "errors"}
     for file in folder.glob("*.py"):
         if file.stem in apart:
             continue
@@ -395,6 +395,32 @@ def test_every_file_registers_and_knows_no_sibling():
                 assert module.removeprefix("rotflex_jax.") in allowed, f"{file.name}: {module}"
     exported = {name for name in effects.__all__ if isinstance(getattr(effects, name), type)}
     assert {c.__name__ for c in CLASSES} <= exported
+
+
+@pytest.mark.parametrize(
+    ("kind", "missing"),
+    [
+        (Linear, "stamp"),
+        (Force, "force"),
+        (DryFriction, "limit"),
+        (Memory, "flow, force"),
+        (Gear, "rotor, stops"),
+        (Actuation, "drive"),
+        (Sensing, "measure"),
+        (Effect, "kind_label"),
+    ],
+)
+def test_a_class_without_the_methods_of_its_kind_cannot_be_defined(kind, missing):
+    declared = {"name": "half_done", "title": "half done", "equation": "tau = 0"}
+    with pytest.raises(InputError, match=f"HalfDone was defined without {missing},"):
+        type("HalfDone", (kind,), declared)
+
+
+def test_a_class_that_a_search_tries_says_at_which_values():
+    declared = {"title": "t", "equation": "tau = 0", "searched": ("hub",), "stamp": Spring.stamp}
+    with pytest.raises(InputError, match="without probes"):
+        type("Unprobed", (Linear,), {"name": "unprobed", **declared})
+    type("Family", (Linear,), declared)  # a base class of several effects has no name yet
 
 
 def test_a_name_is_taken_once():

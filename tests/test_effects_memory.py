@@ -19,8 +19,8 @@ from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, linearise, simulate, simulate_states
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.simulate import _free_outputs
-from rotflex_jax.mechanism.torques import remember
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.step import advance_memories
+from rotflex_jax.runtime.xla import double_precision
 
 J_HUB, J_ARM, K = 0.0021, 0.0059, 1.61
 RESISTANCE, EMF = 2.6, 0.00767 * 70  # also the torque per current
@@ -87,7 +87,7 @@ def test_state_under_a_given_motion(name):
         w, v = map(jnp.asarray, motion((np.arange(n) + 0.5) * span / n))
 
         def body(z, wv):
-            return remember(held, z, jnp.stack([jnp.zeros_like(wv[0]), wv[0]]), wv[1], gates, h), z
+            return advance_memories(held, z, jnp.stack([jnp.zeros_like(wv[0]), wv[0]]), wv[1], gates, h), z
 
         last, z = jax.lax.scan(body, jnp.zeros(1), (w, v))
         return unit * jnp.concatenate([z, last[None]])[:: n // 100, 0]
@@ -149,9 +149,9 @@ def test_a_motor_that_stands_warms_to_a_known_level():
 
 @pytest.mark.parametrize("port", ["joint", "arm"])
 def test_heat_needs_a_motor(port):
-    with pytest.raises(InputError, match=f"Heating was put at '{port}', but no motor drives that port"):
+    with pytest.raises(InputError, match=f"Heating was put at '{port}', but it needs a port with a motor"):
         paper() + fx.Heating(port)
-    with pytest.raises(InputError, match="no motor"):
+    with pytest.raises(InputError, match="needs a port with a motor"):
         paper().without("motor", "hub") + fx.Heating("hub")
 
 

@@ -1,4 +1,4 @@
-"""The worth of an input against explicit least squares, SciPy, differences, and the independent simulator."""
+"""Evidence of an input against explicit least squares, SciPy, differences, and the independent simulator."""
 
 import dataclasses
 
@@ -12,14 +12,14 @@ import rotflex_jax.effects as fx
 from arena.records import make_record
 from rotflex_jax.data.excitation import multisine, noise, prbs
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment import imitation
-from rotflex_jax.experiment.ascent import improved
-from rotflex_jax.experiment.contest import Contest, Meeting
-from rotflex_jax.experiment.hypotheses import hypothesis, place_of
-from rotflex_jax.experiment.imitation import Imitation, imitate, truth
-from rotflex_jax.experiment.limits import Limits
-from rotflex_jax.model import Model
-from rotflex_jax.precision import double_precision
+from rotflex_jax.experiment import rival_fit
+from rotflex_jax.experiment.discrimination import Discrimination, DiscriminationProblem
+from rotflex_jax.experiment.input_optimisation import optimise_input
+from rotflex_jax.experiment.rival_fit import RivalFit, fit_rival, free_run_from_rest
+from rotflex_jax.experiment.rival_model import effect_location, rival_model
+from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.models.model import Model
+from rotflex_jax.runtime.xla import double_precision
 
 Ts = 0.004
 NOISE = np.array([5.3e-4, 5.3e-4])
@@ -33,14 +33,14 @@ def machine() -> Model:
 
 
 def pair(time: float = 0.003, Ts: float = Ts):
-    """Delay and lag of one size."""
-    a = hypothesis(machine(), fx.Delay(time=time), LAG, {}, NOISE, Ts)
-    return a, hypothesis(machine(), fx.Lag(time=time), DELAY, {}, NOISE, Ts)
+    """Delay and lag of the same size."""
+    a = rival_model(machine(), fx.Delay(time=time), LAG, {}, NOISE, Ts)
+    return a, rival_model(machine(), fx.Lag(time=time), DELAY, {}, NOISE, Ts)
 
 
 @pytest.fixture(scope="module")
-def contest():
-    return Contest(pair(), Ts, V)
+def problem():
+    return DiscriminationProblem(pair(), Ts, V)
 
 
 def test_nats_of_a_linear_rival_are_the_noncentrality_of_least_squares():
@@ -54,11 +54,11 @@ def test_nats_of_a_linear_rival_are_the_noncentrality_of_least_squares():
     m = m.trust(*m.parameter_names)
     sd, N = np.array([1e-4]), 300
     # Twice the sampling period: no interpolation between samples.
-    a = hypothesis(Model(m + fx.Delay(time=2 * Ts)), DELAY, ("sensor_bias", "x"), {}, sd, Ts)
-    a = dataclasses.replace(a, moved=())
-    b = hypothesis(Model(m), ("sensor_bias", "x"), DELAY, {}, sd, Ts)
+    a = rival_model(Model(m + fx.Delay(time=2 * Ts)), DELAY, ("sensor_bias", "x"), {}, sd, Ts)
+    a = dataclasses.replace(a, free=())
+    b = rival_model(Model(m), ("sensor_bias", "x"), DELAY, {}, sd, Ts)
     u = noise(N, Ts, seed=3)
-    y = truth(a, u, Ts)
+    y = free_run_from_rest(a, u, Ts)
     t = Ts * np.arange(N)
     late = np.concatenate([[u[0]] * 2, u[:-2]])
     gain = fx.Motor(at="hub", back_emf=0.0).stamp().drive / 0.5
@@ -71,70 +71,70 @@ def test_nats_of_a_linear_rival_are_the_noncentrality_of_least_squares():
     rest = (place - known) - columns @ np.linalg.lstsq(columns, place - known, rcond=None)[0]
     expected = 0.5 * np.sum((rest / sd[0]) ** 2)
     assert expected > 10
-    found = imitate(b, u, y, Ts)
+    found = fit_rival(b, u, y, Ts)
     assert found.nats == pytest.approx(expected, rel=1e-6)
     assert found.converged
 
 
-def test_an_imitation_is_as_good_as_that_of_scipy(contest):
-    a, b = contest.pair
+def test_a_rival_fit_is_as_good_as_that_of_scipy(problem):
+    a, b = problem.pair
     u = multisine(600, Ts, band=(0.5, 12.0), rms=1.0)
-    y = truth(a, u, Ts)
-    found = imitate(b, u, y, Ts)
+    y = free_run_from_rest(a, u, Ts)
+    found = fit_rival(b, u, y, Ts)
 
-    def errors(numbers):
+    def errors(unknowns):
         with double_precision():
-            part, fixed = imitation._parts(b)
-            x, *rest = map(jnp.asarray, (numbers, u, y, Ts))
-            return np.asarray(imitation._whitened(part, x, fixed, *rest)).ravel()
+            part, fixed = rival_fit._static_and_arrays(b)
+            x, *rest = map(jnp.asarray, (unknowns, u, y, Ts))
+            return np.asarray(rival_fit._whitened_residuals(part, x, fixed, *rest)).ravel()
 
-    start = found.numbers + 0.02
+    start = found.unknowns + 0.02
     best = least_squares(errors, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
     assert found.nats == pytest.approx(best.cost, rel=5e-3)
     assert found.converged and found.nats > 1
 
 
-def test_a_machine_imitates_itself(contest):
+def test_a_model_reproduces_its_own_run(problem):
     u = noise(400, Ts, seed=1)
-    a = contest.pair[0]
+    a = problem.pair[0]
     wrong = a.start.copy()
-    wrong[: len(a.moved)] += 0.05
-    assert imitate(a, u, truth(a, u, Ts), Ts, wrong).nats < 0.05
+    wrong[: len(a.free)] += 0.05
+    assert fit_rival(a, u, free_run_from_rest(a, u, Ts), Ts, wrong).nats < 0.05
 
 
-def test_with_process_noise_an_innovation_is_worth_less():
-    """A predictor forgives slow error: the same difference weighs no more than in a free run."""
+def test_with_process_noise_an_innovation_is_weaker_evidence():
+    """A predictor corrects slow errors: the same difference is no more evidence than in a free run."""
     u = noise(600, Ts, bandwidth=10.0, seed=2)
     free = pair()
-    y = truth(free[0], u, Ts)
+    y = free_run_from_rest(free[0], u, Ts)
     q = {"hub": 1e-7, "joint": 1e-7}
-    b = hypothesis(machine(), fx.Lag(time=0.003), DELAY, q, NOISE, Ts)
+    b = rival_model(machine(), fx.Lag(time=0.003), DELAY, q, NOISE, Ts)
     assert np.abs(b.K).max() > 1e-3
-    held = imitate(b, u, y, Ts)
+    held = fit_rival(b, u, y, Ts)
     assert held.converged
-    assert held.nats < imitate(free[1], u, y, Ts).nats
+    assert held.nats < fit_rival(free[1], u, y, Ts).nats
 
 
-def test_slope_is_that_of_differences(contest):
+def test_the_gradient_is_that_of_differences(problem):
     rng = np.random.default_rng(0)
     u = multisine(500, Ts, band=(0.5, 15.0), rms=0.8)
-    m = contest.meet(u)
-    m = contest.meet(u, m)
+    m = problem.evaluate(u)
+    m = problem.evaluate(u, m)
     nothing = np.zeros((2, 2))
-    g = contest.slope(u, m, nothing)
+    g = problem.gradient(u, m, nothing)
     for _ in range(3):
-        # A direction with energy at all frequencies, along which the slope does not vanish.
+        # A direction with energy at all frequencies, along which the gradient does not vanish.
         way = 0.3 * rng.standard_normal(len(u)) + g / np.abs(g).max()
-        up, down = (contest.meet(u + s * 1e-3 * way, m).mean for s in (1, -1))
+        up, down = (problem.evaluate(u + s * 1e-3 * way, m).mean_nats for s in (1, -1))
         assert g @ way == pytest.approx((np.log(up) - np.log(down)) / 2e-3, rel=0.01)
 
 
-def test_slope_of_a_peak(contest):
+def test_the_gradient_of_a_peak(problem):
     """With a penalty the logarithm of a peak comes off, to the width of the smooth maximum."""
     u = multisine(500, Ts, band=(0.5, 15.0), rms=0.8)
-    m = contest.meet(u)
+    m = problem.evaluate(u)
     penalty = np.array([[0.0, 1.0], [0.0, 0.0]])
-    g = contest.slope(u, m, np.zeros((2, 2))) - contest.slope(u, m, penalty)
+    g = problem.gradient(u, m, np.zeros((2, 2))) - problem.gradient(u, m, penalty)
     # Along the input itself a peak of a linear machine grows in proportion.
     assert g @ u == pytest.approx(1.0, rel=1e-6)
 
@@ -159,7 +159,7 @@ def test_limits_on_voltage_and_slew_hold_exactly_and_change_nothing_needlessly()
 def test_each_sample_follows_the_two_it_is_said_to_follow():
     limits, rng = Limits(voltage=2.0, slew=150.0), np.random.default_rng(6)
     x = 1.5 * rng.standard_normal(300)
-    u, low, high = limits.routed(x, Ts)
+    u, low, high = limits.playable_with_sources(x, Ts)
     k = rng.integers(40, 260)
     way = np.zeros(300)
     way[low[k]] += 0.5
@@ -170,32 +170,32 @@ def test_each_sample_follows_the_two_it_is_said_to_follow():
     assert moved[k] - u[k] == pytest.approx(way @ (nudge * inside), abs=1e-12)
 
 
-def test_climbing_gains_within_the_limits():
+def test_input_optimisation_gains_within_the_limits():
     """Where the deflection binds, a design beats the input it starts from, itself as large as allowed."""
-    c = Contest(pair(Ts=0.005), 0.005, Limits(voltage=6.0, travel=1.0, deflection=0.12))
-    start = c.within(prbs(300, 0.005, amplitude=6.0, hold=0.02))
-    begun = c.meet(c.within(np.tile(start, 2))).nats
-    u = c.within(c.limits.playable(np.tile(improved(c, start, looks=12), 2), 0.005))
-    assert c.meet(u).nats > 1.3 * begun
+    c = DiscriminationProblem(pair(Ts=0.005), 0.005, Limits(voltage=6.0, travel=1.0, deflection=0.12))
+    start = c.scaled_to_limits(prbs(300, 0.005, amplitude=6.0, hold=0.02))
+    before = c.evaluate(c.scaled_to_limits(np.tile(start, 2))).nats
+    u = c.scaled_to_limits(c.limits.playable(np.tile(optimise_input(c, start, evaluations=12), 2), 0.005))
+    assert c.evaluate(u).nats > 1.3 * before
     assert np.all(c.peaks(u) <= c.limits.outputs(2))
     assert np.max(np.abs(u)) <= 6.0
 
 
-def test_the_promise_is_kept_by_the_independent_simulator():
+def test_the_expected_evidence_is_found_on_the_independent_simulator():
     """Log-likelihood of the truth less that of its rival, averaged over sensor noise."""
     h = 0.002
     a, b = pair(0.0021, h)
     u = prbs(2500, h, amplitude=1.5, hold=0.02, seed=4)
-    promised = imitate(b, u, truth(a, u, h), h).nats
+    expected = fit_rival(b, u, free_run_from_rest(a, u, h), h).nats
     got = []
     for seed in range(4):
         y = make_record({DELAY: {"time": 0.0021}}, seed=seed, perturb=0.0, played=u)["y"]
-        cost = [imitate(x, u, y, h).nats for x in (a, b)]
+        cost = [fit_rival(x, u, y, h).nats for x in (a, b)]
         got.append(cost[1] - cost[0])
     # The margin of one record has the variance 2 T about T.
-    spread = np.sqrt(2 * promised / len(got))
-    assert promised > 40
-    assert abs(np.mean(got) - promised) < 3 * spread + 0.15 * promised
+    spread = np.sqrt(2 * expected / len(got))
+    assert expected > 40
+    assert abs(np.mean(got) - expected) < 3 * spread + 0.15 * expected
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +221,7 @@ def test_an_experiment_is_no_worse_than_a_standard_input(experiment):
     assert {"noise", "multisine", "prbs", "steps", "sweep"} <= {r.input for r in e.table}
     assert e.chosen.nats == max(r.nats for r in e.table) >= e.standard.nats
     assert e.evidence["nats_per_second"] == pytest.approx(e.chosen.nats / 2.4)
-    # The differences are in units of the outputs: as white noise they are worth what is promised.
+    # The differences are in units of the outputs: over white noise they give the expected evidence.
     nats = 0.5 * np.sum((e.differences / 5.3e-4) ** 2, axis=(1, 2))
     assert nats == pytest.approx(e.chosen.each, rel=0.02)
     assert e.to_dict()["limits"]["slew"] == 400.0
@@ -249,40 +249,40 @@ def test_the_figure_names_units_and_both_effects(experiment):
     assert any("lag@input" in t.get_text() for legend in figure.legends for t in legend.get_texts())
 
 
-def test_new_numbers_need_no_new_program(contest):
+def test_other_parameters_need_no_compilation(problem):
     u = noise(400, Ts, seed=1)
-    contest.meet(u)
-    before = len(imitation._with_slopes)
-    other = Contest(pair(0.004), Ts, V)
-    other.meet(2 * u)
-    assert len(imitation._with_slopes) == before
+    problem.evaluate(u)
+    before = len(rival_fit._residuals_and_jacobian)
+    other = DiscriminationProblem(pair(0.004), Ts, V)
+    other.evaluate(2 * u)
+    assert len(rival_fit._residuals_and_jacobian) == before
 
 
-def test_a_direction_that_nothing_shows_does_not_count():
-    """Stribeck friction holds Coulomb's: if Coulomb is true, no input tells."""
+def test_a_nested_direction_does_not_count():
+    """Coulomb friction is nested in Stribeck's: if Coulomb is true, no input distinguishes them."""
     m = machine()
-    a = hypothesis(m, fx.Stribeck(at="hub", level=0.01, excess=0.02), ("coulomb", "hub"), {}, NOISE, Ts)
-    b = hypothesis(m, fx.Coulomb(at="hub", level=0.01), ("stribeck", "hub"), {}, NOISE, Ts)
-    c = Contest((a, b), Ts, V)
-    meetings = [c.meet(noise(500, Ts, seed=seed)) for seed in (2, 3)]
-    assert c.visible(meetings).counted == (True, False)
+    a = rival_model(m, fx.Stribeck(at="hub", level=0.01, excess=0.02), ("coulomb", "hub"), {}, NOISE, Ts)
+    b = rival_model(m, fx.Coulomb(at="hub", level=0.01), ("stribeck", "hub"), {}, NOISE, Ts)
+    c = DiscriminationProblem((a, b), Ts, V)
+    results = [c.evaluate(noise(500, Ts, seed=seed)) for seed in (2, 3)]
+    assert c.without_nested_direction(results).counted == (True, False)
 
 
 @pytest.mark.parametrize(("other", "counts"), [(500.0, True), (5.0, False)])
-def test_a_direction_that_decides_counts_though_the_opposite_shows_far_more(contest, other, counts):
-    one, two = (Imitation(np.zeros(1), nats, np.zeros((1, 2)), 0.0, 1) for nats in (20_000.0, other))
-    meeting = Meeting(np.zeros((2, 1, 2)), (one, two))
-    assert contest.visible([meeting]).counted == (True, counts)
+def test_a_direction_that_decides_counts_though_the_opposite_is_far_more_distinct(problem, other, counts):
+    one, two = (RivalFit(np.zeros(1), nats, np.zeros((1, 2)), 0.0, 1) for nats in (20_000.0, other))
+    result = Discrimination(np.zeros((2, 1, 2)), (one, two))
+    assert problem.without_nested_direction([result]).counted == (True, counts)
 
 
 def test_a_machine_that_drifts_out_of_its_limits_is_named():
     m = machine() + fx.VoltageOffset(offset=0.5)
     a, b = (
-        hypothesis(m, e, other, {}, NOISE, Ts) for e, other in ((fx.Delay(time=0.003), LAG), (LAG, DELAY))
+        rival_model(m, e, other, {}, NOISE, Ts) for e, other in ((fx.Delay(time=0.003), LAG), (LAG, DELAY))
     )
-    c = Contest((a, b), Ts, Limits(voltage=2.0, travel=0.1))
+    c = DiscriminationProblem((a, b), Ts, Limits(voltage=2.0, travel=0.1))
     with pytest.raises(InputError, match="offset"):
-        c.within(noise(600, Ts, seed=1))
+        c.scaled_to_limits(noise(600, Ts, seed=1))
 
 
 @pytest.mark.parametrize(
@@ -300,7 +300,7 @@ def test_a_machine_that_drifts_out_of_its_limits_is_named():
         ("delay@input", "lag@input", {"process_noise": {"wheel": 1e-6}}, "wheel"),
     ],
 )
-def test_bad_input_is_told_in_a_sentence(a, b, changes, match):
+def test_bad_input_is_named_in_a_sentence(a, b, changes, match):
     settings = {"noise": {"theta": 1e-3, "alpha": 1e-3}, "limits": V} | changes
     with pytest.raises(InputError, match=match):
         rf.next_experiment(machine(), a, b, **settings)
@@ -315,4 +315,9 @@ def test_limits_must_be_positive(wrong):
 
 
 def test_effects_may_be_given_in_three_ways():
-    assert place_of("delay@input") == place_of(("delay", "input")) == place_of(fx.Delay(time=0.1)) == DELAY
+    assert (
+        effect_location("delay@input")
+        == effect_location(("delay", "input"))
+        == effect_location(fx.Delay(time=0.1))
+        == DELAY
+    )

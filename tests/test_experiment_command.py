@@ -8,8 +8,8 @@ import pytest
 
 import rotflex_jax as rf
 from arena.records import make_record
-from rotflex_jax.cli import main
-from rotflex_jax.data.io import save_csv
+from rotflex_jax.cli.app import main
+from rotflex_jax.data.files import save_csv
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import pytest
 from matplotlib.image import imread
 
 import rotflex_jax as rf
-from rotflex_jax.display.explorer import Explorer
 from rotflex_jax.errors import InputError
-from rotflex_jax.model import _free_many
+from rotflex_jax.models.model import _free_many
+from rotflex_jax.notebook.explorer import Explorer
 
 pytest.importorskip("ipywidgets")
 
@@ -58,8 +58,8 @@ def test_a_moved_number_is_that_of_the_model(explorer: Explorer, recording: rf.R
     explorer.factor.value = 1.3
     assert "joint.spring.stiffness = 2.093 N m/rad" in explorer._text.value
     by_hand = rf.Model(
-        explorer._begun.mechanism.with_values({"joint.spring.stiffness": 1.3 * 1.61}),
-        gates=explorer._begun.gates,
+        explorer.model.mechanism.with_values({"joint.spring.stiffness": 1.3 * 1.61}),
+        gates=explorer.model.gates,
     )
     np.testing.assert_allclose(
         explorer.model.simulate_windows(recording), by_hand.simulate_windows(recording), atol=1e-12

@@ -6,19 +6,20 @@ import textwrap
 import numpy as np
 import pytest
 
-from rotflex_jax import cli, fastloops
+from rotflex_jax.cli import app
 from rotflex_jax.effects import CATALOG, Coulomb
 from rotflex_jax.export import Saved, save, to_c
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import simulate
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
+from rotflex_jax.runtime import xla
 
 
 @pytest.fixture(autouse=True)
 def no_global_settings(monkeypatch):
     """What the program sets up for its own process must not leak into the other tests."""
-    monkeypatch.setattr(fastloops, "enable_fast_loops", lambda: True)
-    monkeypatch.setattr(fastloops, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
 
 
 @pytest.fixture
@@ -27,7 +28,7 @@ def run(capsys):
 
     def run(*arguments):
         with pytest.raises(SystemExit) as left:
-            cli.main([str(argument) for argument in arguments])
+            app.main([str(argument) for argument in arguments])
         return left.value.code, *capsys.readouterr()
 
     return run
@@ -116,7 +117,7 @@ def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
 
 def test_a_machine_of_ones_own_from_a_file(run, plant, tmp_path):
     """Named on the command line, its channels are read from the file by their own names."""
-    from rotflex_jax.choices import named
+    from rotflex_jax.joints.by_name import named
 
     u = 2 * np.sin(np.arange(800) * 0.02) + 0.3
     braked = named(f"{plant}:braked").mechanism
@@ -125,7 +126,7 @@ def test_a_machine_of_ones_own_from_a_file(run, plant, tmp_path):
     data = tmp_path / "run.csv"
     np.savetxt(data, table, delimiter=",", header="t,voltage,tacho", comments="", fmt="%.17g")
     status, out, _ = run("simulate", data, "--joint", f"{plant}:wheel", "--save-model", tmp_path / "w.json")
-    assert status == 0 and "tacho [rad/s]" in out
+    assert status == 0 and "tacho [deg/s]" in out
     assert Model.load(tmp_path / "w.json").mechanism.ports == (("axle", (1.0,)),)
     status, out, _ = run("simulate", data, "--model", f"{plant}:wheel", "--add", "plant_drag@axle")
     (row,) = (line.split() for line in out.splitlines() if "free run" in line)

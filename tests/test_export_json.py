@@ -8,13 +8,13 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.effects import CATALOG, BoucWen, Coulomb, LearnedTorque, Motor
-from rotflex_jax.effects.kinds import Actuation, Sensing
+from rotflex_jax.effects.base import Actuation, Sensing
 from rotflex_jax.errors import InputError
 from rotflex_jax.export import Saved, read, save
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
 from rotflex_jax.mechanism.units import Units
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 AWKWARD = (0.1 + 0.2, 1 / 3, np.pi * 1e-9, 5e-324, 1.7976931348623157e308)

@@ -19,10 +19,10 @@ from rotflex_jax.effects import (
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.export import latex, state_space, text
-from rotflex_jax.export.law import law
+from rotflex_jax.export.equations import law
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import simulate, simulate_states
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 
 JOINT = {
     "hub_inertia": 0.0021,

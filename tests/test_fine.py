@@ -5,16 +5,16 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import small_bench as sb
+import small_problem as sp
 
 import rotflex_jax as rf
-from rotflex_jax.discover.fine import FINER, refined
-from rotflex_jax.discover.lanes import Bench
-from rotflex_jax.discover.refit import Judge, levenberg_marquardt
+from rotflex_jax.discover.bias_correction import SUBSTEP_FACTOR, correct_discretisation_bias
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.refit import levenberg_marquardt
 from rotflex_jax.effects import Delay, Heating, Lag
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.parameters import Transform
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 
 @pytest.mark.parametrize("late", [Delay(time=0.0045), Delay(time=0.004), Lag(time=0.006), Lag(time=0.0007)])
@@ -34,26 +34,24 @@ def test_a_late_voltage_moves_a_mass_as_far_as_it_should(late):
 # -- finer steps ------------------------------------------------------------------------------------
 
 
-def coarse(found: Judge, substeps: int) -> Judge:
-    bench = found.bench
-    return dataclasses.replace(
-        found, bench=Bench(bench.supermodel, Exponential(substeps=substeps), bench.data)
-    )
+def coarse(found: LikelihoodProblem, substeps: int) -> LikelihoodProblem:
+    solver = Exponential(substeps=substeps)
+    return LikelihoodProblem.of(found.supermodel, solver, found.dataset, found.ports)
 
 
-def with_friction(judge: Judge):
-    s, h = judge.bench.supermodel, sb.fitted(judge)
-    i = s.parameter_indices(sb.HUB)[0]
+def with_friction(problem: LikelihoodProblem):
+    s, h = problem.supermodel, sp.fitted(problem)
+    i = s.parameter_indices(sp.HUB)[0]
     z = h.z.copy()
     z[i] = Transform.of([s.mechanism.parameter_specifications[i]]).unconstrain(np.array([0.01]))[0]
-    return dataclasses.replace(h, places=(*h.places, sb.HUB), free=(*h.free, i), z=z)
+    return dataclasses.replace(h, locations=(*h.locations, sp.HUB), free=(*h.free, i), z=z)
 
 
 def test_one_step_reaches_what_a_fit_with_finer_steps_finds():
-    judge = coarse(sb.judge(sb.recordings(sb.records(0.03))), 1)
-    h = levenberg_marquardt(judge, [with_friction(judge)], steps=30)[0]
-    best = levenberg_marquardt(coarse(judge, FINER), [h], steps=30)[0]
-    better = refined(judge, h)
+    problem = coarse(sp.problem(sp.recordings(sp.records(0.03))), 1)
+    h = levenberg_marquardt(problem, [with_friction(problem)], max_steps=60)[0]
+    best = levenberg_marquardt(coarse(problem, SUBSTEP_FACTOR), [h], max_steps=60)[0]
+    better = correct_discretisation_bias(problem, h)
     free = list(h.free)
     before, after = (np.abs(x.z[free] - best.z[free]) for x in (h, better))
     assert before.max() > 1e-4
@@ -61,9 +59,9 @@ def test_one_step_reaches_what_a_fit_with_finer_steps_finds():
 
 
 def test_where_the_motion_is_linear_nothing_moves():
-    judge = coarse(sb.judge(sb.recordings(sb.records(0.0))), 1)
-    h = sb.fitted(judge)
-    assert refined(judge, h) is h
+    problem = coarse(sp.problem(sp.recordings(sp.records(0.0))), 1)
+    h = sp.fitted(problem)
+    assert correct_discretisation_bias(problem, h) is h
 
 
 # -- what came before -------------------------------------------------------------------------------

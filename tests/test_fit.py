@@ -13,7 +13,7 @@ from rotflex_jax.fit import fit
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.mechanism import Exponential, simulate
 from rotflex_jax.metrics import rmse
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 # Friction stops and starts within a sample; three steps in each keep that error below the noise.

@@ -10,9 +10,9 @@ from arena.plant import Plant
 from arena.records import make_record
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate, simulate_states
-from rotflex_jax.mechanism.initial import initial_states, rough_state
+from rotflex_jax.mechanism.initial_state import initial_states, rough_state
 from rotflex_jax.metrics import window_starts
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 

@@ -10,7 +10,7 @@ from rotflex_jax.effects import Motor
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.springs import ARM_ANCHORS, HUB_ANCHORS, SIDE, SPRINGS
 from rotflex_jax.mechanism import linearise
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 # Stiffness [N m/rad] by the maker's 2010 formula (config_rotflex.m) at spring, hub anchor A B C
 # and arm anchor 1 2 3, rounded to 4 decimals.

@@ -10,7 +10,7 @@ from scipy.linalg import expm, solve_discrete_are
 import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.mechanism import kalman_gains, linearise
-from rotflex_jax.mechanism.linearise import _built_up
+from rotflex_jax.mechanism.linear import process_covariance
 
 NOISE = np.array([5e-4, 8e-4])
 VECTORS = {"hub": [1.0, 0.0], "joint": [0.0, 1.0], "arm": [1.0, 1.0]}
@@ -52,13 +52,13 @@ def expected(joint, Q: np.ndarray, noise: np.ndarray, Ts: float) -> np.ndarray:
 
 @pytest.mark.parametrize("Ts", [0.002, 0.01])
 @pytest.mark.parametrize("inductance", [None, 0.18e-3])
-def test_built_up_covariance(Ts, inductance):
+def testprocess_covariance_covariance(Ts, inductance):
     joint = paper(inductance=inductance)
     A = linearise(joint).A
     for port in VECTORS:
         g = pushed(joint, port)
         exact = quadrature(A, g, Ts)
-        found = _built_up(A, np.linalg.solve(M, VECTORS[port]), 2, Ts)
+        found = process_covariance(A, np.linalg.solve(M, VECTORS[port]), 2, Ts)
         scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
         np.testing.assert_allclose(found / scale, exact / scale, atol=1e-7)
 

@@ -18,20 +18,14 @@ from rotflex_jax.basis import Delays, Orthonormal, Volterra
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import least_squares
 from rotflex_jax.joints import paper
-from rotflex_jax.kernels import (
-    Kernels,
-    average_kernels,
-    effect_kernels,
-    identified_kernels,
-    local_kernels,
-)
-from rotflex_jax.kernels.sensitivities import slopes
+from rotflex_jax.kernels import Kernels, average_kernels, effect_kernels, identified_kernels, local_kernels
+from rotflex_jax.kernels.figure import kernel_figure
+from rotflex_jax.kernels.sensitivities import output_derivatives
 from rotflex_jax.mechanism import Exponential, Mechanism, free_run, simulate
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.model import Model
-from rotflex_jax.precision import double_precision
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.report.kernels import kernel_figure
+from rotflex_jax.runtime.xla import double_precision
 
 NUMBERS = json.loads((Path(__file__).parent / "paper_numbers.json").read_text())
 Ts, MEMORY, REACH, N = 0.05, 6, 12, 8000
@@ -186,7 +180,7 @@ def test_slopes_are_the_derivative_of_the_whole_simulation(effects: tuple) -> No
         given = (jnp.asarray(m.mechanism.values), jnp.ones(len(m.mechanism.effects)))
         given = (*given, jnp.asarray(rest_state(s, np.float64)))
         u, period = jnp.asarray(white(1)[:length]), jnp.asarray(Ts)
-        found = slopes(s, m.solver, 1, reach, *given, u, period)[1]
+        found = output_derivatives(s, m.solver, 1, reach, *given, u, period)[1]
         run = lambda u: free_run(s, m.solver, *given, u, period)[1][:, 1]  # noqa: E731
         whole = np.asarray(jax.jit(jax.jacfwd(run))(u))
     t = np.arange(reach, length)
@@ -326,10 +320,10 @@ def test_what_odd_effects_do_to_an_odd_joint() -> None:
 
 
 def test_offset_makes_friction_even() -> None:
-    before = len(slopes)
+    before = len(output_derivatives)
     table = effect_kernels(model(HUB, OFFSET), white(10), "alpha", MEMORY, Ts=Ts)
     # One compilation for the kernels with and without each effect (none where a test above had it).
-    assert len(slopes) - before <= 1
+    assert len(output_derivatives) - before <= 1
     friction, offset = table.shares
     without = average_kernels(model(HUB), white(10), "alpha", MEMORY, Ts=Ts)
     np.testing.assert_allclose(offset.change.h2, table.whole.h2 - without.h2, atol=1e-12)
@@ -453,7 +447,7 @@ def test_bad_input_is_refused_in_one_sentence() -> None:
     refused("must be positive", lambda: local_kernels(joint, -1.0, "alpha", 4))
     refused("positive sampling period", lambda: average_kernels(joint, u, "alpha", 4))
     refused("longer recording", lambda: average_kernels(joint, u[:50], "alpha", 4, Ts=Ts))
-    refused("tells the lags apart", lambda: average_kernels(joint, np.ones(500), "alpha", 4, Ts=Ts))
+    refused("distinguishes the lags", lambda: average_kernels(joint, np.ones(500), "alpha", 4, Ts=Ts))
     refused("8 lags", lambda: average_kernels(joint, u, "alpha", 4, Ts=Ts, autocovariance=np.ones(3)))
     wild: Mechanism = joint + fx.QuadraticSpring("joint", stiffness=30.0)
     refused("does not stay finite", lambda: average_kernels(wild, u, "alpha", 4, Ts=Ts))

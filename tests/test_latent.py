@@ -10,24 +10,28 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 from arena.records import make_record
-from rotflex_jax import latent as package
-from rotflex_jax.discover.photographs import calibrated, within
+from rotflex_jax.discover.latent_comparison import calibrated, with_effects_of
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.effects import Coulomb, CubicSpring, Gravity, SensorBias
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.residuals import Data, sensor_noise
+from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
 from rotflex_jax.joints import paper, single_inertia
-from rotflex_jax.latent import latent_torque
-from rotflex_jax.latent.curve import binned
-from rotflex_jax.latent.intensity import Intensities
-from rotflex_jax.latent.pushed import Push, PushedStep, linear_model
-from rotflex_jax.latent.smoother import Linear, Start, log_likelihood, smoothed
+from rotflex_jax.latent import latent_torque, smoother
+from rotflex_jax.latent.augmented_model import AugmentedStep, UnknownTorque, linearise_along
+from rotflex_jax.latent.figure import latent_maps, latent_time
+from rotflex_jax.latent.result import binned_mean
+from rotflex_jax.latent.smoother import (
+    InitialDistribution,
+    IntensityEstimator,
+    LinearTimeVaryingModel,
+    fixed_interval_smoother,
+    log_likelihood,
+)
 from rotflex_jax.mechanism import linearise, simulate_states
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
-from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
-from rotflex_jax.report.latent import latent_maps, latent_time
+from rotflex_jax.runtime.xla import double_precision
 
 TRUE = {"hub_damping": 0.004, "joint_damping": 0.003}
 
@@ -41,22 +45,22 @@ def recorded(effects=(), seed: int = 101, seconds: float = 8.0, **named) -> tupl
 # -- the smoother --------------------------------------------------------------------------------
 
 
-def wandering(N: int = 40, m: int = 4, C: int = 2):
+def time_varying_model(N: int = 40, m: int = 4, C: int = 2):
     """A time-varying model whose last state alone is disturbed, as in the use it is made for."""
     rng = np.random.default_rng(5)
     A = np.eye(m) + 0.1 * rng.normal(size=(N, m, m))
     H, seen = rng.normal(size=(N, C, m)), (rng.random(N) > 0.2).astype(float)
-    model = Linear(A, 0.1 * rng.normal(size=(N, m)), H, rng.normal(size=(N, C)), seen)
+    model = LinearTimeVaryingModel(A, 0.1 * rng.normal(size=(N, m)), H, rng.normal(size=(N, C)), seen)
     return (
         model,
-        Start(rng.normal(size=m), np.full(m, 2.0)),
+        InitialDistribution(rng.normal(size=m), np.full(m, 2.0)),
         np.array([0.3, 0.5]),
         np.r_[np.zeros(m - 1), 0.2],
     )
 
 
-def textbook(model: Linear, start: Start, noise: np.ndarray, Q: np.ndarray):
-    """Rauch, Tung and Striebel, with the whole innovation at once and with inverses."""
+def textbook(model: LinearTimeVaryingModel, start: InitialDistribution, noise: np.ndarray, Q: np.ndarray):
+    """Rauch, Tung and Striebel, with all channels of an innovation at once and with inverses."""
     m, P, R = start.mean, np.diag(start.variance), np.diag(noise**2)
     prior, after, total = [], [], 0.0
     for A, c, H, y, seen in zip(*model, strict=True):
@@ -79,11 +83,11 @@ def textbook(model: Linear, start: Start, noise: np.ndarray, Q: np.ndarray):
 
 
 def test_the_smoother_is_that_of_rauch_tung_and_striebel():
-    given = wandering()
+    given = time_varying_model()
     mean, variance, total = textbook(*given)
     with double_precision():
         arrays = jax.tree.map(jnp.asarray, given)
-        found = [np.asarray(a) for a in smoothed(*arrays)]
+        found = [np.asarray(a) for a in fixed_interval_smoother(*arrays)]
         np.testing.assert_allclose(found[0], mean, rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(found[1], variance, rtol=1e-7, atol=1e-10)
         assert float(log_likelihood(*arrays)) == pytest.approx(total, rel=1e-10)
@@ -91,7 +95,7 @@ def test_the_smoother_is_that_of_rauch_tung_and_striebel():
 
 def test_without_process_noise_it_is_least_squares():
     """The textbook's inverse does not exist there; the first state is a plain regression."""
-    model, start, noise, Q = wandering(N=12)
+    model, start, noise, Q = time_varying_model(N=12)
     rows, targets, move, shift = [], [], np.eye(4), np.zeros(4)
     for A, c, H, y, seen in zip(*model, strict=True):
         if seen:
@@ -102,7 +106,7 @@ def test_without_process_noise_it_is_least_squares():
     J = np.vstack([*rows, prior])
     first = np.linalg.lstsq(J, np.concatenate([*targets, prior @ start.mean]), rcond=None)[0]
     with double_precision():
-        mean, variance = smoothed(*jax.tree.map(jnp.asarray, (model, start, noise, 0 * Q)))
+        mean, variance = fixed_interval_smoother(*jax.tree.map(jnp.asarray, (model, start, noise, 0 * Q)))
     np.testing.assert_allclose(np.asarray(mean)[0], first, rtol=1e-8)
     np.testing.assert_allclose(np.asarray(variance)[0], np.diag(np.linalg.inv(J.T @ J)), rtol=1e-7)
 
@@ -110,24 +114,28 @@ def test_without_process_noise_it_is_least_squares():
 # -- the linear model ----------------------------------------------------------------------------
 
 
-def pushed_along(mechanism, ports, S: np.ndarray, u: np.ndarray, Ts: float, decay: float) -> Linear:
+def linearised(
+    mechanism, ports, S: np.ndarray, u: np.ndarray, Ts: float, decay: float
+) -> LinearTimeVaryingModel:
     m = mechanism
     for port in ports:
-        m = m + Push(at=port)
-    step = PushedStep(m.structure, Model(m).solver, len(ports))
-    data = Data(u[None], np.zeros((1, len(u), len(m.channels))), np.ones((1, len(u))), np.array([Ts]))
+        m = m + UnknownTorque(at=port)
+    step = AugmentedStep(m.structure, Model(m).solver, len(ports))
+    data = StackedRecordings(
+        u[None], np.zeros((1, len(u), len(m.channels))), np.ones((1, len(u))), np.array([Ts])
+    )
     with double_precision():
         arrays = jax.tree.map(
             jnp.asarray, (m.values, np.ones(len(m.effects)), S[None], data, np.array([decay]))
         )
-        return jax.tree.map(lambda a: np.asarray(a)[0], linear_model(step, *arrays))
+        return jax.tree.map(lambda a: np.asarray(a)[0], linearise_along(step, *arrays))
 
 
-def test_a_linear_joint_keeps_its_state_space_and_feels_a_held_torque():
+def test_a_linear_joint_keeps_its_state_space_under_a_held_torque():
     joint, Ts = paper(**TRUE), 0.004
     rng = np.random.default_rng(2)
     S, u = rng.normal(size=(6, 6)), rng.normal(size=6)
-    found = pushed_along(joint, ("hub", "joint"), S, u, Ts, 0.9)
+    found = linearised(joint, ("hub", "joint"), S, u, Ts, 0.9)
     ss = linearise(joint)
     Ad, Bd = ss.discretise(Ts)
     for k in range(6):
@@ -147,43 +155,43 @@ def test_a_linear_joint_keeps_its_state_space_and_feels_a_held_torque():
         np.testing.assert_allclose(found.A[0, :4, column], reached, rtol=1e-6, atol=1e-12)
 
 
-def test_it_touches_a_nonlinear_mechanism_along_its_motion():
+def test_the_linear_model_is_tangent_to_a_nonlinear_mechanism():
     m = paper(**TRUE) + CubicSpring(at="joint", stiffness=60.0) + Gravity(at="hub", sine=0.05)
     u, Ts = np.sin(np.arange(50)), 0.004
     X = simulate_states(m, u, Ts)
     S = np.c_[X, np.zeros((50, 2))]
-    found = pushed_along(m, ("hub", "joint"), S, u, Ts, 1.0)
+    found = linearised(m, ("hub", "joint"), S, u, Ts, 1.0)
     on = np.einsum("kij,kj->ki", found.A, S) + found.c
     np.testing.assert_allclose(on[:-1, :4], X[1:], atol=1e-11)
     nudge = 1e-6 * np.random.default_rng(0).normal(size=S.shape)
-    near = pushed_along(m, ("hub", "joint"), S + nudge, u, Ts, 1.0)
+    near = linearised(m, ("hub", "joint"), S + nudge, u, Ts, 1.0)
     moved = np.einsum("kij,kj->ki", near.A, S + nudge) + near.c
     np.testing.assert_allclose(moved - on, np.einsum("kij,kj->ki", found.A, nudge), atol=1e-11)
 
 
 def test_the_intensity_is_that_of_scipy():
-    """One inertia, pushed by a random walk of known intensity; the optimum by another optimiser."""
+    """One inertia under a random walk of known intensity; the optimum by another optimiser."""
     m, Ts, N = single_inertia(inertia=0.01, damping=0.02), 0.01, 500
     rng = np.random.default_rng(3)
     u, d, x, rows = rng.normal(size=N), 0.0, np.zeros(2), []
-    found = pushed_along(m, ("hub",), np.zeros((N, 3)), u, Ts, 1.0)
+    found = linearised(m, ("hub",), np.zeros((N, 3)), u, Ts, 1.0)
     for k in range(N):
         rows.append(x[0] + 1e-4 * rng.normal())
         x = (found.A[k] @ np.r_[x, d] + found.c[k])[:2]
         d += np.sqrt(0.03 * Ts) * rng.normal()
     model = found._replace(y=np.array(rows)[:, None])
-    start = Start(np.zeros(3), np.r_[1e-6, 1e-6, 0.0])
-    search = Intensities(np.array([1e-4]), np.array([Ts]), 5.0, 1e-12, 1e3, 2, 1)
+    start = InitialDistribution(np.zeros(3), np.r_[1e-6, 1e-6, 0.0])
+    estimator = IntensityEstimator(np.array([1e-4]), np.array([Ts]), 5.0, 1e-12, 1e3, 2, 1)
 
     def cost(z, first=None):
         wide = start._replace(variance=np.r_[1e-6, 1e-6, np.exp(z[0] if first is None else first) * 2.5])
-        return -textbook(model, wide, search.noise, np.r_[0, 0, np.exp(z[0]) * Ts])[2]
+        return -textbook(model, wide, estimator.noise, np.r_[0, 0, np.exp(z[0]) * Ts])[2]
 
     best = minimize(cost, [np.log(1e-3)], method="Nelder-Mead", options={"xatol": 1e-3})
     with double_precision():
         whole = jax.tree.map(lambda a: jnp.asarray(a)[None], (model, start))
-        level = search.likeliest(*whole, np.array([1e-6]), 1e3)
-        (gain,) = search.gains(*whole, level)
+        level = estimator.maximise(*whole, np.array([1e-6]), 1e3)
+        (gain,) = estimator.gains(*whole, level)
     assert cost(np.log(level)) < best.fun + 0.5
     assert level[0] == pytest.approx(0.03, rel=0.6)
     assert gain == pytest.approx(cost([np.log(1e-12)], np.log(level[0])) - cost(np.log(level)), rel=1e-4)
@@ -205,7 +213,7 @@ def test_friction_is_seen_within_its_band():
     far = np.abs(curve.at) > 0.8
     inside = (curve.low < -0.03 * np.sign(curve.at)) & (-0.03 * np.sign(curve.at) < curve.high)
     assert far.sum() > 8 and inside[far].mean() > 0.8
-    # Nothing acts on the joint, and nothing is said to.
+    # Nothing acts on the joint, and nothing is estimated there.
     assert found.size("joint") < 0.02 * found.size("hub")
     assert found.gain_nats["hub"] > 1e4 > 10 > found.gain_nats["joint"]
 
@@ -239,7 +247,7 @@ def test_once_the_effect_is_in_the_model_nothing_is_left():
     r, _ = recorded(effects)
     full = Model(paper(**TRUE) + Coulomb(at="hub", level=0.03) + CubicSpring(at="joint", stiffness=60.0))
     both = [r, r.slice(500, 1500)]
-    before, after = (latent_torque(m, both) for m in (within(Model(paper(**TRUE)), full), full))
+    before, after = (latent_torque(m, both) for m in (with_effects_of(Model(paper(**TRUE)), full), full))
     assert before.size("hub") > 0.015 and before.size("joint") > 0.01
     assert after.size("hub") < 0.02 * before.size("hub")
     assert after.size("joint") < 0.02 * before.size("joint")
@@ -263,34 +271,34 @@ def test_two_recordings_are_one_after_the_other():
     np.testing.assert_allclose(found.position[: r.N, 0], r.y.sum(axis=1), atol=4e-3)
 
 
-def test_a_model_that_moves_is_not_compiled_anew():
+def test_other_parameters_need_no_compilation():
     r, _ = recorded(seconds=2.0)
     latent_torque(paper(**TRUE), r)
-    counts = len(linear_model), package.intensity._likelihoods._cache_size()  # type: ignore
+    counts = len(linearise_along), smoother._log_likelihoods._cache_size()
     latent_torque(paper(hub_damping=0.01, joint_damping=0.004), r)
-    assert (len(linear_model), package.intensity._likelihoods._cache_size()) == counts  # type: ignore
+    assert (len(linearise_along), smoother._log_likelihoods._cache_size()) == counts
 
 
 # -- curves and words ----------------------------------------------------------------------------------
 
 
 def test_a_stay_in_a_bin_counts_once():
-    """Means of stays are independent here and samples within a stay are not: the band is theirs."""
+    """Means of stays are independent here, samples within a stay are not: the band is that of the stays."""
     rng = np.random.default_rng(7)
     misses = []
     for _ in range(200):
         x = np.repeat(rng.permutation(np.tile(np.arange(4.0), 30)), 25)
         each = np.repeat(0.5 * rng.normal(size=120), 25)
-        found = binned(x + 0.01 * rng.normal(size=len(x)), x + each, 0 * x, 4, np.zeros(len(x), int))
+        found = binned_mean(x + 0.01 * rng.normal(size=len(x)), x + each, 0 * x, 4, np.zeros(len(x), int))
         misses.append((found["low"] > np.arange(4)) | (found["high"] < np.arange(4)))
         assert found["count"].sum() == len(x)
     assert 0.01 < np.mean(misses) < 0.10
 
 
-def test_a_single_stay_is_not_believed():
+def test_a_single_stay_has_a_wide_band():
     x = np.r_[np.tile(np.repeat([0.0, 1.0], 20), 50), np.full(30, 2.0)]
     torque = np.r_[np.repeat(np.random.default_rng(1).normal(size=100), 20), np.full(30, 3.0)]
-    found = binned(x, torque, 0 * x, 3, np.zeros(len(x), int))
+    found = binned_mean(x, torque, 0 * x, 3, np.zeros(len(x), int))
     width = found["high"] - found["low"]
     assert width[2] > 3 * width[0]
 
@@ -303,7 +311,7 @@ def test_offsets_of_a_recording_are_part_of_the_stage():
     assert isinstance(bias, SensorBias) and bias.bias == 0.01
 
 
-def test_bad_input_is_told():
+def test_bad_input_is_named():
     r, _ = recorded(seconds=2.0)
     with pytest.raises(InputError, match="'wrist' was asked for"):
         latent_torque(paper(), r, ports=["wrist"])

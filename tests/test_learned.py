@@ -12,18 +12,18 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
 from arena.records import make_record
-from rotflex_jax.discover.formula import LAWS, Formula, Term, candidates, read
+from rotflex_jax.discover.formula import FUNCTIONS, Formula, Term, candidates, read_formula
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.smooth_map import Information, Mapped, _smoother, penalties
-from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.discover.spline_map import FittedMap, MapEquations, _smoother, penalties
+from rotflex_jax.discover.whitening import Whitener
 from rotflex_jax.effects import CATALOG, LearnedTorque, QuadraticDrag
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import simulate
-from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision
 
-learned = importlib.import_module("rotflex_jax.discover.learned")
+learned = importlib.import_module("rotflex_jax.discover.learned_torque")
 
 TRUE = {"hub_damping": 0.004, "joint_damping": 0.003}
 MAP = LearnedTorque(at="hub", position=(-1.0, 2.0), speed=(-3.0, 4.0), bend=0.2, count=(5, 9))
@@ -105,11 +105,11 @@ def test_penalties_are_squared_differences():
     assert len(penalties(flat)) == 2
 
 
-def information(J: np.ndarray, r: np.ndarray, physics: np.ndarray, excess: float = 1.0) -> Information:
+def information(J: np.ndarray, r: np.ndarray, physics: np.ndarray, excess: float = 1.0) -> MapEquations:
     """Of residuals `r + J c + physics a` with nothing fitted yet."""
     W, n = np.hstack([physics, J]), physics.shape[1]
-    places = np.arange(W.shape[1])
-    return Information(W.T @ W, W.T @ r, places[:n], places[:n], places[n:], 0.5 * float(r @ r), excess)
+    indices = np.arange(W.shape[1])
+    return MapEquations(W.T @ W, W.T @ r, indices[:n], indices[:n], indices[n:], 0.5 * float(r @ r), excess)
 
 
 def test_smoothness_is_of_largest_likelihood():
@@ -135,7 +135,7 @@ def test_smoothness_is_of_largest_likelihood():
 # -- formulas ---------------------------------------------------------------------------------------------
 
 
-def mapped(found: Information, weights: int, prior: float = 1e-3) -> Mapped:
+def mapped(found: MapEquations, weights: int, prior: float = 1e-3) -> FittedMap:
     """The best weights in closed form."""
     H, g = found.projected()
     V = np.linalg.inv(H + prior * np.eye(weights))
@@ -152,11 +152,11 @@ def mapped(found: Information, weights: int, prior: float = 1e-3) -> Mapped:
         full,
         np.zeros((1, 0)),
         np.zeros((1, 0)),
-        np.zeros(0),
+        np.zeros((1, 0, 1)),
         {},
         Whitener(np.ones((1, 1)), np.eye(1)),
     )
-    return Mapped(h, np.eye(weights), V, False, at)
+    return FittedMap(h, np.eye(weights), V, False, at)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_a_formula_is_read_in_noise_beside_a_damper(law, wanted):
     noise, design = 0.01, effect.design(q, w)
     r = -law(q, w) / noise + rng.normal(size=N)
     physics = np.stack([w, np.ones(N)], axis=1) / noise
-    found = read(mapped(information(effect.scale * design / noise, r, physics), 153), effect, q, w)
+    found = read_formula(mapped(information(effect.scale * design / noise, r, physics), 153), effect, q, w)
     assert {t.name for t in found.terms} == set(wanted)
     for term in found.terms:
         assert term.coefficient == pytest.approx(
@@ -209,7 +209,7 @@ def test_terms_name_themselves():
     assert Term("w |w|", 0.0).unit == "N m s^2/rad^2"
     small = candidates(np.linspace(-0.1, 0.1, 9), np.linspace(-1, 1, 9))
     assert any(t.name == "sin(12 q)" for t in small) and not any(t.name == "sin(2 q)" for t in small)
-    assert {t.law for t in candidates(np.linspace(-3, 3, 9), np.linspace(-1, 1, 9))} == set(LAWS)
+    assert {t.function for t in candidates(np.linspace(-3, 3, 9), np.linspace(-1, 1, 9))} == set(FUNCTIONS)
 
 
 # -- through the simulator -----------------------------------------------------------------------------------
@@ -225,7 +225,7 @@ def taught(effects=(), seed: int = 101, **given):
 def small_map():
     """Speed alone, so that little is compiled."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learned, "COUNT", (1, 13))
+        patch.setattr(learned, "SPLINES", (1, 13))
         yield
 
 
@@ -284,9 +284,9 @@ def test_a_model_that_lacks_nothing_stays_as_it_is(small_map):
 
 @pytest.mark.slow
 def test_a_map_that_does_not_gain_surely_enough_is_told_in_plain_json(small_map, monkeypatch):
-    monkeypatch.setattr(learned, "SURE", np.inf)
+    monkeypatch.setattr(learned, "MAP_GAIN_Z", np.inf)
     found = taught({("coulomb", "hub"): {"level": 0.03}})
-    assert found.held_out_gain_nats > learned.GAIN and not found.kept
+    assert found.held_out_gain_nats > learned.MAP_GAIN_NATS and not found.kept
     assert json.loads(json.dumps(found.to_dict()))["kept"] is False  # as a report writes it beside its page
 
 

@@ -10,8 +10,7 @@ from rotflex_jax.basis import Delays, GramSchmidt, Orthonormal, Volterra
 from rotflex_jax.data.excitation import noise
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import least_squares
-from rotflex_jax.fit.linear import CHUNK, factor, solve
-from rotflex_jax.fit.rows import Rows
+from rotflex_jax.fit.linear import ROWS_PER_FACTOR, RegressionRows, factor, solve
 from rotflex_jax.recording import Recording
 from rotflex_jax.reproduce.plants import plant, response
 
@@ -60,7 +59,7 @@ def test_intervals_are_the_usual_ones_where_the_residual_is_white() -> None:
 
 @pytest.mark.parametrize("blocks", [1, 3])
 def test_the_triangular_factor_is_that_of_all_rows(blocks: int) -> None:
-    A = np.random.default_rng(0).standard_normal((blocks * CHUNK - 7, 5))
+    A = np.random.default_rng(0).standard_normal((blocks * ROWS_PER_FACTOR - 7, 5))
     R = factor(A)
     np.testing.assert_allclose(R.T @ R, A.T @ A, rtol=1e-11, atol=1e-9)
     assert factor(A[:3]).shape == (5, 5)
@@ -126,7 +125,7 @@ def test_several_recordings_count_as_one_but_do_not_touch() -> None:
     phi = np.concatenate([basis.regressors(r.u)[20:] for r in parts])
     y = np.concatenate([r.y[20:, 0] for r in parts])
     np.testing.assert_allclose(fit.weights, np.linalg.lstsq(phi, y, rcond=None)[0], atol=1e-12)
-    rows = Rows.of(basis, parts, "alpha", 5)
+    rows = RegressionRows.of(basis, parts, "alpha", 5)
     assert rows.phi.shape == (790, 10)
     block = rows.blocks(8)
     assert [len(set(rows.segments[block == k])) for k in set(block)] == [1] * 8

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
 from rotflex_jax.discover import locate
-from rotflex_jax.discover.looks import views
+from rotflex_jax.discover.conditions import condition_sets
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper
 from rotflex_jax.recording import Recording
@@ -59,7 +59,7 @@ def test_reversals_are_named_with_their_time(moving) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "phrase", "place"),
+    ("kind", "phrase", "where"),
     [
         ("deflection", "the deflection is beyond ±", lambda s, a: np.abs(a) > 0.15),
         ("deflection", "the deflection is above", lambda s, a: a > 0.12),
@@ -67,11 +67,11 @@ def test_reversals_are_named_with_their_time(moving) -> None:
         ("speed", "the hub turns backwards faster than", lambda s, a: s < -1.2),
     ],
 )
-def test_speed_and_deflection_are_named(moving, kind, phrase, place) -> None:
+def test_speed_and_deflection_are_named(moving, kind, phrase, where) -> None:
     speed = np.gradient(moving.channel("theta"), moving.Ts)
     speed = np.convolve(speed, np.ones(15) / 15, mode="same")
     e = white(moving)
-    there = place(speed, moving.channel("alpha"))
+    there = where(speed, moving.channel("alpha"))
     e[there, 1] *= 5.0
     found = [w for w in locate(moving, e, moving.channels, NOISE) if w.kind == kind]
     assert [w.channel for w in found] == ["alpha"]
@@ -114,7 +114,7 @@ def test_noise_at_standstill_is_no_reversal() -> None:
     y = np.column_stack([theta, 0.1 * np.sin(9 * t)]) + 1e-3 * rng.standard_normal((N, 2))
     rec = Recording(u=np.sin(t), y=y, Ts=Ts)
     noise = {"theta": 1e-3, "alpha": 1e-3}
-    view = next(v for v in views(rec, rec.channels, noise, None) if v.kind == "reversal")
+    view = next(v for v in condition_sets(rec, rec.channels, noise, None) if v.kind == "reversal")
     just_after = np.flatnonzero(np.diff(view.bins, prepend=view.bins[0]) < 0)
     # The fifth is where the motion stops dead and the filter swings.
     assert rec.t[just_after[:4]] == pytest.approx([0.5, 1.5, 2.5, 3.5], abs=0.03)
@@ -163,16 +163,16 @@ def test_an_error_that_is_nowhere_is_found_nowhere(tau) -> None:
         e = lfilter([1.0], [1.0, -a], rng.standard_normal((rec.N + 500, 2)), axis=0)[500:]
         told = locate(rec, 1e-3 * e, rec.channels, NOISE)
         # Coloured noise truly has more low frequencies than a sensor.
-        places = [w for w in told if len(w.edges) and w.kind != "frequency"]
-        false += bool(places)
+        found = [w for w in told if len(w.edges) and w.kind != "frequency"]
+        false += bool(found)
     assert false <= 6  # of 60; seven or more have a chance of 3 % at the nominal 5 %
 
 
 def test_p_values_are_uniform_without_a_place(moving) -> None:
-    from rotflex_jax.discover.places import in_frequency, in_time, in_view
+    from rotflex_jax.discover.localise import in_conditions, in_frequency, in_time
 
     rec = recording(5, N=1200, Ts=0.01)
-    sorted_by = views(rec, rec.channels, NOISE, None)
+    sorted_by = condition_sets(rec, rec.channels, NOISE, None)
     assert [v.kind for v in sorted_by] == ["speed", "deflection", "reversal"]
     rng = np.random.default_rng(4)
     p: dict[str, list[float]] = {}
@@ -180,9 +180,9 @@ def test_p_values_are_uniform_without_a_place(moving) -> None:
         e = rng.standard_normal(rec.N)
         correlated = lfilter([1.0], [1.0, -0.9], rng.standard_normal(rec.N + 200))[200:]
         found = [in_time("theta", e, rec), in_frequency("theta", e, rec, "rad")]
-        found += [in_view("theta", {"lies": correlated**2}, view) for view in sorted_by]
-        for place in found:
-            p.setdefault(place.where.kind, []).append(place.where.p_value)
+        found += [in_conditions("theta", {"lies": correlated**2}, one) for one in sorted_by]
+        for share in found:
+            p.setdefault(share.where.kind, []).append(share.where.p_value)
     for kind, values in p.items():
         below = [np.mean(np.array(values) <= level) for level in (0.05, 0.2, 0.5)]
         # Three standard deviations of 150 draws.
@@ -210,7 +210,9 @@ def test_names_and_ports_of_another_machine() -> None:
     assert "of the motor error" in told
     assert "while load is beyond ±" in told
     rec = recording()
-    by_mechanism = [v.phrases for v in views(rec, ("theta", "alpha"), noise, paper()) if v.kind == "speed"]
+    by_mechanism = [
+        v.phrases for v in condition_sets(rec, ("theta", "alpha"), noise, paper()) if v.kind == "speed"
+    ]
     assert "while the hub turns forwards" in by_mechanism[0]
 
 

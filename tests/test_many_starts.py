@@ -9,17 +9,16 @@ from scipy.optimize import least_squares
 import rotflex_jax.effects as fx
 from arena.records import make_record
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.many_starts import many_starts
-from rotflex_jax.fit.marquardt import descend
-from rotflex_jax.fit.normal_equations import moved_by, normal_equations
-from rotflex_jax.fit.residuals import first_states, sensor_noise
+from rotflex_jax.fit.dataset import first_states, sensor_noise
+from rotflex_jax.fit.many_starts import many_starts, minimise_starts
+from rotflex_jax.fit.problem import directions, normal_equations
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate
-from rotflex_jax.mechanism.absent import Numbers, Samples
 from rotflex_jax.mechanism.assembly import whole_state
-from rotflex_jax.model import Model
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.sensitivities import Numbers, Samples
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision
 
 
 def recording(seed: int, seconds: float = 2.0) -> Recording:
@@ -52,13 +51,13 @@ def test_one_pass_has_the_sums_that_differences_of_runs_have(effect) -> None:
         structure = joint.structure
         start = whole_state(structure, jnp.asarray(x0))
         numbers = Numbers(jnp.asarray(joint.values), jnp.ones(len(joint.effects)), start, None)
-        ways = moved_by(structure, jnp.asarray(joint.values), jnp.asarray(moved), 4)
+        ways = directions(structure, jnp.asarray(joint.values), jnp.asarray(moved), 4)
         samples = Samples(*(jnp.asarray(a) for a in (u, y, seen, Ts)))
         sums = jax.jit(normal_equations, static_argnums=(0, 1))
         got = jax.device_get(sums(structure, Exponential(), numbers, ways, samples, jnp.asarray(scale)))
-    np.testing.assert_allclose(got.cost.sum(), e @ e / 2, rtol=1e-10)
+    np.testing.assert_allclose(got.cost, e @ e / 2, rtol=1e-10)
     # A difference across the instant at which friction lets go is not quite a slope.
-    np.testing.assert_allclose(got.g, J.T @ e, rtol=1e-4, atol=1e-4 * np.abs(J.T @ e).max())
+    np.testing.assert_allclose(got.gradient, J.T @ e, rtol=1e-4, atol=1e-4 * np.abs(J.T @ e).max())
     np.testing.assert_allclose(got.H, J.T @ J, rtol=1e-4, atol=1e-4 * np.diag(J.T @ J).min())
 
 
@@ -100,15 +99,15 @@ def test_those_that_went_to_the_end_agree_and_are_in_order(found) -> None:
     assert np.all(np.diff(result.costs) >= 0)
     assert result.share == 1.0
     assert "10 starts, 3 of them to the end" in str(result)
-    assert any("beginnings: 8 done" in line for line in said)
+    assert any("first seconds: 8 done" in line for line in said)
 
 
 def test_other_numbers_compile_nothing_anew(found) -> None:
     recordings, _, _ = found
-    before = len(descend)
+    before = len(minimise_starts)
     other = paper(hub_inertia=0.0025, stiffness=1.9, hub_damping=0.004, joint_damping=0.001)
     many_starts(other, recordings, starts=10, spread=0.3, short_seconds=0.7, keep=3, seed=5, max_steps=3)
-    assert len(descend) == before
+    assert len(minimise_starts) == before
 
 
 @pytest.mark.parametrize(

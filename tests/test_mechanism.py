@@ -14,10 +14,10 @@ from rotflex_jax.fit import fit
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, Mechanism, free_run, linearise, simulate
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import parameter
-from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision
 
 PORTS = {"hub": (1.0, 0.0), "joint": (0.0, 1.0), "arm": (1.0, 1.0)}
 OUTPUTS = {"theta": "hub", "alpha": "joint"}

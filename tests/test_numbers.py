@@ -118,7 +118,7 @@ KNOWN = {
         **dict.fromkeys(["0.03", "0.008", "0.04", "0.8"], "what was hidden, settings"),
         **dict.fromkeys(["2109.10681", "2501.05842"], "names of preprints"),
     },
-    "many_recordings.md": {"3.5": "fleet.processes.ROOM [GB], compared below"},
+    "many_recordings.md": {"3.5": "batch.workers.PROCESS_MEMORY [GB], compared below"},
     "first_look.md": {
         "3.11": "version of Python",
         **dict.fromkeys(["1.01", "0.7"], "what the demo prints, compared below"),
@@ -131,9 +131,15 @@ KNOWN = {
         **dict.fromkeys(["1.5", "0.07"], "numbers of the decision, compared in test_docs.py"),
         "13.4": "section of a book",
     },
-    "read_report.md": {"1.5": "verdict.NEAR_FLOOR"},
+    "read_report.md": {"1.5": "result.NEAR_FLOOR"},
     "measured_joint.md": {"-27.60": "reading of the sensor at rest [deg]"},
-    "public_recordings.md": {"-3.16": "published [N]", "2405.10779": "name of a preprint"},
+    "public_recordings.md": {
+        **dict.fromkeys(
+            ["0.49", "7.1", "20.06"], "mass and clocks of measured servos, checked by their readers"
+        ),
+        "-3.16": "published [N]",
+        "2405.10779": "name of a preprint",
+    },
     "seed_paper.md": {
         "-34.8": "a pole of the paper's joint, in tests/paper_numbers.json",
         "-8.99": "the other two, in tests/paper_numbers.json",
@@ -199,9 +205,11 @@ def test_pages_of_results_hold_what_the_results_hold(page: str) -> None:
 
 
 def test_what_pages_say_of_settings_and_of_the_demo_is_so() -> None:
-    from rotflex_jax.fleet.processes import ROOM
+    from rotflex_jax.batch.workers import PROCESS_MEMORY
 
-    assert f"holds more than {ROOM / 1e9:g} GB" in (ROOT / "docs" / "many_recordings.md").read_text()
+    assert (
+        f"holds more than {PROCESS_MEMORY / 1e9:g} GB" in (ROOT / "docs" / "many_recordings.md").read_text()
+    )
     look = (ROOT / "docs" / "first_look.md").read_text()
     shown = (ROOT / "notebooks" / "00_first_look.ipynb").read_text(encoding="utf-8")
     # The notebook runs the loop of the demo, by hand and in one call.

@@ -13,9 +13,7 @@ import pytest
 from turntable import FOR_THE_NOTEBOOK, Truth, record, write
 
 import rotflex_jax as rf
-from rotflex_jax.discover.looks import as_read
 from rotflex_jax.discover.supermodel import build
-from rotflex_jax.display import Live
 from rotflex_jax.effects import (
     CATALOG,
     Coulomb,
@@ -28,12 +26,14 @@ from rotflex_jax.effects import (
     Viscous,
     register,
 )
-from rotflex_jax.effects.kinds import Scale
+from rotflex_jax.effects.base import Scale
 from rotflex_jax.errors import InputError
-from rotflex_jax.mechanism.initial import rough_state
+from rotflex_jax.mechanism.initial_state import rough_state
 from rotflex_jax.mechanism.roles import calibrations, search_places
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
+from rotflex_jax.notebook import Live
 from rotflex_jax.parameters import parameter
+from rotflex_jax.text.numbers import as_read
 
 MOTOR = ("torque_constant", "back_emf", "resistance", "gear_ratio", "efficiency")
 
@@ -273,7 +273,7 @@ def machine(**changes):
         ({"effects": Motor(at="shaft")}, r"one Motor, but a list is needed; write \[Motor\(...\)\]"),
         ({"effects": [Motor]}, r"Motor was given as an effect, .* write Motor\(at=\"...\"\)"),
         ({"effects": [Motor(at="shaf")]}, "Motor was put at 'shaf', but this mechanism has 'shaft'"),
-        ({"outputs": ["shaft"]}, "outputs were given as .* channels with the port that each shows"),
+        ({"outputs": ["shaft"]}, "outputs were given as .* channels with the port that each measures"),
         ({"outputs": {"angle": ("shaft", "sped")}}, "'position' or 'speed'"),
         ({"outputs": {"angle": ("shaft", "speed", 1)}}, "needs a port, or a port and 'speed'"),
         ({"outputs": {"angle": "wheel"}}, r"needs one of the ports \('shaft',\)"),

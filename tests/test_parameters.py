@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from rotflex_jax.parameters import Estimate, Specification, Transform, parameter
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 FREE = Specification(unit="N m", typical=0.02)
 POSITIVE = Specification(unit="kg m^2", typical=0.002, lower=0.0)

@@ -11,12 +11,12 @@ import pytest
 import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential
-from rotflex_jax.mechanism.propagate import CHUNK, states
+from rotflex_jax.mechanism.scan import CHUNK_SAMPLES, states
 from rotflex_jax.mechanism.simulate import FreeStep, PredictorStep
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 # Shorter than a chunk, one chunk, a little more than one, and no multiple of it.
-LENGTHS = (1, 37, CHUNK, CHUNK + 1, 2 * CHUNK + 211)
+LENGTHS = (1, 37, CHUNK_SAMPLES, CHUNK_SAMPLES + 1, 2 * CHUNK_SAMPLES + 211)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ def test_forward_derivative(N):
     assert found[1].shape == (N, 2)
 
 
-@pytest.mark.parametrize("N", [37, CHUNK + 1])
+@pytest.mark.parametrize("N", [37, CHUNK_SAMPLES + 1])
 def test_each_argument_on_its_own(N):
     with double_precision():
         point = pendulum(N)
@@ -94,7 +94,7 @@ def test_each_argument_on_its_own(N):
             close(mine(*point), ordinary(*point))
 
 
-@pytest.mark.parametrize("N", [1, CHUNK + 1])
+@pytest.mark.parametrize("N", [1, CHUNK_SAMPLES + 1])
 def test_reverse_is_the_transpose_of_forward(N):
     with double_precision():
         point = pendulum(N)
@@ -116,7 +116,7 @@ def test_reverse_is_the_transpose_of_forward(N):
 def test_many_at_once():
     """vmap over points and over tangents gives what one at a time gives."""
     with double_precision():
-        points = [pendulum(CHUNK + 5, seed) for seed in range(3)]
+        points = [pendulum(CHUNK_SAMPLES + 5, seed) for seed in range(3)]
         ways = [tangent(points[0], seed) for seed in range(3)]
         step = Pendulum()
         slope = lambda p, d: jax.jvp(functools.partial(states, step), p, d)  # noqa: E731
@@ -132,7 +132,7 @@ def test_many_at_once():
 def test_the_step_of_a_joint(which):
     """The step works on many samples side by side as it works on one: friction, memory, current."""
     with double_precision():
-        step, *point = joint(CHUNK + 90)[which]
+        step, *point = joint(CHUNK_SAMPLES + 90)[which]
         way = tangent(tuple(point), 7)
         found = jax.jit(lambda p, d: jax.jvp(functools.partial(states, step), p, d))(tuple(point), way)
         expected = jax.jit(lambda p, d: jax.jvp(functools.partial(plain, step), p, d))(tuple(point), way)

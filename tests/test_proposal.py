@@ -10,16 +10,17 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.data.excitation import noise
 from rotflex_jax.discover import proposal
-from rotflex_jax.discover.findings import Round, Stage
+from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.proposal import proposed, seen_limits, with_proposal
-from rotflex_jax.discover.result import NEXT, Discovery
+from rotflex_jax.discover.result import NEXT, Round, Stage
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.mechanism import simulate
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 
 TS, SD = 0.01, 5e-4
 
 
-def found(verdict: str = "ambiguous") -> Discovery:
+def found(verdict: Verdict = Verdict.AMBIGUOUS) -> Discovery:
     """A delay that could as well be a lag, as a search would tell it."""
     m = rf.joints.paper(joint_damping=0.003, hub_damping=0.004)
     grown = m + fx.Delay(time=0.012)
@@ -37,9 +38,9 @@ def found(verdict: str = "ambiguous") -> Discovery:
 
 @pytest.fixture(scope="module")
 def answered():
-    old, proposal.SECONDS = proposal.SECONDS, 3.0
+    old, proposal.PROPOSAL_SECONDS = proposal.PROPOSAL_SECONDS, 3.0
     yield with_proposal(found())
-    proposal.SECONDS = old
+    proposal.PROPOSAL_SECONDS = old
 
 
 def test_the_best_standard_input_is_proposed_within_what_the_machine_has_borne(answered):
@@ -61,7 +62,7 @@ def test_the_json_keeps_its_contract(answered):
     assert told["file"] == NEXT
 
 
-@pytest.mark.parametrize("verdict", ["found", "nothing_missing", "unexplained", "not_excited"])
+@pytest.mark.parametrize("verdict", sorted(set(Verdict) - {Verdict.AMBIGUOUS}))
 def test_nothing_is_proposed_where_nothing_is_open(verdict):
     plain = found(verdict)
     assert with_proposal(plain) is plain

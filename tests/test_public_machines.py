@@ -14,8 +14,8 @@ import rotflex_jax as rf
 from rotflex_jax.data.benchmarks import Benchmark, Published, benchmark
 from rotflex_jax.effects import CATALOG, Coulomb, CubicSpring, ViscousAsymmetric, VoltageDrift, VoltageOffset
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.residuals import sensor_noise
-from rotflex_jax.mechanism.between import smoothed
+from rotflex_jax.fit.dataset import sensor_noise
+from rotflex_jax.mechanism.intersample import substep_voltages
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.mechanism.units import Units
 from rotflex_jax.recording import Recording
@@ -94,8 +94,8 @@ def test_a_smooth_input_drives_a_linear_circuit_as_its_frequency_response_says(s
 
 def test_what_is_smoothed_is_linear_and_keeps_a_constant():
     v = jax.random.normal(jax.random.key(3), (200,))
-    np.testing.assert_allclose(smoothed(jnp.full(200, 0.7), 3), 0.7, atol=1e-4)
-    np.testing.assert_allclose(smoothed(2 * v, 2), 2 * smoothed(v, 2), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(substep_voltages(jnp.full(200, 0.7), 3), 0.7, atol=1e-4)
+    np.testing.assert_allclose(substep_voltages(2 * v, 2), 2 * substep_voltages(v, 2), rtol=1e-5, atol=1e-5)
     with pytest.raises(InputError, match="smooth between its samples"):
         rf.kernels.local_kernels(
             rf.Model(rf.joints.silverbox(), rf.Exponential(substeps=2, between="smooth")), 0.001, "output", 4

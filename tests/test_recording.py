@@ -9,7 +9,7 @@ import pytest
 from rotflex_jax.data.excitation import noise, prbs, steps
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Finding, Recording
-from rotflex_jax.recording.sensor import quantisation_step
+from rotflex_jax.recording.quality import quantisation_step
 
 Ts = 0.002
 COUNT = 2 * np.pi / 4096

@@ -16,22 +16,25 @@ from rich.console import Console
 from test_locate import recording as turning, reversals, white
 
 from rotflex_jax.discover import locate
+from rotflex_jax.discover.discovery import Discovery
+from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.discover.formula import Formula, Term
-from rotflex_jax.discover.learned_result import LearnedTorqueResult
-from rotflex_jax.discover.photographs import Photographs
-from rotflex_jax.discover.result import VERDICTS, Discovery, Ranked, Round, Stage, Where
+from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
+from rotflex_jax.discover.learned_torque import LearnedTorqueResult
+from rotflex_jax.discover.result import Ranked, Round, Stage, Where
+from rotflex_jax.discover.tables import next_steps
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import Coulomb, CubicSpring, LearnedTorque
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.latent import LatentTorque
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report import parameter_table, summary_table, write_report
-from rotflex_jax.report.failure import profiles
 from rotflex_jax.report.figures import pictures
-from rotflex_jax.report.html import render
-from rotflex_jax.report.wording import HEADLINES, next_steps
+from rotflex_jax.report.figures.failure import profiles
+from rotflex_jax.report.page import render
 
 NASTY = "bench <script>alert(1)</script> & 'co'.csv"
 NOISE = 5e-4
@@ -128,7 +131,7 @@ def two_rounds() -> Discovery:
         "s",
     )
     return Discovery(
-        verdict="ambiguous",
+        verdict=Verdict.AMBIGUOUS,
         sentence="coulomb at hub and cubic_spring at joint explain the recording",
         train=(train,),
         test=(test,),
@@ -154,7 +157,7 @@ def nothing() -> Discovery:
     even = locate(full.test[0], full.test[0].y - base.windowed[0], ("theta", "alpha"), full.noise_floor)
     return dataclasses.replace(
         full,
-        verdict="nothing_missing",
+        verdict=Verdict.NOTHING_MISSING,
         sentence="Nothing is missing.",
         baseline=base,
         rounds=(),
@@ -170,7 +173,7 @@ def one_channel() -> Discovery:
     error = 0.01 * np.sin(test.t)[:, None] + NOISE
     base = stage(single_inertia(), test, error, {"hub.inertia.inertia": 1e-5})
     where = locate(test, error, ("theta",), [0.0])
-    return Discovery("unexplained", "Something remains", (test,), (test,), base, (), (), where, {}, 1.0)
+    return Discovery(Verdict.UNEXPLAINED, "Something remains", (test,), (test,), base, (), (), where, {}, 1.0)
 
 
 def photographed() -> LatentTorque:
@@ -228,8 +231,8 @@ def discovery() -> Discovery:
 @pytest.fixture
 def undrawn(monkeypatch) -> None:
     """Pages without figures, which take most of the time."""
-    monkeypatch.setattr("rotflex_jax.report.content.pictures", lambda *given: {})
-    monkeypatch.setattr(Discovery, "latent_torque", lambda self: Photographs(photographed(), None))
+    monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
+    monkeypatch.setattr(Discovery, "latent_torque", lambda self: LatentTorqueComparison(photographed(), None))
 
 
 @pytest.fixture(scope="module")
@@ -291,11 +294,11 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page) -> None:
 
 def test_what_a_reader_must_learn_is_there(page, discovery) -> None:
     text = read(page).text
-    assert HEADLINES["ambiguous"] in text
+    assert Verdict.AMBIGUOUS.shown.headline in text
     assert "Coulomb at hub and cubic spring at joint explain the recording." in text
     assert "The hub meets a constant friction torque of 0.03 N m." in text
     assert "τ = −stiffness · position³" in text
-    assert "These recordings cannot tell it from stribeck at hub." in text
+    assert "These recordings cannot distinguish it from stribeck at hub." in text
     assert "0.03000 N m" in text
     assert "0.02980 … 0.03020" in text
     assert "40.00 N m/rad³" in text
@@ -319,12 +322,12 @@ def test_what_a_user_wrote_is_escaped(page) -> None:
         assert tag not in read(page).tags
 
 
-@pytest.mark.parametrize("verdict", VERDICTS)
+@pytest.mark.parametrize("verdict", Verdict)
 def test_every_verdict_has_a_headline_and_a_next_step(discovery, verdict, undrawn) -> None:
     other = dataclasses.replace(discovery, verdict=verdict)
     assert next_steps(other)
     text = read(render(other)).text
-    assert HEADLINES[verdict] in text
+    assert verdict.shown.headline in text
     assert next_steps(other)[0][:30] in text
 
 
@@ -333,7 +336,7 @@ def test_a_report_without_rounds_says_so(undrawn) -> None:
     assert "evenly" in found.where[0].statement
     text = read(render(found)).text
     assert "No effect was added" in text
-    assert "Where the error lives" in text
+    assert "Where the error occurs" in text
     assert "staircase" not in pictures(found)
 
 
@@ -344,9 +347,10 @@ def test_one_channel_in_another_unit_and_nothing_ranked(undrawn) -> None:
 
 
 def test_the_final_model_is_located_where_something_remains(discovery, undrawn) -> None:
-    partly = dataclasses.replace(discovery, verdict="unexplained", rounds=discovery.rounds[:1])
-    text = read(render(partly)).text
+    partly = dataclasses.replace(discovery, verdict=Verdict.UNEXPLAINED, rounds=discovery.rounds[:1])
+    text = read(render(partly, Explanation(remaining=remaining_failures(partly)))).text
     assert "Where the final model still fails" in text
+    assert not remaining_failures(discovery)
     assert "Where the final model still fails" not in read(render(discovery)).text
 
 
@@ -404,17 +408,17 @@ def test_degrees_are_drawn_where_angles_are_read(discovery) -> None:
 
 
 def test_the_missing_torque_is_shown_and_what_was_learned(discovery, page, monkeypatch) -> None:
-    lacking = Photographs(photographed(), photographed().given_back())
-    grown = render(discovery, lacking, map_of_friction(discovery, True))
+    latent = LatentTorqueComparison(photographed(), photographed().given_back())
+    grown = render(discovery, Explanation(latent, map_of_friction(discovery, True)))
     text = read(grown).text
     assert "At the hub the baseline lacks 0.014 N m rms" in text
     assert "At the joint the baseline lacks nothing that could be seen" in text
     assert "τ = −0.0300 sign(w)" in text or "τ = −0.03 sign(w)" in text
     assert "98 %" in text and "755 nat" in text
     assert grown.count("<figure>") == page.count("<figure>") + 3
-    monkeypatch.setattr("rotflex_jax.report.content.pictures", lambda *given: {})  # text alone is read below
-    without = read(render(discovery, lacking, map_of_friction(discovery, False))).text
-    assert "does not make unseen data likelier" in without
+    monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})  # text alone is read below
+    without = read(render(discovery, Explanation(latent, map_of_friction(discovery, False)))).text
+    assert "does not make held-out data likelier" in without
     assert "The missing torque" not in read(page).text
 
 
@@ -430,7 +434,7 @@ def test_a_map_is_learned_only_where_something_is_unexplained(
     monkeypatch.setattr(Discovery, "learned_torque", learned_torque)
     discovery.report(tmp_path / "a")
     assert not asked and not (tmp_path / "a" / "learned_torque.json").exists()
-    dataclasses.replace(discovery, verdict="unexplained").report(tmp_path / "b")
+    dataclasses.replace(discovery, verdict=Verdict.UNEXPLAINED).report(tmp_path / "b")
     discovery.report(tmp_path / "c", learned=True)
     # Where most is left.
     assert asked == ["hub", "hub"]
@@ -461,7 +465,7 @@ def test_a_folder_that_cannot_be_written_is_told(discovery, undrawn, tmp_path, m
     def refuse(*args, **kwargs) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(Path, "open", refuse)  # of the file that is written beside the target
     with pytest.raises(InputError, match="Permission denied"):
         write_report(discovery, tmp_path)
 

@@ -9,23 +9,28 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rotflex_jax import cli, fastloops
 from rotflex_jax.basis import Delays, Volterra
+from rotflex_jax.cli import app
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import least_squares
 from rotflex_jax.mechanism import Exponential
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.reproduce import Settings, reproduce, signals, span
-from rotflex_jax.reproduce.adaptation import adapt, moments, settling, watched
-from rotflex_jax.reproduce.experiment import Reproduction
-from rotflex_jax.reproduce.grey import grey_box
+from rotflex_jax.reproduce import Settings, models, records as sources, reproduce
+from rotflex_jax.reproduce.adaptation import (
+    adapt,
+    moments,
+    predict,
+    settling,
+    settling_eigenvalue,
+    watched_index,
+)
+from rotflex_jax.reproduce.experiment import Reproduction, short_memory_errors
 from rotflex_jax.reproduce.machine import linear_joint, machine_rows, symmetric_twin
-from rotflex_jax.reproduce.models import linearised, nmse
+from rotflex_jax.reproduce.models import grey_box, linearised, nmse
 from rotflex_jax.reproduce.plants import plant, response
-from rotflex_jax.reproduce.prediction import predict, settling_eigenvalue
 from rotflex_jax.reproduce.records import from_measured, simulated
-from rotflex_jax.reproduce.trap import online_trap
+from rotflex_jax.runtime import xla
 
 SHORT = {"samples": 1500, "held_out": 800, "runs": 2, "step": 0.005}
 
@@ -125,9 +130,9 @@ def test_numbers_of_the_machine_are_settings_too() -> None:
 @pytest.mark.parametrize("filter", ["ar1", "butterworth", "fir"])
 def test_variance_is_exactly_that_of_the_settings(filter: str) -> None:
     s = Settings(filter=filter, Ts=0.02, cutoff=5.0, variance=2.0)
-    r = signals.autocovariance(s, 30)
+    r = sources.autocovariance(s, 30)
     assert r[0] == pytest.approx(2.0, rel=1e-12)
-    u = signals.filtered_noise(s, 60000, 3)
+    u = sources.filtered_noise(s, 60000, 3)
     effective = len(u) / (1 + 2 * np.sum((r / r[0]) ** 2))
     assert np.var(u) == pytest.approx(2.0, abs=4 * 2.0 * np.sqrt(2 / effective))
     sample = np.mean(u[:-4] * u[4:])
@@ -139,9 +144,9 @@ def test_autocovariance_of_the_butterworth_filter_is_that_of_its_spectrum() -> N
 
     s = Settings(filter="butterworth", Ts=0.02, cutoff=5.0)
     w = np.linspace(0, np.pi, 20001)
-    power = np.abs(freqz(*butter(signals.ORDER, 5.0, fs=50.0), w)[1]) ** 2
+    power = np.abs(freqz(*butter(sources.BUTTERWORTH_ORDER, 5.0, fs=50.0), w)[1]) ** 2
     expected = [np.trapezoid(power * np.cos(k * w), w) for k in range(8)]
-    np.testing.assert_allclose(signals.autocovariance(s, 8), np.array(expected) / expected[0], atol=1e-6)
+    np.testing.assert_allclose(sources.autocovariance(s, 8), np.array(expected) / expected[0], atol=1e-6)
 
 
 # What a memory can hold -----------------------------------------------------------------------------
@@ -150,9 +155,9 @@ def test_autocovariance_of_the_butterworth_filter_is_that_of_its_spectrum() -> N
 def test_least_error_of_five_samples_has_its_tabulated_values() -> None:
     s = Settings()
     intervals = np.array([0.001, 0.01, 0.02, 0.05, 0.1])
-    white = span.reach(s, linear_joint(s), intervals, white=True)
+    white = models.least_nmse(s, linear_joint(s), intervals, white=True)
     np.testing.assert_allclose(white, [0.9986, 0.6581, 0.4463, 0.0682, 0.00054], atol=1e-4)
-    coloured = span.reach(s, linear_joint(s), intervals)
+    coloured = models.least_nmse(s, linear_joint(s), intervals)
     np.testing.assert_allclose(coloured, [0.8559, 0.5805, 0.5319, 0.0596, 0.00055], atol=1e-4)
 
 
@@ -163,7 +168,7 @@ def test_eigenvalue_of_white_input_is_two_for_a_square_and_one_for_a_product() -
     s = Settings(cutoff=1e3)  # next to white
     basis = Volterra(Delays(5))
     theory = moments(s, basis, simulated(dataclasses.replace(s, **(SHORT | {"runs": 1}))))
-    square, product = (watched(Settings(coefficient=lags), basis) for lags in ((1, 1), (1, 2)))
+    square, product = (watched_index(Settings(coefficient=lags), basis) for lags in ((1, 1), (1, 2)))
     assert settling_eigenvalue(theory.R, basis.degrees, square) == pytest.approx(2.0)
     assert settling_eigenvalue(theory.R, basis.degrees, product) == pytest.approx(1.0)
     prediction = predict(s, basis.degrees, theory, square)
@@ -211,7 +216,7 @@ def test_orthogonalised_regressors_lead_to_the_same_kernels(transform: str) -> N
 
 
 def test_symmetric_friction_has_no_quadratic_kernel_and_an_offset_has() -> None:
-    u = signals.filtered_noise(Settings(), 1500, 4)
+    u = sources.filtered_noise(Settings(), 1500, 4)
     basis = Volterra(Delays(5))
 
     def quadratic(name: str) -> np.ndarray:
@@ -280,7 +285,7 @@ def test_the_paper_s_weights_come_from_the_plain_recursion(short: Reproduction) 
 
 
 def test_online_error_hides_what_the_frozen_weights_show() -> None:
-    found = online_trap(Settings(seed=2), N=6000)
+    found = short_memory_errors(Settings(seed=2), N=6000)
     assert found.online < 0.8 * found.least_squares
     assert found.frozen > 1.05 * found.least_squares
     assert found.least_squares == pytest.approx(0.856, abs=0.08)  # the exact bound of a linear joint
@@ -299,12 +304,12 @@ def test_a_filter_that_runs_away_is_reported() -> None:
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable]:
-    monkeypatch.setattr(fastloops, "enable_fast_loops", lambda: True)
-    monkeypatch.setattr(fastloops, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
+    monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
 
     def run(*arguments: object) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as left:
-            cli.main(["reproduce", *map(str, arguments)])
+            app.main(["reproduce", *map(str, arguments)])
         return left.value.code, *capsys.readouterr()
 
     yield run
@@ -344,7 +349,7 @@ def test_command_writes_figures_page_and_numbers(
 
 
 def recorded(file: Path, seconds: float = 40.0, Ts: float = 0.02) -> Path:
-    u = signals.filtered_noise(Settings(Ts=Ts), round(seconds / Ts), 5)
+    u = sources.filtered_noise(Settings(Ts=Ts), round(seconds / Ts), 5)
     y = response(plant("S1"), u, Ts, step=0.005)
     table = np.column_stack([Ts * np.arange(len(u)), u, y])
     np.savetxt(file, table, delimiter=",", header="t,voltage,theta,alpha", comments="", fmt="%.9g")
@@ -382,7 +387,7 @@ def test_recordings_take_the_place_of_the_simulation(run: Callable, tmp_path: Pa
 
 def test_equations_with_friction_take_their_place_in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = plant("S1").without("dead_zone", "input")
-    u = signals.filtered_noise(Settings(Ts=0.02), 2000, 6)
+    u = sources.filtered_noise(Settings(Ts=0.02), 2000, 6)
     train, test = Recording(u=u, y=response(machine, u, 0.02, step=0.005), Ts=0.02).split(0.7)
     records = from_measured(Settings(), [train], [test], linear_joint(Settings()))
 
@@ -392,7 +397,7 @@ def test_equations_with_friction_take_their_place_in_the_table(monkeypatch: pyte
         assert [part.duration for part in parts] == [pytest.approx(28.0)]  # all of it, before thinning
         return SimpleNamespace(model=Model(machine, Exponential(substeps=4)))
 
-    monkeypatch.setattr("rotflex_jax.reproduce.grey.fit", true_fit)
+    monkeypatch.setattr("rotflex_jax.reproduce.models.fit", true_fit)
     row = grey_box(records, quiet)
     # What is left comes from the first state, which is told by ten samples.
     assert row.held_out < 1e-4 < linearised(records).held_out / 100

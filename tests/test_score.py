@@ -4,15 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-import small_bench as sb
+import small_problem as sp
 from scipy.optimize import nnls
 
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.refit import levenberg_marquardt
-from rotflex_jax.discover.score import Score, _nonnegative, scores
-from rotflex_jax.discover.supermodel import build
-from rotflex_jax.effects.kinds import Scale
+from rotflex_jax.discover.score_test import Score, _amplitudes, scores
+from rotflex_jax.discover.supermodel import EffectLocation, build
+from rotflex_jax.effects.base import Scale
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import simulate
 from rotflex_jax.parameters import Transform
@@ -23,83 +23,85 @@ SMALL = 0.0015
 @pytest.fixture(scope="module")
 def weak():
     """Recordings with a little friction: judge, baseline at its optimum, its scores by place."""
-    judge = sb.judge(sb.recordings(sb.records(SMALL)))
-    h = sb.fitted(judge)
-    return judge, h, {s.place: s for s in scores(judge, h)}
+    problem = sp.problem(sp.recordings(sp.records(SMALL)))
+    h = sp.fitted(problem)
+    return problem, h, {s.location: s for s in scores(problem, h)}
 
 
-def switched_on(judge, h: Hypothesis, score: Score) -> Hypothesis:
+def switched_on(problem, h: Hypothesis, score: Score) -> Hypothesis:
     """The baseline with a candidate, where its score says."""
-    s = judge.bench.supermodel
-    c = s.candidates[score.place]
+    s = problem.supermodel
+    c = s.candidates[score.location]
     specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
     z = h.z.copy()
-    z[list(c.parameters)] = Transform.of(specs).unconstrain(score.start)
-    return dataclasses.replace(h, places=(*h.places, score.place), free=(*h.free, *c.parameters), z=z)
+    z[list(c.parameters)] = Transform.of(specs).unconstrain(score.start.values)
+    return dataclasses.replace(
+        h, locations=(*h.locations, score.location), free=(*h.free, *c.parameters), z=z
+    )
 
 
-def gain(judge, score: Score) -> float:
+def gain(problem, score: Score) -> float:
     """Nats to first order, without the price of the number."""
-    return score.nats + 0.5 * np.log(np.sum(judge.bench.data.seen) * 2)
+    return score.nats + 0.5 * np.log(np.sum(problem.seen) * 2)
 
 
 def test_a_score_foretells_the_gain_of_a_refit(weak):
-    judge, h, found = weak
-    score = found[sb.HUB]
-    refitted = levenberg_marquardt(judge, [switched_on(judge, h, score)])[0]
+    problem, h, found = weak
+    score = found[sp.HUB]
+    refitted = levenberg_marquardt(problem, [switched_on(problem, h, score)])[0]
     won = refitted.log_likelihood - h.log_likelihood
     assert won > 10
-    assert gain(judge, score) == pytest.approx(won, rel=0.2)
-    i = judge.bench.supermodel.parameter_indices(sb.HUB)[0]
-    level = refitted.values(judge.bench)[0, i]
-    assert score.start[0] == pytest.approx(level, rel=0.2)
+    assert gain(problem, score) == pytest.approx(won, rel=0.2)
+    i = problem.supermodel.parameter_indices(sp.HUB)[0]
+    level = refitted.values(problem.supermodel)[0, i]
+    assert score.start.values[0] == pytest.approx(level, rel=0.2)
     assert level == pytest.approx(SMALL, rel=0.4)
 
 
 def test_the_true_effect_comes_first(weak):
-    judge, h, found = weak
-    listed = scores(judge, h)
-    assert [s.place for s in listed] == [s.place for s in sorted(listed, key=lambda s: -s.nats)]
-    assert listed[0].place == sb.HUB and listed[0].nats > 0
-    assert found[sb.HUB].excited and 0.001 < found[sb.HUB].unconfounded < 1
+    problem, h, found = weak
+    listed = scores(problem, h)
+    assert [s.location for s in listed] == [s.location for s in sorted(listed, key=lambda s: -s.nats)]
+    assert listed[0].location == sp.HUB and listed[0].nats > 0
+    assert found[sp.HUB].excited and 0.001 < found[sp.HUB].orthogonal_fraction < 1
     # The visible size is a share of the size tried, a tenth of the motor's torque.
-    tried = 0.1 * judge.torque
-    assert found[sb.HUB].smallest * tried < SMALL
+    tried = 0.1 * problem.dataset.torque_scale
+    assert found[sp.HUB].detection_limit * tried < SMALL
 
 
 def test_what_the_baseline_can_move_has_no_score(weak):
     """Viscous friction at the hub is back-EMF by another name, and the back-EMF is free."""
-    judge, _, found = weak
+    problem, _, found = weak
     score = found[("viscous", "hub")]
-    assert score.unconfounded < 1e-3
-    assert gain(judge, score) < 0.5
+    assert score.orthogonal_fraction < 1e-3
+    assert gain(problem, score) < 0.5
     assert not score.excited
 
 
 def test_nothing_scores_where_nothing_is_missing():
-    judge = sb.judge(sb.recordings(sb.records(0.0)))
-    found = scores(judge, sb.fitted(judge))
-    assert len(found) == len(sb.WANTED)
+    problem = sp.problem(sp.recordings(sp.records(0.0)))
+    found = scores(problem, sp.fitted(problem))
+    assert len(found) == len(sp.WANTED)
     assert all(s.nats < 0 for s in found)
 
 
 def test_what_is_in_the_hypothesis_is_scored_no_more(weak):
-    judge, h, found = weak
-    with_it = switched_on(judge, h, found[sb.HUB])
-    assert {s.place for s in scores(judge, with_it)} == set(found) - {sb.HUB}
+    problem, h, found = weak
+    with_it = switched_on(problem, h, found[sp.HUB])
+    assert {s.location for s in scores(problem, with_it)} == set(found) - {sp.HUB}
 
 
 def test_switched_off_it_is_the_baseline(weak):
     """Innovations of a free run are those of the baseline alone, to the last digits."""
-    judge, _, _ = weak
-    bench, s = judge.bench, judge.bench.supermodel
-    off = sb.start(judge, places=())
-    e = bench.innovations([off.lane(bench)])[0]
-    plain = s.clean(off.values(bench)[0], ())
-    assert plain.parameter_names == sb.baseline().parameter_names
+    problem, _, _ = weak
+    s = problem.supermodel
+    off = sp.start(problem, locations=())
+    e = problem.innovations([off])[0]
+    plain = s.clean(off.values(s)[0], ())
+    assert plain.parameter_names == sp.baseline().parameter_names
     for r in range(2):
-        data = bench.data
-        y_hat = simulate(plain, data.u[r], float(data.Ts[r]), x0=off.x0[r], solver=sb.SOLVER)
+        data = problem.dataset.data
+        y_hat = simulate(plain, data.u[r], float(data.Ts[r]), x0=off.x0[r], solver=sp.SOLVER)
         np.testing.assert_allclose(e[r], data.y[r] - y_hat, atol=1e-11)
 
 
@@ -107,24 +109,25 @@ def test_switched_off_it_is_the_baseline(weak):
 def test_switched_on_it_is_the_clean_model(weak, friction):
     """To the last digits."""
     exact = 1e-9
-    judge, h, _ = weak
-    bench, s = judge.bench, judge.bench.supermodel
+    problem, h, _ = weak
+    s = problem.supermodel
     numbers = {"hub.coulomb.level": 0.02, "joint.cubic_spring.stiffness": 30.0}
     z = Transform.of(s.mechanism.parameter_specifications).unconstrain(
         s.mechanism.with_values(numbers).values
     )
-    places, by_hand = [("cubic_spring", "joint")], sb.baseline() + fx.CubicSpring("joint", 30.0)
+    locations = [EffectLocation("cubic_spring", "joint")]
+    by_hand = sp.baseline() + fx.CubicSpring("joint", 30.0)
     if friction:
-        places, by_hand = [*places, sb.HUB], by_hand + fx.Coulomb("hub", 0.02)
+        locations, by_hand = [*locations, sp.HUB], by_hand + fx.Coulomb("hub", 0.02)
     still = np.zeros((2, len(h.local)))
-    h = dataclasses.replace(sb.start(judge, places=tuple(places)), z=z, own=still)
-    e = bench.innovations([h.lane(bench)])[0]
-    clean = s.clean(h.values(bench)[0], places)
+    h = dataclasses.replace(sp.start(problem, locations=tuple(locations)), z=z, local_z=still)
+    e = problem.innovations([h])[0]
+    clean = s.clean(h.values(s)[0], locations)
     assert clean.structure == by_hand.structure
     np.testing.assert_allclose(clean.values, by_hand.values, rtol=1e-9)
-    data = bench.data
-    y_hat = simulate(by_hand, data.u[1], float(data.Ts[1]), solver=sb.SOLVER)
-    plain = simulate(sb.baseline(), data.u[1], float(data.Ts[1]), solver=sb.SOLVER)
+    data = problem.dataset.data
+    y_hat = simulate(by_hand, data.u[1], float(data.Ts[1]), solver=sp.SOLVER)
+    plain = simulate(sp.baseline(), data.u[1], float(data.Ts[1]), solver=sp.SOLVER)
     assert np.abs(y_hat - plain).max() > 100 * exact
     np.testing.assert_allclose(e[1], data.y[1] - y_hat, atol=exact)
 
@@ -139,7 +142,7 @@ def test_a_super_model_holds_what_is_new_and_possible():
         f"{at}.{n}.{p}"
         for n, at, p in (("voltage_offset", "input", "offset"), ("sensor_bias", "alpha", "bias"))
     ]
-    gates = s.gates([("gravity", "arm")])
+    gates = s.gates([EffectLocation("gravity", "arm")])
     on = [e.name for e, g in zip(s.mechanism.effects, gates, strict=True) if g]
     assert on == [*(e.name for e in paper().effects), "gravity"]
     c = s.candidates[("dead_zone", "input")]
@@ -153,12 +156,12 @@ def test_a_super_model_holds_what_is_new_and_possible():
 @pytest.mark.parametrize("one_sided", [True, False])
 def test_amplitudes_that_cannot_be_negative_are_not(one_sided):
     rng = np.random.default_rng(0)
-    c = dataclasses.replace(sb.supermodel().candidates[sb.HUB], one_sided=one_sided)
+    c = dataclasses.replace(sp.supermodel().candidates[sp.HUB], one_sided=one_sided)
     signs = set()
     for _ in range(30):
         J = rng.normal(size=(50, 2)) @ np.array([[1.0, 0.9], [0.0, 0.4]])
         r = rng.normal(size=50) - J @ rng.normal(size=2)
         free = np.linalg.lstsq(J, -r, rcond=None)[0]
         signs.add(bool((free < 0).any()))
-        np.testing.assert_allclose(_nonnegative(J, r, c), nnls(J, -r)[0] if one_sided else free, atol=1e-9)
+        np.testing.assert_allclose(_amplitudes(J, r, c), nnls(J, -r)[0] if one_sided else free, atol=1e-9)
     assert signs == {True, False}

@@ -5,8 +5,8 @@ import pytest
 
 from rotflex_jax.basis import Delays, GramSchmidt, Orthonormal, Volterra
 from rotflex_jax.errors import InputError
+from rotflex_jax.models.series import Series
 from rotflex_jax.recording import Recording
-from rotflex_jax.series import Series
 
 
 def recording(N: int = 60, Ts: float = 0.01, dtype: type = float) -> Recording:

@@ -19,16 +19,9 @@ from sticking import ARM, HUB, JOINT, Joint, asymmetric, coulomb, stribeck
 
 import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
-from rotflex_jax.mechanism import (
-    Exponential,
-    SmoothRK4,
-    free_run,
-    linearise,
-    simulate,
-    simulate_states,
-)
+from rotflex_jax.mechanism import Exponential, SmoothRK4, free_run, linearise, simulate, simulate_states
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 NUMBERS = json.loads((Path(__file__).parent / "paper_numbers.json").read_text(encoding="utf-8"))
 J_HUB, J_ARM, K = 0.0021, 0.0059, 1.61

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 
 import rotflex_jax.effects as fx
-from rotflex_jax.discover.lanes import Bench, Directions, Lane
-from rotflex_jax.discover.probing import Absent, probe
-from rotflex_jax.discover.supermodel import SuperModel, build, state_rows
-from rotflex_jax.fit.residuals import Data
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
+from rotflex_jax.discover.score_test import InactiveCandidates, candidate_sensitivities
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build
+from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, kalman_gains, simulate
-from rotflex_jax.mechanism.assembly import Layout, driven_voltage
-from rotflex_jax.mechanism.sensors import read_outputs
-from rotflex_jax.mechanism.simulate import PredictorStep
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.assembly import Layout, motor_voltage, own_states
+from rotflex_jax.mechanism.simulate import PredictorStep, read_outputs
+from rotflex_jax.runtime.xla import double_precision
 
 TS, N = (0.004, 0.005), 120
 SCALES = {p: fx.Scale(2.0, 3.0, 0.3, 0.2, 1.6, 0.006) for p in ("hub", "arm", "joint")}
@@ -35,10 +34,10 @@ WANTED = (
 )
 SETS = {
     "nothing": (),
-    "without states": (("cubic_spring", "joint"), ("lag", "input")),
-    "one memory": (("heating", "hub"), ("cubic_spring", "joint")),
-    "a mode and dry friction": (("second_mode", "arm"), ("coulomb", "joint")),
-    "all": tuple((cls.name, port) for cls, port in WANTED),
+    "without states": (EffectLocation("cubic_spring", "joint"), EffectLocation("lag", "input")),
+    "one memory": (EffectLocation("heating", "hub"), EffectLocation("cubic_spring", "joint")),
+    "a mode and dry friction": (EffectLocation("second_mode", "arm"), EffectLocation("coulomb", "joint")),
+    "all": tuple(EffectLocation(cls.name, port) for cls, port in WANTED),
 }
 
 
@@ -50,16 +49,16 @@ def supermodel() -> SuperModel:
 
 
 @functools.cache
-def bench() -> Bench:
+def predictor() -> BatchedPredictor:
     rng = np.random.default_rng(0)
     u = 1.5 * np.repeat(rng.normal(size=(2, N // 5)), 5, axis=1)
     y = np.stack([simulate(paper(stiffness=1.5), v, Ts) for v, Ts in zip(u, TS, strict=True)])
     y = y + 5e-4 * rng.normal(size=y.shape)
-    data = Data(u, y, 1.0 * (rng.random((2, N)) < 0.95), np.array(TS))
-    return Bench(supermodel(), Exponential(), data)
+    data = StackedRecordings(u, y, 1.0 * (rng.random((2, N)) < 0.95), np.array(TS))
+    return BatchedPredictor(supermodel(), Exponential(), data)
 
 
-def numbers(name: str) -> Lane:
+def numbers(name: str) -> ParameterSet:
     """Numbers of a set for the whole super-model, each recording with its own offsets and first state."""
     s, rng = supermodel(), np.random.default_rng(1)
     values, size = np.tile(s.mechanism.values, (2, 1)), Layout.of(s.mechanism.structure).size
@@ -68,14 +67,14 @@ def numbers(name: str) -> Lane:
     for r, Ts in enumerate(TS):
         K[r, s.baseline_states] = kalman_gains(s.baseline, [PROCESS], [5e-4, 5e-4], Ts)[0]
     gates = s.gates(s.calibrations + SETS[name])
-    x0[:, list(s.part(gates).states)] = 0.1  # at rest what is off
-    return Lane(values, x0 * rng.normal(size=x0.shape), gates, K)
+    x0[:, list(s.active(gates).states)] = 0.1  # at rest what is off
+    return ParameterSet(values, x0 * rng.normal(size=x0.shape), gates, K)
 
 
-def lane(name: str) -> Lane:
+def parameter_set(name: str) -> ParameterSet:
     """The same as a bench takes it: the first state is that of the part that runs."""
     whole = numbers(name)
-    return whole._replace(x0=whole.x0[:, list(supermodel().part(whole.gates).states)])
+    return whole._replace(x0=whole.x0[:, list(supermodel().active(whole.gates).states)])
 
 
 @functools.cache
@@ -87,14 +86,14 @@ def program():
     def predicted(gates, values, x0, K, u, y, seen, Ts):
         mechanism = structure.with_values(values)
         constants = (solver.prepare(structure, values, gates, Ts), K)
-        inputs = (driven_voltage(mechanism, gates, u, Ts), y, seen)
+        inputs = (motor_voltage(mechanism, gates, u, Ts), y, seen)
         X = jax.lax.scan(lambda x, w: (step(x, w, constants), x), x0, inputs)[1]
         return (y - read_outputs(mechanism, gates, X.T).T) * seen[:, None]
 
     def run(whole, dvalues, dgates):
         def e(values, gates):
             each = jax.vmap(functools.partial(predicted, gates))
-            return each(values, whole.x0, whole.K, *bench().on_device())
+            return each(values, whole.x0, whole.K, *predictor().on_device())
 
         at = (whole.values, whole.gates)
         return e(*at), jax.vmap(lambda dv, dg: jax.jvp(e, at, (dv, dg))[1])(dvalues, dgates)
@@ -104,7 +103,7 @@ def program():
     return jax.jit(run, compiler_options=rough)
 
 
-def whole_run(whole: Lane, along: Directions) -> tuple[np.ndarray, np.ndarray]:
+def whole_run(whole: ParameterSet, along: Directions) -> tuple[np.ndarray, np.ndarray]:
     """Innovations (R, N, C) and slopes (D, R, N, C)."""
     with double_precision():
         e, J = program()(*jax.tree.map(jnp.asarray, (whole, along.values, along.gates)))
@@ -113,7 +112,7 @@ def whole_run(whole: Lane, along: Directions) -> tuple[np.ndarray, np.ndarray]:
 
 def directions(name: str, *names: str) -> Directions:
     """Along parameters by a tenth of their values, in the first state not at all; always five."""
-    m, on = supermodel().mechanism, lane(name)
+    m, on = supermodel().mechanism, parameter_set(name)
     sizes = ((2, len(m.values)), on.x0.shape[1:], on.gates.shape)
     d = Directions(*(np.zeros((5, *size)) for size in sizes))
     for row, parameter in enumerate(names):
@@ -127,8 +126,8 @@ def directions(name: str, *names: str) -> Directions:
 
 def test_states_of_linear_effects_come_first_then_memories():
     s = supermodel()
-    rows = {(e.name, e.at): state_rows(s.mechanism).get(i) for i, e in enumerate(s.mechanism.effects)}
-    assert {place: r for place, r in rows.items() if r} == {
+    rows = {(e.name, e.at): own_states(s.mechanism).get(i) for i, e in enumerate(s.mechanism.effects)}
+    assert {location: r for location, r in rows.items() if r} == {
         ("motor", "hub"): (4,),
         ("second_mode", "arm"): (5, 6),
         ("dahl", "arm"): (7,),
@@ -142,8 +141,8 @@ def test_states_of_linear_effects_come_first_then_memories():
 
 @pytest.mark.parametrize("name", SETS)
 def test_a_part_lacks_the_candidates_that_are_off(name):
-    s, gates = supermodel(), lane(name).gates
-    part = s.part(gates)
+    s, gates = supermodel(), parameter_set(name).gates
+    part = s.active(gates)
     off = set(s.candidates) - set(SETS[name])
     expected = [e for e in s.mechanism.effects if (e.name, e.at) not in off]
     assert list(part.mechanism.effects) == expected
@@ -152,17 +151,17 @@ def test_a_part_lacks_the_candidates_that_are_off(name):
     assert [s.mechanism.parameter_names[i] for i in part.parameters] == [*part.mechanism.parameter_names]
     assert len(part.states) == Layout.of(part.mechanism.structure).size
     assert set(s.baseline_states) <= set(part.states)
-    mine, all_rows = state_rows(part.mechanism), state_rows(s.mechanism)
+    mine, all_rows = own_states(part.mechanism), own_states(s.mechanism)
     for k, i in enumerate(part.effects):
         assert tuple(part.states[row] for row in mine.get(k, ())) == all_rows.get(i, ())
-    assert s.part(gates) is part  # compiled once
+    assert s.active(gates) is part  # compiled once
     assert part.mechanism.trusted == s.baseline.trusted
 
 
 def test_a_part_holds_all_that_any_of_several_lanes_needs():
     s = supermodel()
-    both = np.stack([lane("one memory").gates, lane("a mode and dry friction").gates])
-    kept = {(s.mechanism.effects[i].name) for i in s.part(both).effects}
+    both = np.stack([parameter_set("one memory").gates, parameter_set("a mode and dry friction").gates])
+    kept = {(s.mechanism.effects[i].name) for i in s.active(both).effects}
     assert {"heating", "second_mode", "coulomb", "cubic_spring"} <= kept
     assert not {"lugre", "bouc_wen", "lag"} & kept
 
@@ -183,7 +182,7 @@ def test_candidates_that_could_not_act_are_left_out():
 
 def test_innovations_on_parts_are_those_of_the_whole():
     names = ("nothing", "without states", "one memory", "a mode and dry friction")
-    found = bench().innovations([lane(name) for name in names])
+    found = predictor().innovations([parameter_set(name) for name in names])
     for name, mine in zip(names, found, strict=True):
         whole = whole_run(numbers(name), directions(name))[0]
         np.testing.assert_allclose(mine, whole, rtol=0, atol=1e-10, err_msg=name)
@@ -193,8 +192,8 @@ def test_innovations_on_parts_are_those_of_the_whole():
 def test_slopes_on_parts_are_those_of_the_whole():
     name = "a mode and dry friction"
     along = directions(name, "hub.motor.torque_constant", "arm.second_mode.frequency", "joint.coulomb.level")
-    along.gates[3] = supermodel().gates([("cubic_spring", "joint")])
-    e, J = bench().slopes([lane(name)], [along])
+    along.gates[3] = supermodel().gates([EffectLocation("cubic_spring", "joint")])
+    e, J = predictor().slopes([parameter_set(name)], [along])
     whole_e, whole_J = whole_run(numbers(name), along)
     np.testing.assert_allclose(e[0], whole_e, rtol=0, atol=1e-10)
     for mine, whole in zip(J[0], whole_J, strict=True):
@@ -204,16 +203,18 @@ def test_slopes_on_parts_are_those_of_the_whole():
 
 def test_probes_are_the_slopes_of_the_whole():
     """Along amplitudes of what is off, and along the gate of the lag, which has no amplitude."""
-    s, now = supermodel(), lane("one memory")
+    s, now = supermodel(), parameter_set("one memory")
     names = ("hub.lugre.level", "joint.bouc_wen.level", "arm.second_mode.inertia", "joint.coulomb.level")
     along = directions("one memory", *names)
-    along.gates[4] = s.gates([("lag", "input")]) - s.gates(())
-    values, put_in = now.values.copy(), lane("all").gates - along.gates[4]
+    along.gates[4] = s.gates([EffectLocation("lag", "input")]) - s.gates(())
+    values, put_in = now.values.copy(), parameter_set("all").gates - along.gates[4]
     values[:, [s.mechanism.parameter_names.index(name) for name in names]] = 0.0
-    families = s.families([c for c in s.candidates.values() if not c.sudden])
-    put = Lane(values, now.x0, put_in, now.K)
+    families = s.families([c for c in s.candidates.values() if not c.threshold])
+    put = ParameterSet(values, now.x0, put_in, now.K)
     # A direction belongs to one family; in the programs of the others nothing moves along it.
-    J = probe(bench(), now, [Absent(family, put, along) for family in families]).sum(axis=0)
+    J = candidate_sensitivities(
+        predictor(), now, [InactiveCandidates(family, put, along) for family in families]
+    ).sum(axis=0)
     assert len(families) == 4
     whole = whole_run(numbers("one memory")._replace(values=values, gates=put_in), along)[1]
     for name, mine, expected in zip((*names, "lag"), J, whole, strict=True):

@@ -8,10 +8,14 @@ import pytest
 import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, SmoothRK4, free_run, predictor_run
-from rotflex_jax.mechanism.absent import Numbers, Samples
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.mechanism.tangents import Ways, outputs_with_slopes
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.sensitivities import (
+    RecordingSamples,
+    RunParameters,
+    TangentDirections,
+    outputs_with_sensitivities,
+)
+from rotflex_jax.runtime.xla import double_precision
 
 JOINT = paper(hub_damping=0.01, joint_damping=0.002, inductance=2e-4)
 PLAIN = paper(hub_damping=0.01, joint_damping=0.002)
@@ -38,9 +42,13 @@ def test_slopes_are_those_of_the_whole_run(case: str) -> None:
     structure = joint.structure
     rng = np.random.default_rng(0)
     N, n, P, E = 120, len(rest_state(structure, np.float64)), len(joint.values), len(joint.effects)
-    ways = Ways(rng.normal(size=(5, P)) * joint.values, np.zeros((5, E)), 0.1 * rng.normal(size=(5, n)))
+    ways = TangentDirections(
+        rng.normal(size=(5, P)) * joint.values, np.zeros((5, E)), 0.1 * rng.normal(size=(5, n))
+    )
     ways.gates[4, -1] = 1.0
-    samples = Samples(3 * rng.normal(size=N), 0.1 * rng.normal(size=(N, 2)), np.arange(N) % 7 > 0.0, 0.002)
+    samples = RecordingSamples(
+        3 * rng.normal(size=N), 0.1 * rng.normal(size=(N, 2)), np.arange(N) % 7 > 0.0, 0.002
+    )
     gain = 0.2 * rng.normal(size=(n, 2)) if corrected else None
     with double_precision():
         given = jax.tree.map(jnp.asarray, (joint.values, np.ones(E), 0.05 * rng.normal(size=n)))
@@ -55,8 +63,10 @@ def test_slopes_are_those_of_the_whole_run(case: str) -> None:
         directions = jax.tree.map(jnp.asarray, tuple(ways))
         slope = jax.vmap(lambda p, g, x: jax.jvp(run, given, (p, g, x))[1], out_axes=-1)
         y_hat, J = jax.jit(lambda: (run(*given), slope(*directions)))()
-        numbers = Numbers(given[0], given[1], given[2], None if gain is None else jnp.asarray(gain))
-        carried = jax.jit(outputs_with_slopes, static_argnums=(0, 1))
-        got = carried(structure, solver, numbers, Ways(*directions), Samples(u, y, seen, Ts))
+        numbers = RunParameters(given[0], given[1], given[2], None if gain is None else jnp.asarray(gain))
+        carried = jax.jit(outputs_with_sensitivities, static_argnums=(0, 1))
+        got = carried(
+            structure, solver, numbers, TangentDirections(*directions), RecordingSamples(u, y, seen, Ts)
+        )
     np.testing.assert_allclose(got[0], y_hat, rtol=1e-10, atol=1e-12 * np.abs(y_hat).max())
     np.testing.assert_allclose(got[1], J, rtol=1e-7, atol=1e-9 * np.abs(J).max())

@@ -9,7 +9,8 @@ import numpy as np
 
 from arena.marks import Kept, Row, confusion, good, grouped, intervals, mean_set, sets
 from arena.table import answer, label
-from rotflex_jax.report.style import BASELINE, FINAL, INK, blank, styled
+from rotflex_jax.text.colours import BASELINE, FINAL, INK
+from rotflex_jax.text.plotting import blank, styled
 
 
 def publish(records: list[Row], results: Path) -> list[Path]:

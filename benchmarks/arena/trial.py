@@ -16,7 +16,7 @@ from arena.records import make_record
 from arena.scoring import parameter_errors, renamed, scored, visible
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.metrics import windowed_rmse
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 
 SPLIT, WINDOW, FS = 0.7, 2.0, 500.0
 BOTH = ["theta", "alpha"]

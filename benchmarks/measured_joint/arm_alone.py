@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
 import rotflex_jax as rf
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
 # Start and scale of each number; w2 and cubic per unit of the arm's inertia.
 START = {

@@ -7,17 +7,8 @@ from matplotlib.figure import Figure
 
 import rotflex_jax as rf
 from measured_joint.fine_run import STRUCTURES, TAKEN, free_runs
-from rotflex_jax.report.style import (
-    BASELINE,
-    BETWEEN,
-    FINAL,
-    INK,
-    MEASURED,
-    blank,
-    legend_above,
-    plain_ticks,
-    styled,
-)
+from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MEASURED
+from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled
 
 # The sensor: steps of 360 / 4096 degrees, as a standard deviation.
 NOISE = 360 / 4096 / np.sqrt(12)
@@ -91,7 +82,7 @@ def errors(fits: dict) -> Figure:
                         va="center",
                         fontsize=7.5,
                     )
-        ax.axvline(NOISE, color=BETWEEN[1], ls=":", lw=1.5, label="noise of the sensor")
+        ax.axvline(NOISE, color=FURTHER[1], ls=":", lw=1.5, label="noise of the sensor")
         ax.set_xscale("log")
         ax.set_xlim(0.02, 7 if column == 0 else 0.5)
         ax.set_xticks([0.03, 0.1, 0.3, *([1, 3] if column == 0 else [])])

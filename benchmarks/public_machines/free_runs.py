@@ -18,8 +18,8 @@ from scipy.optimize import least_squares
 
 import rotflex_jax as rf
 from public_machines.rounds import Say
-from rotflex_jax.discover.scales import scales
-from rotflex_jax.effects.kinds import Effect
+from rotflex_jax.discover.supermodel import scales
+from rotflex_jax.effects.base import Effect
 
 # Both held-out runs must come down to this share, or an effect is not taken.
 BETTER = 0.9

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rotflex_jax.adaptive import LMS, run
-from rotflex_jax.adaptive.learning import settling_step_size
+from rotflex_jax.adaptive.learning_curve import settling_step_size
 from rotflex_jax.basis import Delays, Volterra
 from seed_paper.blocks import Block, mean_and_spread
 from seed_paper.records import deflection, nmse, record, voltage

@@ -13,7 +13,7 @@ import numpy as np
 
 from rotflex_jax.adaptive import AdaptiveFilter, scan
 from rotflex_jax.basis import Basis
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 from seed_paper.records import record
 
 EVERY = 10

@@ -10,8 +10,8 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 from rotflex_jax.adaptive import LMS, RLS
-from rotflex_jax.adaptive.bounds import mean_square_bound
 from rotflex_jax.adaptive.moments import Moments, ar1_covariance
+from rotflex_jax.adaptive.step_sizes import mean_square_bound
 from rotflex_jax.basis import Delays, GramSchmidt, Hermite, Volterra
 from seed_paper.blocks import Block
 from seed_paper.learning import CUTOFF, Task, distances, first_below

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from rotflex_jax.adaptive import LMS
-from rotflex_jax.adaptive.bounds import mean_square_bound
-from rotflex_jax.adaptive.learning import settling_factor, settling_step_size
+from rotflex_jax.adaptive.learning_curve import settling_factor, settling_step_size
 from rotflex_jax.adaptive.moments import Moments, ar1_covariance
+from rotflex_jax.adaptive.step_sizes import mean_square_bound
 from rotflex_jax.basis import Delays, Volterra
 from seed_paper.blocks import Block
 from seed_paper.learning import EVERY, paths

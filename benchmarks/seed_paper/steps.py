@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rotflex_jax.adaptive import LMS
-from rotflex_jax.adaptive.bounds import analyse, mean_bound, mean_square_bound
+from rotflex_jax.adaptive.step_sizes import analyse, mean_bound, mean_square_bound
 from rotflex_jax.basis import Delays, Volterra
 from seed_paper import settling
 from seed_paper.blocks import Block

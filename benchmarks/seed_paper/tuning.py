@@ -10,13 +10,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 from rotflex_jax.adaptive import LMS
-from rotflex_jax.adaptive.grid import grid
-from rotflex_jax.adaptive.objectives import blocks as prepared
-from rotflex_jax.adaptive.settings import Curve
-from rotflex_jax.adaptive.tune import loss_and_slopes, tune
+from rotflex_jax.adaptive.objectives import tuning_data
+from rotflex_jax.adaptive.settings import RangeTransform
+from rotflex_jax.adaptive.tuning import grid, loss_and_slopes, tune
 from rotflex_jax.basis import Delays, Volterra
-from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision
 from seed_paper.blocks import Block, mean_and_spread
 from seed_paper.records import record
 
@@ -113,11 +112,11 @@ def recordings(seeds: range, N: int) -> list[Recording]:
 
 def largest_difference(train: list[Recording], objective: str) -> float:
     """Relative, over both slopes at one point."""
-    curve = Curve(("mu1", "mu2"), ((0.0, np.inf),) * 2)
+    curve = RangeTransform(("mu1", "mu2"), ((0.0, np.inf),) * 2)
     x, h = np.log([0.01, 3e-4]), 1e-5
     points = np.array([x, *(x + s * h * np.eye(2)[k] for k in range(2) for s in (1, -1))])
     with double_precision():
-        data = prepared(BASIS, train, "alpha", objective)
+        data = tuning_data(BASIS, train, "alpha", objective)
         values, slopes = loss_and_slopes(
             jnp.asarray(points), data, curve=curve, build=build, objective=objective
         )
@@ -133,7 +132,7 @@ def modal(train: list[Recording], objective: str) -> tuple[float, float, float]:
     half of the trace of diag(mu) R, reached along the same modes.
     """
     with double_precision():
-        data = prepared(BASIS, train, "alpha", "mean_error")
+        data = tuning_data(BASIS, train, "alpha", "mean_error")
         R, w, least = (np.asarray(x)[0] for x in (data.gram, data.best, data.smallest))
     N = train[0].N - train[0].n_init
     quadratic = BASIS.degrees == 2

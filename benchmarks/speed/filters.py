@@ -12,13 +12,11 @@ import numpy as np
 
 from rotflex_jax import Recording
 from rotflex_jax.adaptive import LMS, RLS, grid, run
-from rotflex_jax.adaptive.judged import values_at
-from rotflex_jax.adaptive.objectives import batch, evaluate
-from rotflex_jax.adaptive.settings import Curve
-from rotflex_jax.adaptive.tune import loss_and_slopes
+from rotflex_jax.adaptive.objectives import evaluate, tuning_data, values_at
+from rotflex_jax.adaptive.settings import RangeTransform
+from rotflex_jax.adaptive.tuning import loss_and_slopes
 from rotflex_jax.basis import Delays, Volterra
-from rotflex_jax.devices import mesh_of
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision, mesh_of
 from speed import c_reference, peers
 from speed.rounds import Case
 
@@ -117,8 +115,8 @@ def pairs_cases(N: int) -> list[Case]:
     lanes = c_reference.LANES * N * NANO
     searched = lambda axes: grid(_build(5), axes, basis, [recording], "alpha", objective="mean_error")  # noqa: E731
     with double_precision():
-        data = batch(basis, [recording], "alpha", "mean_error")
-        curve = Curve(("linear", "quadratic"), ((0.0, float("inf")),) * 2)
+        data = tuning_data(basis, [recording], "alpha", "mean_error")
+        curve = RangeTransform(("linear", "quadratic"), ((0.0, float("inf")),) * 2)
         point = jnp.asarray(np.log([[1e-3, 1e-4]]))
 
     def slopes() -> None:
@@ -157,7 +155,7 @@ def sweep(N: int) -> Callable[[], None]:
     points = np.array(np.meshgrid(*axes)).reshape(2, -1).T
     names, mesh = ("linear", "quadratic"), mesh_of()
     with double_precision():
-        data = batch(basis, [Recording(u=u, y=y, Ts=0.001, channels="alpha")], "alpha", "mean_error")
+        data = tuning_data(basis, [Recording(u=u, y=y, Ts=0.001, channels="alpha")], "alpha", "mean_error")
 
     def run() -> None:
         with double_precision():

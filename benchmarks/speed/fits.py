@@ -143,7 +143,7 @@ def optimistix_fit(r: Recording, p0: np.ndarray) -> np.ndarray:
     import jax
     import jax.numpy as jnp
 
-    from rotflex_jax.precision import double_precision
+    from rotflex_jax.runtime.xla import double_precision
 
     with double_precision():
         given = tuple(jnp.asarray(a) for a in (r.u, r.y, 0.01 * np.std(r.y, axis=0)))

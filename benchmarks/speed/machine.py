@@ -10,7 +10,7 @@ import numpy as np
 
 import rotflex_jax as rf
 from rotflex_jax.effects import Coulomb, CubicSpring
-from rotflex_jax.effects.kinds import Force, Probe, Scalar, Scale
+from rotflex_jax.effects.base import Force, Probe, Scalar, Scale
 from rotflex_jax.parameters import parameter
 
 Ts = 1e-3

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from rotflex_jax.fit.normal_equations import moved_by, normal_equations
+from rotflex_jax.fit.problem import moved_by, normal_equations
 from rotflex_jax.mechanism import Exponential, free_run, simulate
-from rotflex_jax.mechanism.absent import Numbers, Samples
-from rotflex_jax.mechanism.tangents import outputs_with_slopes
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters, outputs_with_sensitivities
+from rotflex_jax.runtime.xla import double_precision
 from speed import c_reference, peers
 from speed.machine import MOTOR, TRUE, Ts, dry, linear, multisine, smooth, voltage
 from speed.rounds import Case
@@ -98,7 +97,7 @@ def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any, Any]
     with double_precision():
         values, U, T = jnp.asarray(joint.values), jnp.asarray(u), jnp.asarray(Ts)
         gates, x0 = jnp.ones(len(joint.effects)), jnp.zeros(5)
-        samples = Samples(U, jnp.zeros((len(u), 2)), jnp.ones(len(u)), T)
+        samples = RecordingSamples(U, jnp.zeros((len(u), 2)), jnp.ones(len(u)), T)
         one = jnp.ones(len(values))
 
         def out(z: jax.Array) -> jax.Array:
@@ -106,11 +105,13 @@ def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any, Any]
 
         def carried(values: jax.Array) -> Any:
             ways = moved_by(structure, one, jnp.asarray(eight), 0)
-            return outputs_with_slopes(structure, solver, Numbers(values, gates, x0, None), ways, samples)
+            return outputs_with_sensitivities(
+                structure, solver, RunParameters(values, gates, x0, None), ways, samples
+            )
 
         def sums(values: jax.Array) -> Any:
             ways, scale = moved_by(structure, one, jnp.asarray(eight), 4), jnp.asarray([0.1, 0.01])
-            numbers = Numbers(values, gates, x0, None)
+            numbers = RunParameters(values, gates, x0, None)
             return normal_equations(structure, solver, numbers, ways, samples, scale)
 
         calls = [

@@ -67,7 +67,7 @@ def diffrax_joint(u: np.ndarray, p: np.ndarray, Ts: float) -> Callable[[], np.nd
     import jax
     import jax.numpy as jnp
 
-    from rotflex_jax.precision import double_precision
+    from rotflex_jax.runtime.xla import double_precision
 
     def flow(t: Any, x: Any, given: Any) -> Any:
         u, p = given

@@ -9,20 +9,10 @@ import re
 from generate.docstrings import plain
 from generate.laws import figure
 from rotflex_jax.effects import CATALOG, LearnedTorque
-from rotflex_jax.effects.kinds import KIND_LABELS, Effect
-from rotflex_jax.export.law import law
+from rotflex_jax.effects.base import KINDS, Effect
+from rotflex_jax.export.equations import law
 from rotflex_jax.parameters import Specification
 
-# Kind -> what it means, in the order of the list.
-KINDS = {
-    "dry friction": "A level that opposes motion; a port at rest is held by any torque within it.",
-    "force": "A torque that depends on position, speed or voltage at this moment.",
-    "with memory": "A torque with a state of its own: it depends on what came before.",
-    "gear": "Motor and machine touch only where the teeth do.",
-    "linear": "Enters the linear part of the equations, which the step integrates exactly.",
-    "actuation": "What lies between the recorded command and the motor.",
-    "sensing": "What a sensor makes of the true value.",
-}
 # What the figure shows, by kind, where that is not plain from its axes.
 CAPTIONS = {
     "with memory": "A wide swing, then narrow ones about another place: where the motion turns, the torque "
@@ -41,7 +31,7 @@ OWN_CAPTIONS = {
 
 def shown() -> list[type[Effect]]:
     """All effects of the catalogue, kind by kind, and the learned torque."""
-    order = list(KINDS)
+    order = [kind.kind_label for kind in KINDS]
     classes = [cls for cls in CATALOG.values() if cls.__module__.startswith("rotflex_jax.")]
     return sorted([*classes, LearnedTorque], key=lambda cls: (order.index(cls.kind()), cls.name))
 
@@ -59,7 +49,6 @@ def pages() -> dict[str, str]:
 
 def overview(on_site: bool = False) -> str:
     """The list of all effects, `docs/catalogue.md`; its links lead to the code, on the site to the pages."""
-    assert set(KINDS) == set(KIND_LABELS.values()), "a kind of effect lacks its line in KINDS"
     lines = [
         "# Catalogue of effects",
         "",
@@ -73,10 +62,10 @@ def overview(on_site: bool = False) -> str:
         "[another machine](own_machine.md) they are read by what acts there.",
         "",
     ]
-    for kind, meaning in KINDS.items():
-        lines += [f"## {kind.capitalize()}", "", meaning, ""]
+    for kind in KINDS:
+        lines += [f"## {kind.kind_label.capitalize()}", "", kind.kind_meaning, ""]
         lines += ["| effect | what it is | law | searched at |", "|---|---|---|---|"]
-        for cls in (c for c in shown() if c.kind() == kind):
+        for cls in (c for c in shown() if issubclass(c, kind)):
             where = ", ".join(f"`{place}`" for place in cls.searched) or "no"
             file = f"../{cls.__module__.replace('.', '/')}.py"
             link = f"effects/{cls.name}.rst" if on_site else file

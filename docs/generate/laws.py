@@ -10,9 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rotflex_jax import effects as fx
-from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Force, Linear, Memory, Sensing
-from rotflex_jax.precision import double_precision
-from rotflex_jax.report.style import FINAL, MUTED, blank, styled
+from rotflex_jax.effects.base import Actuation, DryFriction, Effect, Force, Linear, Memory, Sensing
+from rotflex_jax.runtime.xla import double_precision
+from rotflex_jax.text.colours import FINAL, MUTED
+from rotflex_jax.text.plotting import blank, styled
 
 # At rest friction holds with any torque of this band.
 HELD = {"color": FINAL, "alpha": 0.25, "lw": 7, "solid_capstyle": "butt"}
@@ -114,7 +115,7 @@ def _actuation(ax: Axes, effect: Effect) -> None:
     reach = 10.0 if effect.name == "saturation" else 0.4
     u = np.linspace(-reach, reach, 401)
     ax.plot(u, u, **OTHER, label="without it")
-    ax.plot(u, np.asarray(effect.drive(u, 0.001)), **LINE, label="with it")
+    ax.plot(u, np.asarray(effect.drive(jnp.asarray(u), 0.001)), **LINE, label="with it")
     _labels(ax, "command [V]", "voltage at the motor [V]")
 
 
@@ -125,7 +126,7 @@ def _in_time(ax: Axes, effect: Effect) -> None:
     t = np.arange(0, 0.06, Ts)
     u = np.where((t >= 0.01) & (t < 0.03), 1.0, 0.0)
     ax.plot(1e3 * t, u, **OTHER, drawstyle="steps-post", label="command")
-    v = np.asarray(effect.drive(u, Ts))
+    v = np.asarray(effect.drive(jnp.asarray(u), Ts))
     ax.plot(1e3 * t, v, **LINE, drawstyle="steps-post", label="at the motor")
     _labels(ax, "time [ms]", "voltage [V]")
 
@@ -133,7 +134,7 @@ def _in_time(ax: Axes, effect: Effect) -> None:
 def _drift(ax: Axes, effect: Effect) -> None:
     assert isinstance(effect, Actuation)
     t = np.linspace(0, 60, 601)
-    ax.plot(t, 1e3 * np.asarray(effect.drive(np.zeros_like(t), t[1])), **LINE)
+    ax.plot(t, 1e3 * np.asarray(effect.drive(jnp.zeros(len(t)), float(t[1]))), **LINE)
     _labels(ax, "time since the first sample [s]", "added voltage [mV]")
 
 

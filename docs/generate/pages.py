@@ -12,7 +12,7 @@ from generate import catalogue, reference
 PAGES = {
     "../CONTRIBUTING.md": "contributing.md",
     "../CHANGELOG.md": "changelog.md",
-    "../rotflex_jax/effects/kinds.py": "reference/rotflex_jax_effects_kinds.rst",
+    "../rotflex_jax/effects/base.py": "reference/rotflex_jax_effects_base.rst",
 }
 
 

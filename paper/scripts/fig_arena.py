@@ -2,7 +2,8 @@
 
 from sources import claims, save
 
-from rotflex_jax.report.style import BASELINE, FINAL, INK, MEASURED, blank, styled
+from rotflex_jax.text.colours import BASELINE, FINAL, INK, MEASURED
+from rotflex_jax.text.plotting import blank, styled
 
 COLUMNS = 3
 # Marker, colour and words of each kind of answer; shapes tell them apart without colour.

@@ -4,14 +4,15 @@ import math
 
 from sources import claims, save
 
-from rotflex_jax.report.style import BASELINE, BETWEEN, FINAL, INK, NOISE, blank, plain_ticks, styled
+from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, NOISE
+from rotflex_jax.text.plotting import blank, plain_ticks, styled
 
 LOOKS = {
     "physics": (FINAL, "o"),
     "linear": (INK, "s"),
-    "series": (BETWEEN[0], "^"),
-    "adaptive": (BETWEEN[1], "v"),
-    "sindy": (BETWEEN[2], "D"),
+    "series": (FURTHER[0], "^"),
+    "adaptive": (FURTHER[1], "v"),
+    "sindy": (FURTHER[2], "D"),
     "other": (BASELINE, "P"),
 }
 

@@ -4,7 +4,8 @@ import math
 
 from sources import ROOT, claims, save
 
-from rotflex_jax.report.style import BASELINE, FINAL, NOISE, blank, legend_above, plain_ticks, styled
+from rotflex_jax.text.colours import BASELINE, FINAL, NOISE
+from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled
 
 TITLES = {
     "ab": "learnt from run A, judged on B",

@@ -4,27 +4,24 @@ Beside the filters stand the theory of the simplest of them, LMS (`Moments`, `an
 learning curves), and the search for settings by gradient (`tune`) or on a grid (`grid`).
 """
 
-from rotflex_jax.adaptive.apa import AffineProjection
-from rotflex_jax.adaptive.bounds import Stability, analyse, mean_bound, mean_square_bound
 from rotflex_jax.adaptive.filter import AdaptiveFilter, scan
-from rotflex_jax.adaptive.grid import grid
-from rotflex_jax.adaptive.identify import Identified, identify
+from rotflex_jax.adaptive.identification import Identified, identify
 from rotflex_jax.adaptive.kalman import Kalman
 from rotflex_jax.adaptive.lattice import VolterraLattice
-from rotflex_jax.adaptive.learning import (
+from rotflex_jax.adaptive.learning_curve import (
     LearningCurve,
     learning_curve,
     settling_factor,
     settling_samples,
     settling_step_size,
 )
-from rotflex_jax.adaptive.lms import LMS
+from rotflex_jax.adaptive.lms import LMS, NLMS, AffineProjection, fixed_point
 from rotflex_jax.adaptive.moments import Moments, ar1_covariance
-from rotflex_jax.adaptive.nlms import NLMS, fixed_point
 from rotflex_jax.adaptive.rls import RLS
 from rotflex_jax.adaptive.running import Run, run
-from rotflex_jax.adaptive.tune import tune
-from rotflex_jax.adaptive.tuned import Tuned
+from rotflex_jax.adaptive.settings import Tuned
+from rotflex_jax.adaptive.step_sizes import Stability, analyse, mean_bound, mean_square_bound
+from rotflex_jax.adaptive.tuning import grid, tune
 
 __all__ = [
     "LMS",

@@ -1,16 +1,22 @@
-"""Kalman filter for weights that wander: how fast they may change is stated, not guessed from errors."""
+"""Kalman filter for weights on a random walk, whose variance per sample is given."""
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rotflex_jax.adaptive.filter import AdaptiveFilter
-from rotflex_jax.adaptive.ranges import Number, PerWeight, per_weight, real_data, within
-from rotflex_jax.adaptive.sums import times
+from rotflex_jax.adaptive.filter import (
+    AdaptiveFilter,
+    Number,
+    PerWeight,
+    per_weight,
+    real_data,
+    times,
+    within,
+)
 
 
-class Belief(NamedTuple):
+class KalmanState(NamedTuple):
     """Mean and covariance of the weights, as expected before the next sample."""
 
     w: Float[Array, " P"]
@@ -46,13 +52,15 @@ class Kalman(AdaptiveFilter):
         within("r", self.r, 0, float("inf"), open_low=True)
         within("p0", self.p0, 0, float("inf"))
 
-    def init(self, size: int, dtype: Any) -> Belief:
+    def init(self, size: int, dtype: Any) -> KalmanState:
         """All weights zero, with the variance `p0`."""
         real_data("Kalman", dtype)
-        return Belief(jnp.zeros(size, dtype), jnp.diag(per_weight("p0", self.p0, size, dtype)))
+        return KalmanState(jnp.zeros(size, dtype), jnp.diag(per_weight("p0", self.p0, size, dtype)))
 
-    def step(self, state: Belief, phi: Array, y: Array) -> tuple[Belief, Array]:
-        """Correction by the sample, then the walk to the next one."""
+    def step(
+        self, state: KalmanState, phi: Float[Array, " P"], y: Float[Array, ""]
+    ) -> tuple[KalmanState, Float[Array, ""]]:
+        """Correction by the sample, then the prediction for the next one."""
         w, P = state
         e = y - jnp.sum(w * phi)
         v = times(P, phi)
@@ -61,4 +69,4 @@ class Kalman(AdaptiveFilter):
         P = P - g[:, None] * v[None, :]
         P = P - times(P, phi)[:, None] * g[None, :] + (self.r * g)[:, None] * g[None, :]
         P = (P + P.T) / 2
-        return Belief(w + g * e, P + jnp.diag(per_weight("q", self.q, len(w), P.dtype))), e
+        return KalmanState(w + g * e, P + jnp.diag(per_weight("q", self.q, len(w), P.dtype))), e

@@ -6,27 +6,110 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from rotflex_jax.adaptive.filter import AdaptiveFilter
-from rotflex_jax.adaptive.lattice_weights import Stage, direct_form, known_channels, monomials
-from rotflex_jax.adaptive.ranges import Number, count, real_data, within
-from rotflex_jax.adaptive.root import correct
-from rotflex_jax.adaptive.sums import times
+from rotflex_jax.adaptive.filter import AdaptiveFilter, Number, count, real_data, times, within
+from rotflex_jax.adaptive.rls import potter_update
 
 
-class Ladder(NamedTuple):
-    """All stages, the past of the input, and the regression on a constant that ends the ladder.
+class LatticeStage(NamedTuple):
+    """One stage: three regressions with the a-priori errors f and b, one of each per channel.
+
+    Stage m knows the first m + 2 channels; what belongs to the others stays zero. In a `LatticeState` all M
+    stages are stacked along a first axis.
+
+    Attributes:
+        b: errors of the samples that leave, predicted from those after them.
+        g: gain of the regressions on b.
+        gamma: a-posteriori over a-priori error after the stages before this one.
+        root_b: square root of the inverse Gram matrix of b.
+        output: coefficients of b for the outputs.
+        root_f: square root of the inverse Gram matrix of f.
+        forward: coefficients of the previous b for f of the next stage.
+        backward: coefficients of f for b of the next stage.
+    """
+
+    b: Float[Array, "*M n"]
+    g: Float[Array, "*M n"]
+    gamma: Float[Array, "*M"]
+    root_b: Float[Array, "*M n n"]
+    output: Float[Array, "*M n T"]
+    root_f: Float[Array, "*M n n"]
+    forward: Float[Array, "*M n n"]
+    backward: Float[Array, "*M n n"]
+
+
+def monomials(memory: int) -> list[tuple[int, ...]]:
+    """Delays of every regressor, the smaller first: linear ones, then products by their first delay.
+
+    >>> monomials(2)
+    [(0,), (1,), (0, 0), (0, 1), (1, 1)]
+    """
+    delays = range(memory)
+    return [(i,) for i in delays] + [(i, j) for i in delays for j in delays[i:]]
+
+
+def direct_form(stages: LatticeStage, memory: int) -> Float[Array, "P T"]:
+    """Weights of the outputs on the monomials, from the coefficients of the stages.
+
+    In a vector over all monomials, with C and A the predictors of what leaves and of what is new:
+    b = old - C'x and f = new - A'x, with x the samples between, so that
+
+        w <- w + (old - C) output
+        C <- (old - C before, new - A) - (new - A) backward,    A <- A + (old - C before) forward
+
+    where "before" is one sample earlier. It need not be stored, for the last update
+    was `C = C before + k b'`, with k the gain of RLS, which the stages hold as well: `k <- k + (old - C) g`.
+
+    Args:
+        stages: of a lattice, along the first axis.
+        memory: its memory.
+    """
+    names = monomials(memory)
+    place = {delays: i for i, delays in enumerate(names)}
+    size, channels, dtype = len(names), memory + 1, stages.b.dtype
+    # The samples of row i, seen one sample earlier, are those of row `earlier[i]`.
+    earlier = [place.get(tuple(d - 1 for d in delays), size) for delays in names]
+    later = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])[np.array(earlier)]  # noqa: E731
+    new = np.eye(size)[:, [place[delays] for delays in [(0,), *((0, j) for j in range(memory))]]]
+    known, joining = (jnp.asarray(x) for x in known_channels(memory))
+
+    def next_stage(carry: tuple[Array, ...], stage: tuple[LatticeStage, Array, Array]) -> tuple[Any, None]:
+        # B and F are error filters, the monomials less their predictors: of b and of f.
+        w, k, B, F = carry
+        own, knows, joins = stage
+        before = later(B + k[:, None] * own.b[None])
+        B_next = before + jnp.where(joins[None], F, 0) - jnp.where(knows[None], F, 0) @ own.backward
+        return (w + B @ own.output, k + B @ own.g, B_next, F - before @ own.forward), None
+
+    F = jnp.asarray(new, dtype)
+    start = (
+        jnp.zeros((size, stages.output.shape[2]), dtype),
+        jnp.zeros(size, dtype),
+        jnp.where(np.arange(channels)[None] < 2, F, 0),
+        F,
+    )
+    return jax.lax.scan(next_stage, start, (stages, known, joining))[0][0]
+
+
+def known_channels(memory: int) -> tuple[Bool[np.ndarray, "M M+1"], Bool[np.ndarray, "M M+1"]]:
+    """Which channels each stage knows, the first m + 2, and which the next one knows besides."""
+    known = np.arange(memory + 1) < np.arange(2, memory + 2)[:, None]
+    return known, np.diff(known, axis=0, append=known[-1:])
+
+
+class LatticeState(NamedTuple):
+    """All stages, the past of the input, and the regression on a constant that follows the last stage.
 
     Attributes:
         u: the last `memory - 1` input samples, newest first.
         stages: one per sample of memory, along the first axis.
-        level: coefficient of what the stages leave of a constant.
-        energy: of what they leave of it.
+        level: coefficient of the residual that the stages leave of a constant.
+        energy: of that residual, the weighted sum of its squares.
     """
 
     u: Float[Array, " M-1"]
-    stages: Stage
+    stages: LatticeStage
     level: Float[Array, ""]
     energy: Float[Array, ""]
 
@@ -36,14 +119,14 @@ class VolterraLattice(AdaptiveFilter):
 
     Stage m goes from the memory m to m + 1. What is new in the regressors is `u_t (1, u_t, ...,
     u_(t-m))`, what leaves them `u_(t-m) (1, u_(t-m), ..., u_t)`, so the series is a linear filter with
-    M + 1 channels, of which stage m knows m + 2. The part of the new that the samples between do not
-    tell (f) and that of the old (b) predict each other, and b predicts the output. Each of these
-    small regressions takes a-priori errors, corrects itself by them, and weighs its samples by the
-    share of an error that the stages before leave after their correction.
+    M + 1 channels, of which stage m knows m + 2. The parts of the new (f) and of the old (b) that the samples
+    between do not predict are regressed on each other, and the output on b. Each of these small
+    regressions is corrected by its a-priori errors, and weighs its samples by the ratio of a-posteriori
+    to a-priori error after the stages before it.
 
     The a-priori errors are those of `RLS` on the same regressors to rounding, with the same start:
     `RLS(lam, delta=lattice.start)`. A start has to be the same for every stage at any time, so the
-    delayed regressors are thought to have been excited earlier, which they forget by the same factor:
+    delayed regressors are taken as excited earlier, which is forgotten by the same factor:
     `P0 = delta lam^j`, with j the smaller delay of a regressor. With `lam = 1` it is `delta` for all.
 
     One sample costs of the order of M^3 operations, RLS M^4. Not for speed at a small memory, where
@@ -85,12 +168,12 @@ class VolterraLattice(AdaptiveFilter):
         return len(monomials(self.memory)) + self.constant
 
     @property
-    def start(self) -> np.ndarray:
-        """Start of the inverse Gram matrix (P,), for an `RLS` with the same errors."""
+    def start(self) -> Float[np.ndarray, " P"]:
+        """Diagonal of the inverse Gram matrix at the start, for an `RLS` with the same errors."""
         delays = [0] * self.constant + [delays[0] for delays in monomials(self.memory)]
         return np.asarray(self.delta, float) * np.asarray(self.lam, float) ** np.array(delays)
 
-    def init(self, size: int, dtype: Any) -> Ladder:
+    def init(self, size: int, dtype: Any) -> LatticeState:
         """All weights zero, after silence; `size` plays no part."""
         del size
         real_data("VolterraLattice", dtype)
@@ -102,7 +185,7 @@ class VolterraLattice(AdaptiveFilter):
         root = jnp.sqrt(delta * lam ** jnp.asarray(np.maximum(delays, 0), dtype))
         diagonal = jax.vmap(jnp.diag)
         zeros = lambda *shape: jnp.zeros((M, *shape), dtype)  # noqa: E731
-        stages = Stage(
+        stages = LatticeStage(
             b=zeros(n),
             g=zeros(n),
             gamma=jnp.ones(M, dtype),
@@ -112,27 +195,31 @@ class VolterraLattice(AdaptiveFilter):
             forward=zeros(n, n),
             backward=zeros(n, n),
         )
-        return Ladder(jnp.zeros(M - 1, dtype), stages, jnp.zeros((), dtype), 1 / delta)
+        return LatticeState(jnp.zeros(M - 1, dtype), stages, jnp.zeros((), dtype), 1 / delta)
 
-    def step(self, state: Ladder, phi: Array, y: Array) -> tuple[Ladder, Array]:
+    def step(
+        self, state: LatticeState, phi: Float[Array, ""], y: Float[Array, ""]
+    ) -> tuple[LatticeState, Float[Array, ""]]:
         """One sample through all stages."""
         M = self.memory
         past = jnp.concatenate([phi[None], state.u])
         f = jnp.concatenate([phi[None], phi * past])
-        # The constant rides along as a second output; what is left of it then serves the first.
+        # The constant is a second output; its residual is a further regressor of the first.
         e = jnp.stack([y, jnp.ones_like(y)]) if self.constant else y[None]
 
-        def climb(carry: tuple[Array, ...], stage: tuple[Stage, Array, Array]) -> tuple[Any, Stage]:
+        def next_stage(
+            carry: tuple[Array, ...], stage: tuple[LatticeStage, Array, Array]
+        ) -> tuple[Any, LatticeStage]:
             f, b, gamma, e = carry
             old, known, joins = stage
-            root_b, g, left = correct(old.root_b, b, self.lam, gamma)
+            root_b, g, left = potter_update(old.root_b, b, self.lam, gamma)
             e = e - times(b, old.output)
             own = jnp.where(known, f, 0)
-            root_f, g_f, _ = correct(old.root_f, own, self.lam, old.gamma)
-            # The next product joins those that leave, its own past being nothing yet.
+            root_f, g_f, _ = potter_update(old.root_f, own, self.lam, old.gamma)
+            # The next product joins those that leave; it has no past of its own yet.
             above = old.b + jnp.where(joins, f, 0) - times(own, old.backward)
             f = f - times(old.b, old.forward)
-            new = Stage(
+            new = LatticeStage(
                 b=b,
                 g=g,
                 gamma=gamma,
@@ -147,17 +234,17 @@ class VolterraLattice(AdaptiveFilter):
         known, joins = known_channels(M)
         start = (f, jnp.where(known[0], f, 0), jnp.ones_like(phi), e)
         (_, _, gamma, e), stages = jax.lax.scan(
-            climb, start, (state.stages, jnp.asarray(known), jnp.asarray(joins))
+            next_stage, start, (state.stages, jnp.asarray(known), jnp.asarray(joins))
         )
         if not self.constant:
-            return Ladder(past[:-1], stages, state.level, state.energy), e[0]
+            return LatticeState(past[:-1], stages, state.level, state.energy), e[0]
         error = e[0] - state.level * e[1]
-        energy = self.lam * state.energy + gamma * e[1] ** 2
+        energy: Any = self.lam * state.energy + gamma * e[1] ** 2
         level = state.level + gamma * e[1] * error / energy
-        return Ladder(past[:-1], stages, level, energy), error
+        return LatticeState(past[:-1], stages, level, energy), error
 
-    def weights(self, state: Ladder) -> Array:
-        """Weights (P,) of the direct form, from the coefficients of all stages."""
+    def weights(self, state: LatticeState) -> Float[Array, " P"]:
+        """Weights of the direct form, from the coefficients of all stages."""
         w = direct_form(state.stages, self.memory)
         if not self.constant:
             return w[:, 0]

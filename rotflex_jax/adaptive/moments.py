@@ -1,4 +1,4 @@
-"""Second and fourth moments of regressors: all that the theory of LMS asks of a signal.
+"""Second and fourth moments of regressors: all that the theory of LMS needs to know of a signal.
 
     R = E[phi phi'],    S(W) = E[phi phi' W phi phi']
 
@@ -9,15 +9,102 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from rotflex_jax.adaptive.wick import Wick, exponents
 from rotflex_jax.basis import Orthogonalised, Volterra
-from rotflex_jax.basis.monomials import Index, indices
+from rotflex_jax.basis.volterra import Index, indices
 from rotflex_jax.errors import InputError
 
-MEMORY = 2**29
-"""Bytes that fourth moments may take: 8 (P (P + 1) / 2)^2 exactly, 8 N P from samples."""
+
+def exponents(terms: Sequence[Index], size: int) -> Int[np.ndarray, "P {size}"]:
+    """Monomials as powers: z0 z0 z2, that is (0, 0, 2), of a vector of three is 2, 0, 1."""
+    powers = np.zeros((len(terms), size), dtype=np.int64)
+    for row, term in enumerate(terms):
+        np.add.at(powers[row], list(term), 1)
+    return powers
+
+
+class GaussianMoments:
+    """Moments of a zero-mean Gaussian vector, stored once they are computed.
+
+        E[z_i z^b] = sum_j b_j R_ij E[z^(b - e_j)]
+
+    Every entry is paired with each of the others in turn; equal partners count as often as they occur.
+
+    Args:
+        covariance: of the vector.
+
+    Source: Isserlis 1918, Biometrika 12; Wick 1950.
+
+    >>> GaussianMoments(np.eye(2)).moment((4, 2))  # E[z0^4] E[z1^2]
+    3.0
+    """
+
+    def __init__(self, covariance: Float[np.ndarray, "n n"]) -> None:
+        self.covariance = checked_covariance(covariance)
+        self._rows = self.covariance.tolist()
+        self._known: dict[tuple[int, ...], float] = {(0,) * len(self._rows): 1.0}
+
+    def moment(self, powers: tuple[int, ...]) -> float:
+        """E[z0^powers0 z1^powers1 ...]."""
+        if powers in self._known:
+            return self._known[powers]
+        total = 0.0
+        if sum(powers) % 2 == 0:
+            i = next(k for k, power in enumerate(powers) if power)
+            rest = [*powers]
+            rest[i] -= 1
+            for j, count in enumerate(rest):
+                if count:
+                    rest[j] -= 1
+                    total += count * self._rows[i][j] * self.moment(tuple(rest))
+                    rest[j] += 1
+        self._known[powers] = total
+        return total
+
+    def products(
+        self, left: Int[np.ndarray, "A n"], right: Int[np.ndarray, "B n"]
+    ) -> Float[np.ndarray, "A B"]:
+        """E[z^left_a z^right_b] for the powers `left` and `right`."""
+        # Many entries are the same product: number the different ones, and compute each once.
+        base = int(left.max(initial=0) + right.max(initial=0)) + 1
+        if base ** left.shape[1] >= 2**62:
+            raise InputError(
+                f"Moments of degree {base - 1} of {left.shape[1]} entries are too many to number; "
+                "use regressors of a simulated or recorded input instead."
+            )
+        weight = base ** np.arange(left.shape[1], dtype=np.int64)
+        codes, where = np.unique(np.add.outer(left @ weight, right @ weight), return_inverse=True)
+        digits = codes[:, None] // weight % base
+        values = np.array([self.moment(tuple(row)) for row in digits.tolist()])
+        return values[where].reshape(len(left), len(right))
+
+
+def checked_covariance(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """The covariance in float64.
+
+    Raises:
+        InputError: it is not square, symmetric, finite and without negative eigenvalues.
+    """
+    R = np.asarray(covariance, dtype=float)
+    if R.ndim != 2 or R.shape[0] != R.shape[1] or not len(R) or not np.all(np.isfinite(R)):
+        raise InputError(
+            f"A covariance must be a square matrix of finite numbers, but has the shape {R.shape}; "
+            "give for instance ar1_covariance(0.5, 5)."
+        )
+    if (
+        not np.allclose(R, R.T, atol=1e-9 * np.abs(R).max())
+        or np.linalg.eigvalsh(R)[0] < -1e-9 * np.abs(R).max()
+    ):
+        raise InputError(
+            "A covariance must be symmetric without negative eigenvalues, but the one given is not; "
+            "compute it from the regressors as phi' phi / N."
+        )
+    return R
+
+
+MOMENT_BYTES = 2**29
+"""Memory that fourth moments may take [bytes]: 8 (P (P + 1) / 2)^2 exactly, 8 N P from samples."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,9 +112,9 @@ class Moments:
     """Moments of a vector of regressors.
 
     Attributes:
-        R: E[phi phi'] (P, P).
-        pairs: S as a matrix over packed symmetric matrices (D, D), D = P (P + 1) / 2; None for samples.
-        samples: regressors (N, P) that all moments are means over; None for exact moments.
+        R: E[phi phi'].
+        pairs: S as a matrix over packed symmetric matrices, D = P (P + 1) / 2; None for samples.
+        samples: regressors that all moments are means over; None for exact moments.
     """
 
     R: Float[np.ndarray, "P P"]
@@ -71,7 +158,7 @@ class Moments:
 
         Args:
             basis: the regressors.
-            covariance: of the outputs of its bank (n, n).
+            covariance: of the outputs of its bank.
 
         Raises:
             InputError: as `gaussian`, or a covariance that does not fit the bank.
@@ -87,14 +174,14 @@ class Moments:
 
     @classmethod
     def _of_monomials(cls, covariance: Float[np.ndarray, "n n"], terms: Sequence[Index]) -> "Moments":
-        wick = Wick(covariance)
+        wick = GaussianMoments(covariance)
         powers = exponents(terms, len(wick.covariance))
         P = len(powers)
         needed = 8 * (P * (P + 1) // 2) ** 2
-        if needed > MEMORY:
+        if needed > MOMENT_BYTES:
             raise InputError(
                 f"The fourth moments of {P} regressors take {needed / 2**20:.0f} MB, but "
-                f"{MEMORY // 2**20} MB are allowed; make regressors of a long simulated input and use "
+                f"{MOMENT_BYTES // 2**20} MB are allowed; make regressors of a long simulated input and use "
                 "Moments.of_regressors."
             )
         i, j = np.triu_indices(P)
@@ -110,7 +197,7 @@ class Moments:
         bounds to about 5 %, a few hundred only their size.
 
         Args:
-            phi: regressors (N, P), for instance `basis.regressors(recording.u)`.
+            phi: regressors, for instance `basis.regressors(recording.u)`.
 
         Raises:
             InputError: no matrix of finite numbers, or one beyond the memory.
@@ -121,10 +208,10 @@ class Moments:
                 f"Argument `phi` must be a matrix (N, P) of finite numbers, but has the shape {phi.shape}; "
                 "give one row per sample."
             )
-        if phi.nbytes > MEMORY:
+        if phi.nbytes > MOMENT_BYTES:
             raise InputError(
-                f"Argument `phi` takes {phi.nbytes / 2**20:.0f} MB, but {MEMORY / 2**20:.0f} MB are allowed; "
-                "thin it, for instance phi[::10]."
+                f"Argument `phi` takes {phi.nbytes / 2**20:.0f} MB, but {MOMENT_BYTES / 2**20:.0f} MB are "
+                "allowed; thin it, for instance phi[::10]."
             )
         return cls(phi.T @ phi / len(phi), samples=phi)
 

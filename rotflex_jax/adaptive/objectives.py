@@ -1,57 +1,64 @@
-"""What settings of a filter are judged by. The three answers differ by decades, so name the question.
+"""Objectives by which settings of a filter are compared, evaluated at many settings at once.
 
-    final       mean square of what the last weights of one recording miss on the other recordings
+    final       mean squared error of the last weights of one recording on the other recordings
     mean_error  mean square of the a-priori errors over the whole run
     last_half   the same over its second half
 
-`final` asks for a model and likes small steps. The other two judge the filter while it runs: they
-reward weights that follow the record, which no frozen model repeats, and `mean_error` above all a
-quick start.
+`final` measures a model and favours small steps. The other two measure the filter while it runs: they
+favour weights that follow the recording, which no frozen model repeats, and `mean_error` above all fast
+initial convergence.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from rotflex_jax.adaptive.filter import AdaptiveFilter, scan
+from rotflex_jax.adaptive.filter import AdaptiveFilter, per_weight, scan, times
+from rotflex_jax.adaptive.lms import LMS
+from rotflex_jax.adaptive.moments import Moments
+from rotflex_jax.adaptive.settings import FilterBuilder, Tuned, build_filter
+from rotflex_jax.adaptive.step_sizes import Stability, analyse
 from rotflex_jax.basis import Basis
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision, spread
 
 Objective = Literal["final", "mean_error", "last_half"]
 
 
-class Batch(eqx.Module):
-    """Recordings of one length side by side, and what the best fixed weights make of them.
+class TuningData(eqx.Module):
+    """Recordings of one length, and the least-squares weights that the objectives are relative to.
 
     The first `n_init` samples are left out: their regressors reach back to before the recording.
 
     Attributes:
-        u: inputs (B, N).
-        y: outputs (B, N).
-        phi: regressors (B, N - n_init, P) of the basis as given.
+        u: inputs.
+        y: outputs.
+        phi: regressors of the basis as given, L = N - n_init.
         skip: samples left out.
-        best: best weights for all recordings but one (B, P), or for all (1, P).
+        best: best weights for all recordings but one, K = R, or for all, K = 1.
         gram: mean of phi phi' over the same recordings.
         smallest: mean squared error of these weights.
     """
 
-    u: Float[Array, "B N"]
-    y: Float[Array, "B N"]
-    phi: Float[Array, "B L P"]
+    u: Float[Array, "R N"]
+    y: Float[Array, "R N"]
+    phi: Float[Array, "R L P"]
     skip: int = eqx.field(static=True)
     best: Float[Array, "K P"]
     gram: Float[Array, "K P P"]
     smallest: Float[Array, " K"]
 
 
-def batch(basis: Basis, recordings: Sequence[Recording], channel: str, objective: str) -> Batch:
-    """Recordings made ready for an objective.
+def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, objective: str) -> TuningData:
+    """Recordings prepared for an objective.
 
     Args:
         basis: of the regressors.
@@ -96,18 +103,20 @@ def batch(basis: Basis, recordings: Sequence[Recording], channel: str, objective
         gram.append(X.T @ X / len(X))
         smallest.append(np.mean((Y - X @ w) ** 2))
     parts = (np.stack(best), np.stack(gram), np.array(smallest))
-    return Batch(jnp.asarray(u), jnp.asarray(y), jnp.asarray(phi), skip, *(jnp.asarray(p) for p in parts))
+    return TuningData(
+        jnp.asarray(u), jnp.asarray(y), jnp.asarray(phi), skip, *(jnp.asarray(p) for p in parts)
+    )
 
 
 def evaluate(
-    data: Batch, objective: Objective, filter: AdaptiveFilter, basis: Any = None
+    data: TuningData, objective: Objective, filter: AdaptiveFilter, basis: Any = None
 ) -> Float[Array, ""]:
     """The objective, traced: settings of the filter and poles of the basis may carry derivatives.
 
     Args:
         data: recordings.
         objective: which.
-        filter: started anew on every recording.
+        filter: started again on every recording.
         basis: given where it changes; its error is then compared with the variance of the output,
             for the best weights are no longer the same.
 
@@ -135,8 +144,174 @@ def evaluate(
     return jnp.sum(others * jnp.mean(e**2, axis=2)) / jnp.sum(others) / unit
 
 
-def unit(objective: Objective, changing: bool) -> str:
-    """What `evaluate` counts in, in words."""
+def objective_unit(objective: Objective, changing: bool) -> str:
+    """Unit of `evaluate` in words."""
     if changing:
         return "of the output's variance"
     return "of the smallest error, in excess of it" if objective == "final" else "of the smallest error"
+
+
+CACHED_WEIGHTS = 2640
+"""Weights of all settings together that still fit into the fastest cache."""
+LEAST_SETTINGS_TOGETHER = 32
+"""Settings evaluated together even where the cache is too small, for fewer do not use a processor well."""
+
+
+def settings_together(P: int) -> int:
+    """Most settings that are evaluated together, for P weights each.
+
+    >>> settings_together(21), settings_together(66), settings_together(1326)
+    (120, 40, 32)
+    """
+    return max(LEAST_SETTINGS_TOGETHER, CACHED_WEIGHTS // P // 8 * 8)
+
+
+def lms_objectives(
+    data: TuningData, objective: Objective, mu: Float[Array, "C P"], leakage: Float[Array, " C"] | None
+) -> Float[Array, " C"]:
+    """The objective of LMS at every one of C settings.
+
+    As `evaluate` for each of them, but with the settings along the last axis, so that vector instructions
+    work on C settings at once. Of the errors only the sum of squares is stored.
+
+    Args:
+        data: recordings.
+        objective: which.
+        mu: step sizes.
+        leakage: one for each setting; None for none.
+    """
+    C, P = mu.shape
+    step, y = mu.T, data.y[:, data.skip :]
+    first = y.shape[1] // 2 if objective == "last_half" else 0
+    decay = None if leakage is None else (1 - mu * leakage[:, None]).T
+
+    def update(carry: tuple[Array, Array], sample: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+        w, total = carry
+        phi, target = sample
+        e = target - times(phi, w)
+        decayed = w if decay is None else w * decay
+        return (decayed + (step * e[None]) * phi[:, None], total + e * e), None
+
+    def run(recording: tuple[Array, Array]) -> tuple[Array, Array]:
+        phi, y = recording
+        w, none = jnp.zeros((P, C), y.dtype), jnp.zeros(C, y.dtype)
+        if first:  # the errors before it do not count
+            w, _ = jax.lax.scan(update, (w, none), (phi[:first], y[:first]))[0]
+        return jax.lax.scan(update, (w, none), (phi[first:], y[first:]))[0]
+
+    w, total = jax.lax.map(run, (data.phi, y))
+    if objective == "final":
+        miss = jnp.moveaxis(w, 2, 0) - data.best[None]
+        return jnp.mean(jnp.einsum("cbp,bpq,cbq->cb", miss, data.gram, miss) / data.smallest[None], axis=1)
+    return jnp.mean(total, axis=0) / (y.shape[1] - first) / jnp.mean(data.smallest)
+
+
+SETTINGS_PER_BATCH = 32
+"""Settings that are evaluated together, for other filters than LMS."""
+MOST_WEIGHTS_FOR_STABILITY = 60
+"""Most weights for which the stability of the result is analysed."""
+MOMENT_SAMPLES = 20_000
+"""Most samples of which the moments for this are means."""
+
+
+@functools.partial(jax.jit, static_argnames=("names", "build", "objective", "mesh"))
+def values_at(
+    points: Float[Array, "K n"],
+    data: TuningData,
+    *,
+    names: tuple[str, ...],
+    build: FilterBuilder,
+    objective: Objective,
+    mesh: Mesh | None = None,
+) -> Float[Array, " K"]:
+    """The objective at many points, on each device some at a time; compiled once per `build`."""
+    values = functools.partial(_values, names=names, build=build, objective=objective)
+    return spread(values, mesh)(points, data)
+
+
+def _values(
+    points: Float[Array, "K n"],
+    data: TuningData,
+    *,
+    names: tuple[str, ...],
+    build: FilterBuilder,
+    objective: Objective,
+) -> Float[Array, " K"]:
+    def made(point: Array) -> tuple[AdaptiveFilter, Basis | None]:
+        return build_filter(build, dict(zip(names, point, strict=True)))
+
+    filter, changed = made(points[0])
+    if type(filter) is LMS and changed is None:
+        return _lms_values(
+            points, data, made, objective, not isinstance(filter.leakage, float) or filter.leakage != 0
+        )
+    value = lambda point: evaluate(data, objective, *made(point))  # noqa: E731
+    return jax.lax.map(value, points, batch_size=min(SETTINGS_PER_BATCH, len(points)))
+
+
+def _lms_values(
+    points: Array, data: TuningData, made: Any, objective: Objective, leaks: bool
+) -> Float[Array, " K"]:
+    """`values_at` for LMS on fixed regressors, as many points at a time as fit into the cache."""
+    K, P = len(points), data.phi.shape[2]
+
+    def settings(point: Array) -> tuple[Array, Array]:
+        filter = made(point)[0]
+        return per_weight("mu", filter.mu, P, data.phi.dtype), jnp.asarray(filter.leakage, data.phi.dtype)
+
+    parts = -(-K // settings_together(P))
+    some = min(K, -(-K // (8 * parts)) * 8)
+    padded = jnp.concatenate([points, jnp.broadcast_to(points[-1:], (-K % some, points.shape[1]))])
+
+    def at(points: Array) -> Array:
+        mu, leakage = jax.vmap(settings)(points)
+        return lms_objectives(data, objective, mu, leakage if leaks else None)
+
+    return jax.lax.map(at, padded.reshape(-1, some, points.shape[1])).reshape(-1)[:K]
+
+
+def sample_moments(phi: Float[Array, "R L P"]) -> Moments:
+    """Moments of the regressors of recordings, from at most `MOMENT_SAMPLES` of them."""
+    rows = np.asarray(phi).reshape(-1, phi.shape[-1])
+    return Moments.of_regressors(rows[:: -(-len(rows) // MOMENT_SAMPLES)])
+
+
+def tuning_result(
+    build: FilterBuilder,
+    settings: Mapping[str, float],
+    basis: Basis,
+    recordings: Sequence[Recording],
+    channel: str,
+    data: TuningData,
+    *,
+    objective: Objective,
+    test: Sequence[Recording],
+    value: float | None = None,
+    **rest: Any,
+) -> Tuned:
+    """The result for the settings found: value if None was given, test, stability, and `rest` unchanged."""
+    names = tuple(settings)
+    with double_precision():
+        filter, changed = build_filter(build, dict(settings))
+        point = jnp.asarray([list(settings.values())])
+
+        def value_on(data: TuningData) -> float:
+            return float(values_at(point, data, names=names, build=build, objective=objective)[0])
+
+        tested = value_on(tuning_data(basis, test, channel, objective)) if test else float("nan")
+        stability: Stability | None = None
+        if isinstance(filter, LMS) and data.phi.shape[2] <= MOST_WEIGHTS_FOR_STABILITY:
+            # Other poles are other regressors.
+            known = data if changed is None else tuning_data(changed, recordings, channel, objective)
+            stability = analyse(sample_moments(known.phi), np.asarray(filter.mu))
+        return Tuned(
+            settings=dict(settings),
+            value=value_on(data) if value is None else value,
+            test=tested,
+            objective=objective,
+            unit=objective_unit(objective, changed is not None),
+            filter=filter,
+            basis=basis if changed is None else changed,
+            stability=stability,
+            **rest,
+        )

@@ -1,4 +1,4 @@
-"""A filter run over arrays: errors, final weights, their path, and whether it stayed stable."""
+"""A filter run over arrays: errors, final weights, their path, and whether it diverged."""
 
 import functools
 from dataclasses import dataclass
@@ -7,32 +7,30 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, Inexact, Int
 
-from rotflex_jax.adaptive.filter import AdaptiveFilter, regressor_size, scan
-from rotflex_jax.adaptive.forms import quickest
-from rotflex_jax.adaptive.rebuilt import Rebuilt
-from rotflex_jax.adaptive.samples import as_samples, finite, stretch
+from rotflex_jax.adaptive.fast_forms import RegressorsInLoop, fastest_form
+from rotflex_jax.adaptive.filter import AdaptiveFilter, as_samples, finite, regressor_size, scan, stretch
 from rotflex_jax.basis import Basis, Volterra
 from rotflex_jax.basis.bank import require_basis, signal
 from rotflex_jax.errors import InputError
-from rotflex_jax.precision import working_precision
+from rotflex_jax.runtime.xla import working_precision
 
-# An a-priori error beyond this multiple of the largest output means that the filter runs away.
-RUNAWAY = 1e4
+# An a-priori error beyond this multiple of the largest output means divergence.
+DIVERGENCE_RATIO = 1e4
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a filter did over the samples it was given.
+    """Result of a filter over the samples it was given.
 
     Attributes:
-        errors: a-priori errors (N,), each made with the weights from before its sample [output]. The
+        errors: a-priori errors, each made with the weights from before its sample [output]. The
             weights follow the record meanwhile, so this is the error of no one model, and often far
             below that of the last weights on other data. NaN after a divergence.
-        weights: last weights (P,); of no use after a divergence.
-        path: weights (K, P) after `path_times` samples; none unless asked for.
-        path_times: samples seen (K,): 0, keep_every, 2 keep_every, ...
+        weights: last weights; of no use after a divergence.
+        path: weights after `path_times` samples; none unless asked for.
+        path_times: samples seen: 0, keep_every, 2 keep_every, ...
         state: to go on from.
         status: "ok", or "diverged at sample k".
     """
@@ -40,13 +38,13 @@ class Run:
     errors: Inexact[np.ndarray, " N"]
     weights: Inexact[np.ndarray, " P"]
     path: Inexact[np.ndarray, "K P"]
-    path_times: np.ndarray
+    path_times: Int[np.ndarray, " K"]
     state: Any
     status: str
 
     @property
     def diverged(self) -> bool:
-        """Whether the filter ran away."""
+        """Whether the filter diverged."""
         return self.status != "ok"
 
 
@@ -64,15 +62,15 @@ def run(
     One compiled loop; another call with the same shapes and other values compiles nothing. A filter
     has diverged where an error is not finite, or ten thousand times larger than any output.
 
-    With a basis, a Volterra series of delays is worked out inside of the loop: that is several times
-    quicker than `basis.regressors` beforehand, and of the regressors nothing is stored.
+    With a basis, the regressors of a Volterra series of delays are formed inside the loop: that is several
+    times quicker than `basis.regressors` beforehand, and no regressors are stored.
 
     Args:
         filter: with its settings.
         phi: regressors (N, P); with a basis, or for a filter that makes its own, the input (N,).
         y: measured output (N,).
-        basis: makes the regressors of the input, which may begin before the output: what is too much at
-            its beginning only fills the memory of the basis.
+        basis: makes the regressors of the input, which may start before the output: the samples before it
+            only fill the memory of the basis.
         state: `Run.state` of an earlier run, to go on from; the filter's start if None. Two runs in a
             row give what one run over all samples gives.
         keep_every: keep the weights after every so many samples; 0 keeps only the last.
@@ -107,7 +105,7 @@ def _over_basis(filter: AdaptiveFilter, basis: Basis, u: Any, y: Any, state: Any
             f"The output must have the shape (N,), no longer than its input, but has {y.shape} where the "
             f"input has {u.shape}; give an input for every output sample."
         )
-    form = None if y.dtype.kind == "c" else quickest(filter, basis, not every)
+    form = None if y.dtype.kind == "c" else fastest_form(filter, basis, not every)
     if form is None:
         phi, y = as_samples(filter, basis.regressors(u)[before:], y)
         return _run_on(filter, None, phi, y, state, every)
@@ -120,35 +118,35 @@ def _over_basis(filter: AdaptiveFilter, basis: Basis, u: Any, y: Any, state: Any
 
 def _run_on(
     filter: AdaptiveFilter,
-    form: Rebuilt | None,
-    phi: np.ndarray,
-    y: np.ndarray,
+    form: RegressorsInLoop | None,
+    phi: Inexact[np.ndarray, "N *P"],
+    y: Inexact[np.ndarray, " N"],
     state: Any,
     every: int,
-    lags: np.ndarray | None = None,
+    lags: Inexact[np.ndarray, " M"] | None = None,
 ) -> Run:
     size = regressor_size(phi) if form is None else form.size
     with working_precision(np.real(phi)):
-        # Settings of one kind whatever they were given as, so that only shapes decide what is compiled.
+        # Settings of one type however they were given, so that only shapes decide what is compiled.
         real = jnp.finfo(phi.dtype).dtype
         filter = jax.tree.map(lambda leaf: np.asarray(leaf).astype(real), filter)
         start = None if state is None else _resumed(filter, size, phi.dtype, state)
         result = _run(filter, lags, phi, y, start, form, every)
         end, errors, path, weights = jax.device_get(result)
-    errors, status = _judged(errors, y)
+    errors, status = _divergence(errors, y)
     return Run(errors, weights, path, np.arange(len(path)) * every, end, status)
 
 
 @functools.partial(jax.jit, static_argnums=(5, 6))
 def _run(
     filter: AdaptiveFilter,
-    lags: Array | None,
-    phi: Array,
-    y: Array,
+    lags: Inexact[Array, " M"] | None,
+    phi: Inexact[Array, "N *P"],
+    y: Inexact[Array, " N"],
     state: Any,
-    form: Rebuilt | None,
+    form: RegressorsInLoop | None,
     every: int,
-) -> tuple[Any, Array, Array, Array]:
+) -> tuple[Any, Inexact[Array, " N"], Inexact[Array, "K p"], Inexact[Array, " p"]]:
     size = regressor_size(phi) if form is None else form.size
     state = filter.init(size, phi.dtype) if state is None else state
     step: Any = lambda state, phi, y: scan(filter, phi, y, state)  # noqa: E731
@@ -163,7 +161,7 @@ def _run(
         last = weights(state)
         return close(state), errors, jnp.zeros((0, *last.shape), last.dtype), last
     first = weights(state)
-    # An outer loop over chunks keeps the weights at their ends; what does not fill one follows.
+    # An outer loop over chunks stores the weights at their ends; the samples that fill none follow.
     whole = len(y) // every * every
     chunks = jax.tree.map(lambda x: x[:whole].reshape(-1, every, *x.shape[1:]), (phi, y))
 
@@ -199,14 +197,14 @@ def _resumed(filter: AdaptiveFilter, size: int, dtype: Any, state: Any) -> Any:
     return jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), state, wanted)
 
 
-def _judged(errors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, str]:
+def _divergence(errors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, str]:
     """The errors, NaN after a divergence, and the status."""
-    # A state to go on from may belong to larger outputs, which its first error then shows.
+    # A state to go on from may belong to larger outputs; then its first error is large.
     scale = max(_largest(y), float(np.nan_to_num(np.abs(errors[0]), posinf=0.0)))
-    if _largest(errors) <= RUNAWAY * scale:
+    if _largest(errors) <= DIVERGENCE_RATIO * scale:
         return errors, "ok"
     size = np.abs(errors)
-    bad = ~np.isfinite(size) | (size > RUNAWAY * scale) & (scale > 0)
+    bad = ~np.isfinite(size) | (size > DIVERGENCE_RATIO * scale) & (scale > 0)
     if not bad.any():
         return errors, "ok"
     k = int(np.argmax(bad))

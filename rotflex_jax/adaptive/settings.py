@@ -1,4 +1,4 @@
-"""Settings of a filter by name: what a user gives, and the free numbers that a search moves."""
+"""Settings of a filter by name, their ranges, and the result of a search over them."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -10,20 +10,21 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter
+from rotflex_jax.adaptive.step_sizes import Stability
 from rotflex_jax.basis import Basis
 from rotflex_jax.errors import InputError
 
-Build = Callable[[dict[str, Any]], AdaptiveFilter | tuple[AdaptiveFilter, Basis]]
-"""Makes a filter, or a filter and a basis, of settings by name."""
+FilterBuilder = Callable[[dict[str, Any]], AdaptiveFilter | tuple[AdaptiveFilter, Basis]]
+"""Makes a filter, or a filter and a basis, from settings by name."""
 
 
-def built(build: Build, settings: dict[str, Any]) -> tuple[AdaptiveFilter, Basis | None]:
+def build_filter(build: FilterBuilder, settings: dict[str, Any]) -> tuple[AdaptiveFilter, Basis | None]:
     """Filter, and the basis where it has settings too."""
     made = build(settings)
     return made if isinstance(made, tuple) else (made, None)
 
 
-def named(starts: Mapping[str, float] | Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
+def starting_sets(starts: Mapping[str, float] | Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
     """One or several sets of settings as a list.
 
     Raises:
@@ -39,8 +40,8 @@ def named(starts: Mapping[str, float] | Sequence[Mapping[str, float]]) -> list[d
 
 
 @dataclasses.dataclass(frozen=True)
-class Curve:
-    """Settings within their ranges as numbers that may be anything.
+class RangeTransform:
+    """Settings within their ranges as unconstrained coordinates.
 
         setting = low + exp(x)  without an upper end,    low + (high - low) / (1 + exp(-x))  with one
 
@@ -63,7 +64,7 @@ class Curve:
                     "correct it."
                 )
 
-    def settings(self, x: Float[Array, " n"]) -> dict[str, Array]:
+    def settings(self, x: Float[Array, " n"]) -> dict[str, Float[Array, ""]]:
         """The settings at a point, traced."""
         return {
             name: low + (jnp.exp(x[i]) if np.isinf(high) else (high - low) * jax.nn.sigmoid(x[i]))
@@ -86,3 +87,72 @@ class Curve:
                 )
             x.append(np.log(value - low) if np.isinf(high) else np.log((value - low) / (high - value)))
         return np.array(x)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TuningPath:
+    """One descent, from its start to its end.
+
+    Attributes:
+        points: settings by name, the start first.
+        values: objective, penalty included.
+        evaluations: filters run, each with its derivatives.
+        status: "minimum", "no further progress", "evaluations used up" or "no finite value".
+    """
+
+    points: dict[str, Float[np.ndarray, " K"]]
+    values: Float[np.ndarray, " K"]
+    evaluations: int
+    status: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tuned:
+    """Settings of a filter, chosen by gradient or on a grid.
+
+    Attributes:
+        settings: by name.
+        value: objective on the recordings that were tuned on.
+        test: the same on the others; NaN if there were none.
+        objective: "final", "mean_error" or "last_half".
+        unit: of `value` and `test`, in words.
+        filter: with the settings in it.
+        basis: with the settings in it.
+        evaluations: settings tried in all.
+        stability: of the step sizes, where the theory of LMS applies and the weights are not too many.
+        paths: one descent per start; none for a grid.
+        axes: settings tried on a grid, by name; empty for a descent.
+        values: objective on the grid, one axis per setting; NaN or infinite where the filter diverged.
+    """
+
+    settings: dict[str, float]
+    value: float
+    test: float
+    objective: str
+    unit: str
+    filter: AdaptiveFilter
+    basis: Basis
+    evaluations: int
+    stability: Stability | None
+    paths: tuple[TuningPath, ...] = ()
+    axes: dict[str, Float[np.ndarray, " _"]] = dataclasses.field(default_factory=dict)
+    values: Float[np.ndarray, "..."] | None = None
+
+    def __str__(self) -> str:
+        how = f"{len(self.paths)} starts" if self.paths else f"a grid of {self.evaluations}"
+        lines = [f'tuned for "{self.objective}" with {self.evaluations} evaluations from {how}']
+        lines += [f"  {name} = {value:.4g}" for name, value in self.settings.items()]
+        lines += [f"  {self.value:.4g} {self.unit}"]
+        if np.isfinite(self.test):
+            lines += [f"  {self.test:.4g} on the recordings kept for the test"]
+        for path in self.paths:
+            start = ", ".join(
+                f"{name} {points[0]:.3g}" for name, points in path.points.items() if len(points)
+            )
+            last = f"{path.values[-1]:.4g}" if len(path.values) else "-"
+            lines += [
+                f"  from {start or 'a start that diverges'}: {last}, {path.evaluations} evaluations, "
+                f"{path.status}"
+            ]
+        lines += [f"  {self.stability.sentence}" if self.stability else "  stability: no theory applied"]
+        return "\n".join(lines)

@@ -4,8 +4,7 @@ Delays suit a slow sampling, orthonormal filters a fast one or a long memory; Vo
 products of either. `reach` tells beforehand what a bank can do, `optimise_poles` finds its poles.
 """
 
-from rotflex_jax.basis.bank import Bank, Basis
-from rotflex_jax.basis.delays import Delays
+from rotflex_jax.basis.bank import Bank, Basis, Delays
 from rotflex_jax.basis.orthogonalise import GramSchmidt, Hermite, Orthogonalised
 from rotflex_jax.basis.orthonormal import Orthonormal
 from rotflex_jax.basis.pole_search import PoleSearch, optimise_poles

@@ -1,25 +1,26 @@
-"""What a basis is: a signal goes in, one named regressor per column comes out.
+"""What a basis is, and the simplest banks: delays, and means over intervals.
 
-A bank is linear: delays, or orthonormal filters. A basis is what weights stand in front of: the
-monomials of a bank's outputs, as they are or orthogonalised.
+A bank is linear: delays, or orthonormal filters. A basis makes the regressors of a model: the monomials of
+a bank's outputs, as they are or orthogonalised.
 """
 
 import abc
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.precision import working_precision
+from rotflex_jax.runtime.xla import working_precision
 
 
+@runtime_checkable
 class Traced(Protocol):
-    """A pytree that turns a signal into columns, inside of traced code too."""
+    """A pytree that turns a signal into columns, also in traced code."""
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N P"]:
         """Columns for a signal, in its dtype; causal, nothing before the first sample."""
@@ -27,7 +28,7 @@ class Traced(Protocol):
 
 
 class Bank(eqx.Module):
-    """Turns a signal into linear regressors: what a bank of one's own derives from."""
+    """Turns a signal into linear regressors; base class of all banks."""
 
     @property
     @abc.abstractmethod
@@ -42,11 +43,11 @@ class Bank(eqx.Module):
     @property
     @abc.abstractmethod
     def reach(self) -> int:
-        """Samples after which an impulse has left the bank, to a millionth of its size."""
+        """Samples after which the impulse response has decayed, to a millionth of its size."""
 
     @abc.abstractmethod
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:
-        """Columns for a signal, inside of traced code too; causal, nothing before the first sample."""
+        """Columns for a signal, also in traced code; causal, nothing before the first sample."""
 
     def outputs(self, u: Any) -> Float[np.ndarray, "N M"]:
         """Columns for a signal, in its precision.
@@ -57,10 +58,11 @@ class Bank(eqx.Module):
         return evaluate(self, u)
 
     def impulse_responses(self, length: int) -> Float[np.ndarray, "L M"]:
-        """Columns for a unit impulse, over so many samples."""
+        """Columns for a unit impulse, over `length` samples."""
         return self.outputs(impulse(length))
 
 
+@runtime_checkable
 class Basis(Traced, Protocol):
     """Turns a signal into the regressors of a model that is linear in its weights."""
 
@@ -95,7 +97,7 @@ class Basis(Traced, Protocol):
 _respond = jax.jit(lambda part, u: part.respond(u))
 
 
-def evaluate(part: Traced, u: Any) -> np.ndarray:
+def evaluate(part: Traced, u: Any) -> Float[np.ndarray, "N P"]:
     """Columns as an array, in the precision of the signal; compiled once for each shape."""
     u = signal(u)
     with working_precision(u):
@@ -103,13 +105,13 @@ def evaluate(part: Traced, u: Any) -> np.ndarray:
 
 
 def require_basis(basis: Any) -> None:
-    """Refuses what weights cannot stand in front of.
+    """Refuses what is no basis.
 
     Raises:
         InputError: A bank was given, or anything else.
     """
     wanted = ("names", "degrees", "regressors", "units", "kernels")
-    # The class is asked first: working out all names takes longer than a filter over a short record.
+    # The class comes first: making all names takes longer than a filter over a short record.
     if not all(hasattr(type(basis), name) or hasattr(basis, name) for name in wanted):
         raise InputError(
             f"A basis such as Volterra(Delays(5)) is needed, but {type(basis).__name__} was given; wrap a "
@@ -117,8 +119,8 @@ def require_basis(basis: Any) -> None:
         )
 
 
-def impulse(length: int) -> np.ndarray:
-    """A one, then zeros."""
+def impulse(length: int) -> Float[np.ndarray, " L"]:
+    """Unit impulse: a one, then zeros."""
     if isinstance(length, bool) or length != int(length) or length < 1:
         raise InputError(
             f"Argument `length` must be a number of samples from 1, but is {length!r}; give for instance 100."
@@ -126,8 +128,8 @@ def impulse(length: int) -> np.ndarray:
     return np.eye(1, int(length))[0]
 
 
-def signal(u: Any, name: str = "u") -> np.ndarray:
-    """A signal as an array (N,), float32 where that was given, else float64.
+def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
+    """A signal as an array, float32 where that was given, else float64.
 
     Raises:
         InputError: More than one column, complex, empty, or not finite.
@@ -146,8 +148,8 @@ def signal(u: Any, name: str = "u") -> np.ndarray:
     return u.astype(np.float32 if u.dtype in (np.float16, np.float32) else np.float64, copy=False)
 
 
-def all_finite(x: np.ndarray) -> bool:
-    """Whether no number is infinite or missing, mostly without an array of answers."""
+def all_finite(x: Num[np.ndarray, "..."]) -> bool:
+    """Whether all numbers are finite, mostly without an array of results."""
     with np.errstate(all="ignore"):
         return bool(np.isfinite(np.sum(x)) or np.isfinite(x).all())
 
@@ -168,3 +170,118 @@ give for instance 1.
             f"give for instance {least}."
         )
     return int(value)
+
+
+class Delays(Bank):
+    """A tapped delay line; with one weight per tap, a finite impulse response.
+
+        z_i[t] = u[t - first - i],  i = 0 ... memory - 1,  u = 0 before the first sample
+
+    Not for sampling much faster than the plant: its impulse response must decay within the memory. A bank
+    of orthonormal filters needs fewer weights there.
+
+    Args:
+        memory: Number of taps.
+        first: Delay of the first tap [samples]; 1 where the output has no direct feedthrough.
+
+    Raises:
+        InputError: A memory below 1, or a negative delay.
+
+    >>> bank = Delays(3, first=1)
+    >>> bank.names
+    ('u[t-1]', 'u[t-2]', 'u[t-3]')
+    >>> bank.outputs([1.0, 2.0, 3.0])
+    array([[0., 0., 0.],
+           [1., 0., 0.],
+           [2., 1., 0.]])
+    """
+
+    memory: int = eqx.field(static=True)
+    first: int = eqx.field(static=True)
+
+    def __init__(self, memory: int, first: int = 0) -> None:
+        self.memory = whole(memory, "memory", 1)
+        self.first = whole(first, "first", 0)
+
+    @property
+    def size(self) -> int:
+        """Number of taps."""
+        return self.memory
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """`u[t]`, `u[t-1]`, ..."""
+        lags = range(self.first, self.reach)
+        return tuple(f"u[t-{lag}]" if lag else "u[t]" for lag in lags)
+
+    @property
+    def reach(self) -> int:
+        """Samples after which the impulse response is zero."""
+        return self.first + self.memory
+
+    def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:
+        """Columns for a signal, also in traced code."""
+        N = len(u)
+        padded = jnp.concatenate([jnp.zeros(self.reach - 1, u.dtype), u])
+        starts = [self.memory - 1 - i for i in range(self.memory)]
+        return jnp.stack([padded[s : s + N] for s in starts], axis=1)
+
+
+class Averages(Bank):
+    """A tapped delay line with wide taps: a piecewise constant impulse response.
+
+        z_i[t] = mean of u[t - first - i width - j] over j = 0 ... width - 1,  i = 0 ... count - 1
+
+    With width 1 these are the plain delays. The width is an argument of the compiled code, so another one
+    compiles nothing again. Not for a plant that responds within less than a step: only the mean of its
+    response over each is known.
+
+    Args:
+        count: Number of steps.
+        width: Samples in each.
+        first: Delay of the first [samples]; 1 where the output has no direct feedthrough.
+
+    Raises:
+        InputError: A count or a width below 1, or a negative delay.
+
+    >>> Averages(2, 2, first=0).outputs([2.0, 4.0, 6.0, 8.0])
+    array([[1., 0.],
+           [3., 0.],
+           [5., 1.],
+           [7., 3.]])
+    """
+
+    width: Any
+    count: int = eqx.field(static=True)
+    first: int = eqx.field(static=True)
+
+    def __init__(self, count: int, width: int, first: int = 1) -> None:
+        self.count = whole(count, "count", 1)
+        self.width = np.asarray(whole(width, "width", 1))
+        self.first = whole(first, "first", 0)
+
+    @property
+    def size(self) -> int:
+        """Number of steps."""
+        return self.count
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """`mean u[t-1..t-10]`, ..."""
+        starts = [self.first + i * int(self.width) for i in range(self.count)]
+        return tuple(f"mean u[t-{s}..t-{s + int(self.width) - 1}]" for s in starts)
+
+    @property
+    def reach(self) -> int:
+        """Samples after which the impulse response is zero."""
+        return self.first + self.count * int(self.width)
+
+    def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:
+        """Columns for a signal, also in traced code."""
+        total = jnp.concatenate([jnp.zeros(1, u.dtype), jnp.cumsum(u)])
+        width = jnp.asarray(self.width)
+        edges = self.first - 1 + jnp.arange(self.count + 1, dtype=width.dtype) * width
+        # Sum of all samples up to and with t - first - i width; nothing before the first sample.
+        until = jnp.maximum(jnp.arange(len(u), dtype=width.dtype)[:, None] - edges[None, :], 0)
+        sums = total[until]
+        return (sums[:, :-1] - sums[:, 1:]) / width.astype(u.dtype)

@@ -1,15 +1,15 @@
-"""The regressors of a Volterra series turned orthonormal: for a Gaussian input, or for a sample of it.
+"""Orthonormal combinations of the regressors of a Volterra series: for a Gaussian input, or for a sample.
 
-Equal speeds for all weights of a gradient filter are the aim. Least squares gives the same model with
-or without, since the regressors span the same. Nor is it always faster on real data: where nearly all
-power sits in a few linear directions, the raw regressors with a step size per degree may win.
+The aim is that all weights of a gradient filter converge equally fast. Least squares gives the same model
+with or without, since the regressors span the same space. Nor is it always faster on real data: where a
+few linear directions have nearly all power, the raw regressors with a step size per degree may be faster.
 """
 
 import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,12 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rotflex_jax.basis.bank import evaluate, signal
-from rotflex_jax.basis.monomials import Index, from_tensor, indices
-from rotflex_jax.basis.volterra import Volterra, spread
+from rotflex_jax.basis.volterra import Index, Volterra, from_tensor, indices, spread
 from rotflex_jax.errors import InputError
 
-# A column of which less than this share is left depends on those before it.
-DEPENDENT = 1e-10
+# Relative norm of the residual below which a column depends linearly on those before it.
+DEPENDENT_RESIDUAL = 1e-10
 
 
 class Orthogonalised(eqx.Module):
@@ -55,7 +54,7 @@ class Orthogonalised(eqx.Module):
         return np.array(self.degree_list, int)
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N P"]:
-        """Regressors for a signal, inside of traced code too."""
+        """Regressors for a signal, also in traced code."""
         return self.volterra.respond(u) @ jnp.asarray(self.transform).astype(u.dtype)
 
     def regressors(self, u: Any) -> Float[np.ndarray, "N P"]:
@@ -111,7 +110,7 @@ class Hermite(Orthogonalised):
     """
 
     @classmethod
-    def of(cls, volterra: Volterra, covariance: Any) -> Self:
+    def of(cls, volterra: Volterra, covariance: Any) -> "Hermite":
         """The polynomials for a covariance of the bank's outputs.
 
         Args:
@@ -136,12 +135,12 @@ class Hermite(Orthogonalised):
 
 
 class GramSchmidt(Orthogonalised):
-    """Each regressor without what those before it explain, on a sample; no law of the input assumed.
+    """Each regressor less its projection on those before it, on a sample of any input.
 
         phi = Q R,  T = sqrt(N) R^-1
 
     Columns that depend on earlier ones are left out. Orthonormal on that sample only: another input,
-    even of the same law but short, is not.
+    even of the same distribution but short, is not.
 
     Source: Golub and Van Loan 2013, section 5.2 (QR); Korenberg 1988 for its use with Volterra series.
 
@@ -153,7 +152,7 @@ class GramSchmidt(Orthogonalised):
     """
 
     @classmethod
-    def of(cls, volterra: Volterra, u: Any) -> Self:
+    def of(cls, volterra: Volterra, u: Any) -> "GramSchmidt":
         """The transform for a sample of the input.
 
         Args:
@@ -170,20 +169,20 @@ class GramSchmidt(Orthogonalised):
                 "give a longer sample of the input."
             )
         size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-        kept: list[int] = []
+        independent: list[int] = []
         for k, left in enumerate(np.abs(np.diag(np.linalg.qr(phi / size, mode="r")))):
-            if left > DEPENDENT:
-                kept.append(k)
-        R = np.linalg.qr(phi[:, kept], mode="r")
+            if left > DEPENDENT_RESIDUAL:
+                independent.append(k)
+        R = np.linalg.qr(phi[:, independent], mode="r")
         R *= np.sign(np.diag(R))[:, None]  # so that each column keeps the sign of its regressor
-        transform = np.zeros((volterra.size, len(kept)))
-        transform[kept] = np.linalg.inv(R) * np.sqrt(len(phi))
+        transform = np.zeros((volterra.size, len(independent)))
+        transform[independent] = np.linalg.inv(R) * np.sqrt(len(phi))
         names, degrees = volterra.names, volterra.degrees
-        titles = tuple(names[k] if k == 0 and names[k] == "1" else f"GS({names[k]})" for k in kept)
-        return cls(volterra, transform, titles, tuple(int(degrees[k]) for k in kept))
+        titles = tuple(names[k] if k == 0 and names[k] == "1" else f"GS({names[k]})" for k in independent)
+        return cls(volterra, transform, titles, tuple(int(degrees[k]) for k in independent))
 
 
-def _cholesky(covariance: Any, m: int) -> np.ndarray:
+def _cholesky(covariance: Any, m: int) -> Float[np.ndarray, "M M"]:
     R1 = np.asarray(covariance, float)
     if R1.shape != (m, m) or not np.allclose(R1, R1.T, rtol=1e-8, atol=0):
         raise InputError(
@@ -206,7 +205,7 @@ def _hermite(power: int) -> dict[int, float]:
     return {k: float(c) for k, c in enumerate(terms) if c}
 
 
-def _column(volterra: Volterra, index: Index, whitening: np.ndarray) -> np.ndarray:
+def _column(volterra: Volterra, index: Index, whitening: Float[np.ndarray, "M M"]) -> Float[np.ndarray, " P"]:
     """Raw weights of one product of Hermite polynomials."""
     m = volterra.bank.size
     by_degree = {d: np.zeros((m,) * d) for d in volterra.chosen}

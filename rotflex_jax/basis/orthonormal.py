@@ -1,17 +1,165 @@
-"""Orthonormal filters with poles of one's choice: Laguerre, Kautz and the general case."""
+"""Orthonormal filters with given poles: Laguerre, Kautz and the general case.
+
+Each section is an all-pass filter in a balanced realisation: its matrix `[A B; C D]` is orthogonal.
+So is that of any chain of them, hence `A A' + B B' = I`: the impulse responses of the states are
+orthonormal sequences. Complex poles come in pairs and need no complex arithmetic.
+"""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rotflex_jax.basis.bank import Bank, whole
-from rotflex_jax.basis.sections import Kinds, poles_of, run_chain, sections
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.samples import sampling_period
+
+SectionKinds = tuple[str, ...]
+"""Order of a section: "real" for one pole, "pair" for a conjugate pair."""
+
+
+def sections(poles: Sequence[complex]) -> tuple[SectionKinds, Float[np.ndarray, " M"]]:
+    """Kinds of the sections, in the order of their first pole, and their parameters.
+
+    A real pole `a` has one parameter, a pair two: its real and its positive imaginary part.
+
+    Raises:
+        InputError: No poles, one on or outside the unit circle, or one without its conjugate.
+    """
+    given = np.atleast_1d(np.asarray(poles, complex))
+    if given.ndim != 1 or not given.size or not np.isfinite(given).all():
+        raise InputError(
+            f"Argument `poles` must list finite numbers, at least one, but is {poles!r}; "
+            "give for instance (0.5, 0.6 + 0.3j, 0.6 - 0.3j)."
+        )
+    outside = [p if p.imag else p.real for p in given.tolist() if abs(p) >= 1]
+    if outside:
+        raise InputError(
+            f"A pole must lie inside the unit circle, but {outside[0]:.6g} has the modulus "
+            f"{abs(outside[0]):.6g}; give poles of the sampled plant, exp(s Ts), that decay."
+        )
+    kinds, numbers, waiting = [], [], list(given)
+    while waiting:
+        pole = waiting.pop(0)
+        if abs(pole.imag) <= 1e-12:
+            kinds.append("real")
+            numbers.append(pole.real)
+            continue
+        partners = [k for k, other in enumerate(waiting) if abs(other - pole.conjugate()) <= 1e-9]
+        if not partners:
+            raise InputError(
+                f"A complex pole needs its conjugate, but {pole:.6g} has none; give both, "
+                "since the input and the output are real."
+            )
+        waiting.pop(partners[0])
+        kinds.append("pair")
+        numbers += [pole.real, abs(pole.imag)]
+    return tuple(kinds), np.array(numbers)
+
+
+def poles_of(kinds: SectionKinds, numbers: Float[np.ndarray, " M"]) -> tuple[complex, ...]:
+    """The poles, pairs next to each other."""
+    poles, k = [], 0
+    for kind in kinds:
+        if kind == "real":
+            poles.append(complex(numbers[k]))
+            k += 1
+        else:
+            pole = complex(numbers[k], numbers[k + 1])
+            poles += [pole, pole.conjugate()]
+            k += 2
+    return tuple(poles)
+
+
+def chain(kinds: SectionKinds, numbers: Float[Array, " M"]) -> tuple[Float[Array, "M M"], Float[Array, " M"]]:
+    """`A`, `B` of the chain, `x+ = A x + B u`; traced in the parameters."""
+    n = len(numbers)
+    zero = jnp.zeros(n, numbers.dtype)
+    through_x, through_u = zero, jnp.ones((), numbers.dtype)  # input of the next section
+    rows, B, k = [], [], 0
+    for kind in kinds:
+        own = _real(numbers[k]) if kind == "real" else _pair(numbers[k], numbers[k + 1])
+        a, b, c, d = own
+        width = len(b)
+        for i in range(width):
+            rows.append((b[i] * through_x).at[k : k + width].add(a[i]))
+            B.append(b[i] * through_u)
+        through_x = (d * through_x).at[k : k + width].add(c)
+        through_u = d * through_u
+        k += width
+    return jnp.stack(rows), jnp.stack(B)
+
+
+Section = tuple[Float[Array, "m m"], Float[Array, " m"], Float[Array, " m"], Float[Array, ""]]
+"""A, B, C, D of a section with one or two states."""
+
+
+def _real(a: Float[Array, ""]) -> Section:
+    """`(z^-1 - a) / (1 - a z^-1)`."""
+    s = jnp.sqrt(1 - a**2)
+    return a[None, None], s[None], s[None], -a
+
+
+def _pair(re: Float[Array, ""], im: Float[Array, ""]) -> Section:
+    """`(-c + b (c - 1) z^-1 + z^-2) / (1 + b (c - 1) z^-1 - c z^-2)`, `c = -|p|^2`."""
+    c = -(re**2 + im**2)
+    b = 2 * re / (1 - c)
+    # 1 - b^2 without the cancellation that a pole near one would suffer.
+    q = jnp.sqrt((1 - c - 2 * re) * (1 - c + 2 * re)) / (1 - c)
+    k = jnp.sqrt((1 - c) * (1 + c))
+    A = jnp.stack([jnp.stack([-b * c, c * q]), jnp.stack([q, b])])
+    return A, jnp.stack([k, jnp.zeros_like(k)]), jnp.stack([-b * k, q * k]), -c
+
+
+def run_chain(kinds: SectionKinds, numbers: Float[Array, " M"], u: Float[Array, " N"]) -> Float[Array, "N M"]:
+    """States before each sample: the response of the chain to `u`, delayed by one sample."""
+    A, B = chain(kinds, numbers)
+
+    def step(x: Float[Array, " M"], u: Float[Array, ""]) -> tuple[Float[Array, " M"], Float[Array, " M"]]:
+        return A @ x + B * u, x
+
+    return jax.lax.scan(step, jnp.zeros_like(B), u)[1]
+
+
+def numbers_of(kinds: SectionKinds, signs: Sequence[float], z: Float[Array, " M"]) -> Float[Array, " M"]:
+    """Parameters of the sections from unconstrained coordinates, always inside the unit circle.
+
+    A real pole is `± exp(-exp(z))`, a pair `exp(-exp(z_1) ± j exp(z_2))`: the logarithms of its
+    decay and of its angle per sample.
+    """
+    z = jnp.clip(z, -40.0, 5.0)
+    numbers, k = [], 0
+    for kind, sign in zip(kinds, signs, strict=True):
+        size = jnp.exp(-jnp.exp(z[k]))
+        if kind == "real":
+            numbers.append(sign * size)
+            k += 1
+        else:
+            angle = jnp.exp(z[k + 1])
+            # An angle beyond pi gives the same pair as its conjugate.
+            numbers += [size * jnp.cos(angle), jnp.abs(size * jnp.sin(angle))]
+            k += 2
+    return jnp.stack(numbers)
+
+
+def coordinates(
+    kinds: SectionKinds, numbers: Float[np.ndarray, " M"]
+) -> tuple[Float[np.ndarray, " M"], tuple[float, ...]]:
+    """Unconstrained coordinates and signs of sections, the inverse of `numbers_of`."""
+    z, signs, k = [], [], 0
+    for kind in kinds:
+        pole = complex(numbers[k], 0.0 if kind == "real" else numbers[k + 1])
+        # A pole at zero is clipped to the fastest decay that the coordinates express.
+        z.append(np.log(-np.log(np.clip(abs(pole), 1e-12, 1 - 1e-12))))
+        signs.append(-1.0 if kind == "real" and pole.real < 0 else 1.0)
+        if kind == "pair":
+            z.append(np.log(abs(np.angle(pole))))
+        k += 1 if kind == "real" else 2
+    return np.array(z), tuple(signs)
 
 
 class Orthonormal(Bank):
@@ -22,14 +170,14 @@ class Orthonormal(Bank):
         D = 1 + b (c - 1) z^-1 - c z^-2,  c = -|p|^2,  b = 2 Re(p) / (1 + |p|^2)
 
     A linear plant with just these poles is exactly a weighted sum of them, at any sampling period.
-    Poles are numbers of the compiled code, so another value compiles nothing anew.
+    Poles are arguments of the compiled code, so another value compiles nothing again.
 
     Not for poles on the unit circle, such as that of an angle that integrates: take the delays, or
     fit the speed.
 
     Args:
         poles: In the z domain, each complex one with its conjugate; may repeat.
-        first: Delay of the whole bank [samples]; 1 suits a plant whose output does not jump.
+        first: Delay of the whole bank [samples]; 1 for a plant without direct feedthrough.
 
     Raises:
         InputError: A pole that does not decay, or a complex one without its conjugate.
@@ -45,7 +193,7 @@ class Orthonormal(Bank):
     """
 
     numbers: Any
-    kinds: Kinds = eqx.field(static=True)
+    kinds: SectionKinds = eqx.field(static=True)
     first: int = eqx.field(static=True)
     label: str = eqx.field(static=True)
 
@@ -55,7 +203,7 @@ class Orthonormal(Bank):
         self.label = label
 
     @classmethod
-    def laguerre(cls, pole: float, count: int, first: int = 1) -> Self:
+    def laguerre(cls, pole: float, count: int, first: int = 1) -> "Orthonormal":
         """Functions that share one real pole, for a plant that is well damped.
 
         Args:
@@ -76,7 +224,7 @@ class Orthonormal(Bank):
         return cls((pole,) * whole(count, "count", 1), first, "Laguerre")
 
     @classmethod
-    def kautz(cls, pole: complex, count: int, first: int = 1) -> Self:
+    def kautz(cls, pole: complex, count: int, first: int = 1) -> "Orthonormal":
         """Functions that share one pair of complex poles, for one resonance.
 
         Args:
@@ -97,7 +245,7 @@ class Orthonormal(Bank):
         return cls((pole, pole.conjugate()) * (count // 2), first, "Kautz")
 
     @classmethod
-    def at(cls, continuous_poles: Sequence[complex], Ts: float, first: int = 1) -> Self:
+    def at(cls, continuous_poles: Sequence[complex], Ts: float, first: int = 1) -> "Orthonormal":
         """Functions with the poles `exp(s Ts)` of a sampled plant.
 
         Args:
@@ -118,11 +266,11 @@ class Orthonormal(Bank):
             )
         return cls([complex(p) for p in np.exp(s * sampling_period(Ts))], first)
 
-    def with_numbers(self, numbers: Float[Array, " M"]) -> Self:
-        """The bank with other numbers of its sections, which may be traced.
+    def with_numbers(self, numbers: Float[Array, " M"]) -> "Orthonormal":
+        """The bank with other parameters of its sections, which may be traced.
 
         Args:
-            numbers: A real pole, or real and imaginary part of a pair, section by section.
+            numbers: Of each section: a real pole, or real and imaginary part of a pair.
         """
         return eqx.tree_at(lambda bank: bank.numbers, self, numbers)
 
@@ -147,15 +295,15 @@ class Orthonormal(Bank):
 
     @property
     def reach(self) -> int:
-        """Samples after which an impulse has left, to about a millionth of its size."""
+        """Samples after which the impulse response has decayed, to about a millionth of its size."""
         slowest = max(abs(p) for p in self.poles)
-        # Poles that repeat answer with a polynomial in front of the decay, which lasts longer.
+        # Repeated poles have a polynomial in front of the decay, which lasts longer.
         return self.first + int(np.ceil((14 + 3 * self.size) / -np.log(max(slowest, 0.05))))
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:
-        """Columns for a signal, inside of traced code too."""
+        """Columns for a signal, also in traced code."""
         numbers = jnp.asarray(self.numbers).astype(u.dtype)
-        # The chain's states come one sample late, so a bank without delay looks one sample ahead.
+        # The states of the chain are delayed by one sample, so a bank without delay looks one sample ahead.
         ahead = jnp.concatenate([jnp.zeros(self.first, u.dtype), u, jnp.zeros(1, u.dtype)])
         states = run_chain(self.kinds, numbers, ahead)
         return states[1 : len(u) + 1]

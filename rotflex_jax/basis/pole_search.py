@@ -1,4 +1,4 @@
-"""Poles of orthonormal filters from data: weights by least squares inside, poles outside."""
+"""Poles of orthonormal filters from data, by variable projection."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,14 +11,13 @@ import scipy
 from jaxtyping import Array, Float
 
 from rotflex_jax.basis.bank import signal, whole
-from rotflex_jax.basis.orthonormal import Orthonormal
-from rotflex_jax.basis.sections import Kinds, coordinates, numbers_of, poles_of
+from rotflex_jax.basis.orthonormal import Orthonormal, SectionKinds, coordinates, numbers_of, poles_of
 from rotflex_jax.basis.volterra import Volterra
 from rotflex_jax.errors import InputError
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
-# Beyond this modulus a pole decays over a million samples: the search ran to the edge.
-EDGE = 1 - 1e-6
+# Beyond this modulus a pole decays over a million samples: the search ended at the unit circle.
+LARGEST_MODULUS = 1 - 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +36,10 @@ class PoleSearch:
 
     Attributes:
         status: Of the best start: "converged", or in words what stopped it.
-        nmse: Squared error over the squared deviation from the mean (of the output itself where
+        nmse: Squared error over the squared deviation from the mean (over the squared output where
             there is no constant).
-        starts: Every start, the best first; like errors with unlike poles mean that the data do not
-            tell them apart.
+        starts: Every start, the best first; equal errors with different poles mean that the data do
+            not distinguish them.
     """
 
     status: str
@@ -65,21 +64,21 @@ class PoleSearch:
 
 @dataclasses.dataclass(frozen=True)
 class _Residual:
-    """What least squares leaves of the output, as a function of the poles; hashable, compiled once."""
+    """Residual of least squares as a function of the poles; hashable, compiled once."""
 
-    kinds: Kinds
+    kinds: SectionKinds
     signs: tuple[float, ...]
     degrees: tuple[int, ...]
     constant: bool
     repeat: int
 
-    def __call__(self, z: Float[Array, " D"], args: Any) -> Float[Array, " N"]:
-        bank, u, y, seen = args
+    def __call__(self, z: Float[Array, " M"], args: Any) -> Float[Array, " RN"]:
+        bank, u, y, counted = args
         numbers = jnp.tile(numbers_of(self.kinds, self.signs, z), self.repeat)
         basis = Volterra(bank.with_numbers(numbers), degrees=self.degrees, constant=self.constant)
-        phi = jax.vmap(basis.respond)(u) * seen[:, :, None]
+        phi = jax.vmap(basis.respond)(u) * counted[:, :, None]
         Q, _ = jnp.linalg.qr(phi.reshape(-1, phi.shape[2]))
-        y = (y * seen).ravel()
+        y = (y * counted).ravel()
         return y - Q @ (Q.T @ y)
 
 
@@ -87,7 +86,7 @@ _left = jax.jit(lambda residual, z, args: residual(z, args), static_argnums=0)
 _slopes = jax.jit(lambda residual, z, args: jax.jacfwd(residual)(z, args), static_argnums=0)
 
 
-def _descend(residual: _Residual, z: np.ndarray, args: Any, most: int) -> PoleStart:
+def _descend(residual: _Residual, z: Float[np.ndarray, " M"], args: Any, most: int) -> PoleStart:
     """One start of the search."""
     with double_precision():
         args = (args[0], *map(jnp.asarray, args[1:]))
@@ -108,7 +107,7 @@ def _descend(residual: _Residual, z: np.ndarray, args: Any, most: int) -> PoleSt
             nmse, steps, status = float("nan"), 0, "failed: the error is not finite"
         numbers = numbers_of(residual.kinds, residual.signs, jnp.asarray(z))
     poles = poles_of(residual.kinds, np.asarray(numbers))
-    if any(abs(p) > EDGE for p in poles):
+    if any(abs(p) > LARGEST_MODULUS for p in poles):
         status += ", a pole at the edge of the unit circle"
     return PoleStart(poles, nmse, status, steps)
 
@@ -134,28 +133,27 @@ def optimise_poles(
 
     Variable projection: only the poles are searched, by Levenberg-Marquardt with exact derivatives,
     in the logarithms of decay and angle, so that no pole can leave the unit circle. Several starts
-    show whether the answer depends on where one begins. The plant's own poles, where friction does not
-    move them, are the answer for a linear plant.
+    show whether the result depends on the start. For a linear plant it is the plant's own poles.
 
-    Not for many free poles: beyond about six the error is flat and they trade places.
+    Not for many free poles: beyond about six the error is flat, and the poles are interchangeable.
 
     Args:
         u: Input (N,), or several recordings as a list.
         y: Output (N,), or a list.
-        poles0: Where to begin, in the z domain, each complex pole with its conjugate; their number,
-            and which are real, stay.
+        poles0: First poles, in the z domain, each complex pole with its conjugate; their number, and
+            which are real, does not change.
         degrees: Of the Volterra series whose weights are fitted inside.
         constant: Whether it has a constant.
         repeat: How often the poles repeat: one real pole four times is a Laguerre bank of four.
         first: Delay of the bank [samples].
         skip: Samples at the start of each recording that do not count.
         starts: The first is `poles0`, the others are drawn around it.
-        spread: Deviation of the others, in the logarithms.
+        spread: Standard deviation of the others, in the logarithms.
         max_steps: Most evaluations of each start.
         seed: Of the starts.
 
     Returns:
-        The bank with the best poles, and what every start came to.
+        The bank with the best poles, and the result of every start.
 
     Raises:
         InputError: Shapes that do not fit, poles that do not decay.
@@ -171,7 +169,7 @@ def optimise_poles(
     (0.8, 'converged')
     """
     skip = whole(skip, "skip", 0)
-    U, Y, seen = _stack(u, y, skip, constant)
+    U, Y, counted = _stack(u, y, skip, constant)
     bank = Orthonormal(poles0, first)
     chosen = Volterra(bank, degrees=degrees, constant=constant)
     repeat = whole(repeat, "repeat", 1)
@@ -182,12 +180,12 @@ def optimise_poles(
     residual = _Residual(bank.kinds, signs, chosen.chosen, constant, repeat)
     repeated = Orthonormal(bank.poles * repeat, first, _label(bank, repeat))
     most = whole(max_steps, "max_steps", 1)
-    ends = [_descend(residual, z + shift, (repeated, U, Y, seen), most) for shift in shifts]
+    ends = [_descend(residual, z + shift, (repeated, U, Y, counted), most) for shift in shifts]
     ends.sort(key=lambda end: end.nmse if np.isfinite(end.nmse) else np.inf)
     best = ends[0]
     search = PoleSearch(best.status, best.nmse, tuple(ends))
     if not np.isfinite(best.nmse) or any(abs(p) >= 1 for p in best.poles):
-        return repeated, search  # rather the poles that were given than none
+        return repeated, search  # the poles that were given, rather than none
     return Orthonormal(best.poles * repeat, first, repeated.label), search
 
 
@@ -197,8 +195,12 @@ def _label(bank: Orthonormal, repeat: int) -> str:
     return "Laguerre" if bank.kinds == ("real",) else "Kautz"
 
 
-def _stack(u: Any, y: Any, skip: int, constant: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inputs, scaled outputs and what counts of them, (R, N) each."""
+Stacked = Float[np.ndarray, "R N"]
+"""Recordings of different length, filled up with zeros."""
+
+
+def _stack(u: Any, y: Any, skip: int, constant: bool) -> tuple[Stacked, Stacked, Stacked]:
+    """Inputs, scaled outputs, and one where a sample counts."""
     many = isinstance(u, (list, tuple)) and len(u) > 0 and np.ndim(u[0]) == 1
     us = [signal(x).astype(float) for x in (u if many else [u])]
     ys = [signal(x, "y").astype(float) for x in (y if many else [y])]
@@ -208,11 +210,11 @@ def _stack(u: Any, y: Any, skip: int, constant: bool) -> tuple[np.ndarray, np.nd
             f"first {skip} left out; give as many outputs as inputs, and more than are left out."
         )
     N = max(map(len, us))
-    U, Y, seen = np.zeros((3, len(us), N))
+    U, Y, counted = np.zeros((3, len(us), N))
     for k, (a, b) in enumerate(zip(us, ys, strict=True)):
-        U[k, : len(a)], Y[k, : len(b)], seen[k, skip : len(a)] = a, b, 1.0
-    counted = Y[seen > 0]
-    spread = np.linalg.norm(counted - counted.mean() if constant else counted)
+        U[k, : len(a)], Y[k, : len(b)], counted[k, skip : len(a)] = a, b, 1.0
+    used = Y[counted > 0]
+    spread = np.linalg.norm(used - used.mean() if constant else used)
     if not spread > 0:
         raise InputError("Argument `y` does not change, so no pole can be found; give a moving output.")
-    return U, Y / spread, seen
+    return U, Y / spread, counted

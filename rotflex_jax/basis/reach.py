@@ -1,6 +1,6 @@
-"""What a bank can reach: the least error of any weights, from the answer of the plant to an impulse.
+"""The least error that a bank can reach with any weights, from the impulse response of the plant.
 
-Exact for a linear plant and an input whose autocovariance is known; no recording, no chance.
+Exact for a linear plant and an input whose autocovariance is known, without any recording.
 """
 
 from typing import Any
@@ -56,11 +56,11 @@ def minimum_nmse(bank: Bank, impulse_response: Any, autocovariance: Any = (1.0,)
 
     Args:
         bank: The filters.
-        impulse_response: h of the plant (L,), so long that it has decayed.
+        impulse_response: h of the plant (L,), until it has decayed.
         autocovariance: Of the input, lags from 0; zero beyond those given. White unless given.
 
     Raises:
-        InputError: Too few lags, or a plant that does not answer.
+        InputError: Too few lags, or an impulse response of zero.
 
     Source: Wiener 1949; Haykin 2014, Adaptive Filter Theory, section 2.4.
 
@@ -83,7 +83,7 @@ def fir_nmse(impulse_response: Any, autocovariance: Any = (1.0,), first: int = 0
     """`minimum_nmse` of `Delays(1, first)`, `Delays(2, first)`, ..., all from one factorisation.
 
     Args:
-        impulse_response: h of the plant (L,), so long that it has decayed.
+        impulse_response: h of the plant (L,), until it has decayed.
         autocovariance: Of the input, lags from 0; zero beyond those given. White unless given.
         first: Delay of the first tap [samples].
 
@@ -106,7 +106,7 @@ def memory_for(nmse: float, impulse_response: Any, autocovariance: Any = (1.0,),
 
     Args:
         nmse: Squared error over the variance of the output, for instance 0.01.
-        impulse_response: h of the plant (L,), so long that it has decayed.
+        impulse_response: h of the plant (L,), until it has decayed.
         autocovariance: Of the input, lags from 0; zero beyond those given. White unless given.
         first: Delay of the first tap [samples].
 
@@ -123,16 +123,16 @@ def memory_for(nmse: float, impulse_response: Any, autocovariance: Any = (1.0,),
 def best_laguerre(
     impulse_response: Any, count: int, first: int = 1, grid: int = 60
 ) -> tuple[Orthonormal, float]:
-    """The Laguerre bank of a size that comes closest to an impulse response, and its error.
+    """The Laguerre bank of given size that is closest to an impulse response, and its error.
 
     The error as a function of the pole has several minima, about one per function, so a grid over
     all decays comes first, from the whole response down to one sample.
 
     Args:
-        impulse_response: h of the plant (L,), so long that it has decayed.
+        impulse_response: h of the plant (L,), until it has decayed.
         count: Number of functions.
         first: Delay of the bank [samples].
-        grid: Poles to try before the best is refined.
+        grid: Poles to try before the best one is improved.
 
     Returns:
         The bank, and |h - B c|^2 / |h|^2.
@@ -159,7 +159,7 @@ def best_laguerre(
     return Orthonormal.laguerre(float(np.exp(-np.exp(found.x))), count, first), error(found.x)
 
 
-def _lags(autocovariance: Any, length: int) -> np.ndarray:
+def _lags(autocovariance: Any, length: int) -> Float[np.ndarray, " {length}"]:
     """Autocovariance at the lags 0 ... length - 1."""
     r = signal(autocovariance, "autocovariance").astype(float)
     if r[0] <= 0:
@@ -174,7 +174,7 @@ def _lags(autocovariance: Any, length: int) -> np.ndarray:
     return np.concatenate([r, np.zeros(max(length - len(r), 0))])[:length]
 
 
-def _power(h: np.ndarray, r: np.ndarray) -> float:
+def _power(h: Float[np.ndarray, " L"], r: Float[np.ndarray, " L"]) -> float:
     power = float(h @ scipy.linalg.matmul_toeplitz(r, h))
     if not power > 0:
         raise InputError(

@@ -1,6 +1,10 @@
 """Volterra series: weighted monomials of a bank's outputs."""
 
+import itertools
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Literal
 
 import equinox as eqx
@@ -10,9 +14,159 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rotflex_jax.basis.bank import Bank, evaluate, whole
-from rotflex_jax.basis.kernels import kernels_of, weights_of
-from rotflex_jax.basis.monomials import Index, indices, orders, title
 from rotflex_jax.errors import InputError
+
+Index = tuple[int, ...]
+"""Columns of a product; () is the constant."""
+
+
+@cache
+def indices(size: int, degree: int, layout: str) -> tuple[Index, ...]:
+    """Products of one degree: each once ("triangular"), or in every order of its factors ("full").
+
+    >>> indices(2, 2, "triangular")
+    ((0, 0), (0, 1), (1, 1))
+    >>> indices(2, 2, "full")
+    ((0, 0), (0, 1), (1, 0), (1, 1))
+    """
+    if layout == "full":
+        return tuple(itertools.product(range(size), repeat=degree))
+    return tuple(itertools.combinations_with_replacement(range(size), degree))
+
+
+def orders(index: Index) -> int:
+    """In how many orders its factors can be written.
+
+    >>> orders((0, 0, 1))
+    3
+    """
+    return math.factorial(len(index)) // math.prod(math.factorial(n) for n in Counter(index).values())
+
+
+def title(index: Index, names: Sequence[str]) -> str:
+    """Such as `u[t]^2 * u[t-1]`.
+
+    >>> title((0, 0, 1), ["u[t]", "u[t-1]"])
+    'u[t]^2 * u[t-1]'
+    """
+    if not index:
+        return "1"
+    if len(index) == 1:
+        return names[index[0]]
+    words = []
+    for k, power in Counter(index).items():
+        name = f"({names[k]})" if " " in names[k] else names[k]
+        words.append(f"{name}^{power}" if power > 1 else name)
+    return " * ".join(words)
+
+
+@cache
+def positions(size: int, degree: int) -> Int[np.ndarray, "*M"]:
+    """Position of every entry of a tensor (size, ...) in the triangular list."""
+    place = {index: k for k, index in enumerate(indices(size, degree, "triangular"))}
+    flat = [place[tuple(sorted(i))] for i in indices(size, degree, "full")]
+    return np.array(flat, int).reshape((size,) * degree)
+
+
+@cache
+def counts(size: int, degree: int) -> Int[np.ndarray, " P"]:
+    """`orders` of the triangular list."""
+    return np.array([orders(i) for i in indices(size, degree, "triangular")], int)
+
+
+def symmetric(kernel: Float[np.ndarray, "*L"]) -> Float[np.ndarray, "*L"]:
+    """Mean over all orders of the axes, which leaves the output of a Volterra series unchanged."""
+    axes = list(itertools.permutations(range(kernel.ndim)))
+    return np.asarray(sum((np.transpose(kernel, a) for a in axes[1:]), kernel) / len(axes))
+
+
+def to_tensor(w: Float[np.ndarray, " P"], size: int, degree: int, layout: str) -> Float[np.ndarray, "*M"]:
+    """Symmetric tensor (size, ...) of the weights of one degree."""
+    if layout == "full":
+        return symmetric(w.reshape((size,) * degree))
+    return (w / counts(size, degree))[positions(size, degree)]
+
+
+def from_tensor(tensor: Float[np.ndarray, "*M"], size: int, layout: str) -> Float[np.ndarray, " P"]:
+    """Weights of one degree from a tensor (size, ...) of any symmetry."""
+    if layout == "full":
+        return symmetric(tensor).ravel()
+    places = positions(size, tensor.ndim)
+    return np.bincount(places.ravel(), tensor.ravel(), minlength=len(counts(size, tensor.ndim)))
+
+
+def change_axes(tensor: Float[np.ndarray, "*M"], matrix: Float[np.ndarray, "L m"]) -> Float[np.ndarray, "*L"]:
+    """The matrix applied to every axis of a tensor (m, ...)."""
+    for _ in range(tensor.ndim):
+        # The first axis becomes the last, so after all of them the order is as before.
+        tensor = np.tensordot(tensor, matrix, axes=(0, 1))
+    return tensor
+
+
+LARGEST_KERNEL = 20_000_000
+"""Most entries of one kernel, for want of memory."""
+
+
+def kernels_of(
+    bank: Bank, parts: Mapping[int, Float[np.ndarray, " P"]], layout: str, length: int | None
+) -> dict[int, Any]:
+    """Degree -> symmetric kernel (length, ...), from the weights of each degree.
+
+    Args:
+        bank: Of the series.
+        parts: Degree -> weights.
+        layout: Of the weights.
+        length: Delays from 0 to give [samples]; as far as the bank reaches if None.
+    """
+    length = whole(bank.reach if length is None else length, "length", 1)
+    most = max(parts)
+    if length**most > LARGEST_KERNEL:
+        raise InputError(
+            f"A kernel of degree {most} over {length} delays has {float(length**most):.1e} numbers, but at "
+            f"most {LARGEST_KERNEL:.0e} are made; give a smaller `length`."
+        )
+    B = bank.impulse_responses(length)
+    found: dict[int, Any] = {}
+    for d, w in parts.items():
+        found[d] = float(w[0]) if d == 0 else change_axes(to_tensor(w, bank.size, d, layout), B)
+    return found
+
+
+def weights_of(
+    bank: Bank, kernels: Mapping[int, Any], layout: str, tolerance: float
+) -> dict[int, Float[np.ndarray, " P"]]:
+    """Degree -> weights, from kernels over the delays from 0 on.
+
+    Args:
+        bank: Of the series.
+        kernels: Degree -> kernel (length, ...), of any symmetry.
+        layout: Of the weights.
+        tolerance: Share of a kernel that may lie outside the span of the bank.
+    """
+    found = {}
+    for d, kernel in kernels.items():
+        H = np.asarray(kernel, float)
+        if H.ndim != d or len(set(H.shape)) > 1:
+            raise InputError(
+                f"A kernel of degree {d} must have {d} axes of one length, but has the shape {H.shape}; "
+                "give it over the same delays on each axis."
+            )
+        if d == 0:
+            found[d] = H[None]
+            continue
+        B = bank.impulse_responses(len(H))
+        H = symmetric(H)
+        tensor = change_axes(H, np.linalg.pinv(B))
+        left, size = np.linalg.norm(change_axes(tensor, B) - H), np.linalg.norm(H)
+        if left > tolerance * size:
+            raise InputError(
+                f"The kernel of degree {d} lies outside the span of the bank by {100 * left / size:.2g} % "
+                "of its norm; take other poles or a longer memory, or give a larger `tolerance` for the "
+                "best approximation."
+            )
+        found[d] = from_tensor(tensor, bank.size, layout)
+    return found
+
 
 Layout = Literal["triangular", "full"]
 
@@ -24,14 +178,14 @@ class Volterra(eqx.Module):
 
     The full layout lists a product once for every order of its factors, as the sums over all delays
     are often written; equal columns make it rank deficient, so least squares needs the minimum norm.
-    Not for friction that sticks, nor for a strong threshold: no low degree comes near.
+    Not for dry friction that sticks, nor for a strong threshold, which no low degree approximates.
 
     Args:
-        bank: `Delays`, `Orthonormal`, or one's own.
+        bank: `Delays`, `Orthonormal`, or another.
         order: All degrees from 1 to this one.
         degrees: The degrees instead, such as (1, 3) where the plant is odd.
-        constant: Whether there is a constant. Without it the even degrees also have to carry the
-            mean of the output, and bend.
+        constant: Whether there is a constant. Without it the even degrees also have to fit the
+            mean of the output, and are biased.
         layout: "triangular", each product once, or "full".
 
     Raises:
@@ -112,7 +266,7 @@ class Volterra(eqx.Module):
         return np.array([len(i) for i in self.indices], int)
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N P"]:
-        """Regressors for a signal, inside of traced code too."""
+        """Regressors for a signal, also in traced code."""
         return self.products(self.bank.respond(u))
 
     def products(self, z: Float[Array, "N M"]) -> Float[Array, "N P"]:
@@ -171,8 +325,8 @@ class Volterra(eqx.Module):
 
         Args:
             kernels: Degree -> kernel over the delays from 0 on, of any symmetry; those left out are zero.
-            tolerance: Part of a kernel that may lie outside of what the bank spans; `numpy.inf` gives
-                the best approximation, whatever is lost.
+            tolerance: Share of a kernel that may lie outside the span of the bank; `numpy.inf` gives the
+                best approximation in any case.
 
         Raises:
             InputError: A degree that the basis lacks, a kernel that is no cube, or one that the bank does
@@ -200,9 +354,11 @@ class Volterra(eqx.Module):
         >>> Volterra(Delays(2)).step_sizes({0: 0.1, 1: 0.01, 2: 0.001}, as_full=True)
         array([0.1  , 0.01 , 0.01 , 0.001, 0.002, 0.001])
         """
-        often = np.array([orders(i) if as_full and self.layout == "triangular" else 1 for i in self.indices])
+        multiplicity = np.array(
+            [orders(i) if as_full and self.layout == "triangular" else 1 for i in self.indices]
+        )
         sizes = spread(by_degree, self.degrees)
-        return sizes * often.astype(sizes.dtype)
+        return sizes * multiplicity.astype(sizes.dtype)
 
 
 def spread(by_degree: Mapping[int, Any], degrees: Int[np.ndarray, " P"]) -> Any:

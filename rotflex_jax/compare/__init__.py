@@ -2,20 +2,19 @@
 
 from rotflex_jax.compare.adaptive_series import AdaptiveSeries
 from rotflex_jax.compare.arx import ARX
-from rotflex_jax.compare.batch_series import RIDGES, BatchSeries
-from rotflex_jax.compare.learned import LearnedTorqueMethod
+from rotflex_jax.compare.linear_models import LinearStateSpace, Subspace
 from rotflex_jax.compare.method import METHODS, Fitted, Method, register
-from rotflex_jax.compare.output_error import LinearStateSpace
 from rotflex_jax.compare.physics import (
     Discovered,
     GreyBox,
     GreyBoxPredictor,
+    LearnedTorqueMethod,
     LinearPart,
     Textbook,
 )
-from rotflex_jax.compare.side_by_side import compare
+from rotflex_jax.compare.run import compare
+from rotflex_jax.compare.series import RIDGES, BatchSeries
 from rotflex_jax.compare.sindy import SINDy
-from rotflex_jax.compare.subspace import Subspace
 from rotflex_jax.compare.table import Comparison, Row
 
 # The order in which they run; one more method is one more line.

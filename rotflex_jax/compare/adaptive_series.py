@@ -1,4 +1,4 @@
-"""Volterra series learnt sample by sample: LMS and its relatives, with settings by grid or by gradient."""
+"""Volterra series adapted sample by sample: LMS and its relatives, with settings by grid or by gradient."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -11,17 +11,24 @@ from jaxtyping import Array, Float, Int
 
 from rotflex_jax.adaptive import LMS, NLMS, RLS, AdaptiveFilter, Kalman, grid, run, tune
 from rotflex_jax.basis import Volterra
-from rotflex_jax.compare.banks import Kind, banks
-from rotflex_jax.compare.batch_series import RIDGES, in_words
-from rotflex_jax.compare.held_in import one_period
+from rotflex_jax.compare.evaluation import require_one_sampling_period
 from rotflex_jax.compare.method import Fitted, Progress
-from rotflex_jax.compare.series_rows import Rows, choose, series
-from rotflex_jax.compare.series_run import ChannelSeries, model_of
-from rotflex_jax.model import Model
+from rotflex_jax.compare.series import (
+    RIDGES,
+    BankKind,
+    ChannelSeries,
+    SeriesRegression,
+    candidate_banks,
+    channel_series,
+    describe_selection,
+    select_series,
+    series_model,
+)
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
 
-Rule = Literal["lms", "nlms", "rls", "kalman"]
+FilterRule = Literal["lms", "nlms", "rls", "kalman"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,30 +36,30 @@ class AdaptiveSeries:
     """A Volterra series whose weights are adapted by a filter, then frozen.
 
     Bank, time scale, and output or rate are those that batch least squares chooses, so that the filter
-    alone makes the difference. A rate is learnt from changes of the output over as many samples as a
-    model may look at, since those of one sample are mostly noise. Settings are chosen on halves of the
-    recordings, each judged on the others; how often the record is gone through, by the free run over
-    its last part. Not the way to use a whole recording: least squares does, and LMS only nears it.
+    alone makes the difference. A rate is learned from changes of the output over `n_init` samples, since
+    those of one sample are mostly noise. Settings are chosen on halves of the recordings, each validated
+    on the others; the number of passes, by the free run over the last part. Not the way to use a whole
+    recording: least squares is exact, and LMS only approaches it.
 
     Source: Mathews and Sicuranza 2000, Polynomial Signal Processing; Haykin 2002.
 
     Attributes:
         name: Short.
         title: In words.
-        rule: Which filter.
+        rule: Kind of filter.
         gradient: Settings by gradient through the filter instead of by a grid.
         bank: Kind of the bank.
         order: Of the Volterra series.
         count: Columns of the bank.
-        passes: Most times that the record is gone through; one for filters that remember all of it.
-        share: First part of each recording, for choices.
+        passes: Passes through the recordings at most; one for filters with unlimited memory.
+        share: First part of each recording; the rest is for validation.
     """
 
     name: str
     title: str
-    rule: Rule = "lms"
+    rule: FilterRule = "lms"
     gradient: bool = False
-    bank: Kind = "delays"
+    bank: BankKind = "delays"
     order: int = 2
     count: int = 10
     passes: int = 30
@@ -60,29 +67,29 @@ class AdaptiveSeries:
     family: str = "adaptive"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Takes no notice of the model."""
-        one_period(train, "a series")
-        candidates = [Volterra(b, self.order) for b in banks(self.bank, self.count, train)]
-        choices, found, said = [], [], []
+        """Ignores the model."""
+        require_one_sampling_period(train, "a series")
+        candidates = [Volterra(b, self.order) for b in candidate_banks(self.bank, self.count, train)]
+        choices, adapted, phrases = [], [], []
         for c, name in enumerate(train[0].channels):
-            choices.append(choose(candidates, train, c, self.share, RIDGES))
-            learnt, words = self._learnt(choices[-1].series, train, c)
-            found.append(learnt)
-            said.append(words)
+            choices.append(select_series(candidates, train, c, self.share, RIDGES))
+            series, words = self._adapt(choices[-1].series, train, c)
+            adapted.append(series)
+            phrases.append(words)
             say(f"{name}: {words}")
-        result = model_of(found)
-        words = f"{in_words(choices, train[0])}; {', '.join(said)}"
+        result = series_model(adapted)
+        words = f"{describe_selection(choices, train[0])}; {', '.join(phrases)}"
         return Fitted(result, result.parameters, words, result.predict)
 
-    def _learnt(self, batch: ChannelSeries, train: Sequence[Recording], c: int) -> tuple[ChannelSeries, str]:
+    def _adapt(self, batch: ChannelSeries, train: Sequence[Recording], c: int) -> tuple[ChannelSeries, str]:
         """Weights of the filter on the basis of a batch fit, and its settings in words."""
-        rows = [Rows.of(batch.basis, r, c, batch.integrates) for r in train]
+        rows = [SeriesRegression.of(batch.basis, r, c, batch.integrates) for r in train]
         hold = train[0].n_init if batch.integrates else 0
-        data = [_samples(x, hold) for x in rows]
+        data = [_training_rows(x, hold) for x in rows]
         size = np.sqrt(np.mean(np.concatenate(data) ** 2, axis=0))
         size = np.where(size > 0, size, 1.0)
-        shaped = Shaped(batch.basis, size, hold, batch.Ts)
-        halves = [h for r in train for h in _halves(r, c, hold, size[-1], min(x.N for x in train) // 2)]
+        shaped = NormalisedSeries(batch.basis, size, hold, batch.Ts)
+        halves = [h for r in train for h in _equal_parts(r, c, hold, size[-1], min(x.N for x in train) // 2)]
         noise = batch.noise / size[-1]
         settings, filter = self._settings(shaped, halves, noise)
         cuts = [round(self.share * r.N) for r in train]
@@ -102,14 +109,14 @@ class AdaptiveSeries:
             raise RuntimeError(f"the filter {end.status}")
         w = end.weights / size[:-1] * size[-1]
         times = f", {best} passes" if passes > 1 else ""
-        return series(batch.basis, w, batch.integrates, train, c, rows), settings + times
+        return channel_series(batch.basis, w, batch.integrates, train, c, rows), settings + times
 
     def _settings(
-        self, basis: "Shaped", halves: Sequence[Recording], noise: float
+        self, basis: "NormalisedSeries", halves: Sequence[Recording], noise: float
     ) -> tuple[str, AdaptiveFilter]:
-        """Settings of the filter, chosen for what the last weights are worth on the other halves."""
+        """Settings of the filter with the least error of its last weights on the other halves."""
         P, rule = basis.size, self.rule
-        build = Build(rule, tuple((basis.degrees > 1).tolist()), noise)
+        build = FilterFactory(rule, tuple((basis.degrees > 1).tolist()), noise)
         axes: dict[str, Any] = {
             "lms": {"mu": np.logspace(-3.5, -0.3, 7) / P, "mu_products": np.logspace(-3.5, -0.3, 7) / P},
             "nlms": {"mu": np.logspace(-3.5, 0, 10)},
@@ -125,8 +132,8 @@ class AdaptiveSeries:
 
 
 @dataclasses.dataclass(frozen=True)
-class Build:
-    """Makes the filter of settings by name; one object of like fields is one compilation."""
+class FilterFactory:
+    """Makes the filter of settings by name; equal objects share one compilation."""
 
     rule: str
     products: tuple[bool, ...]
@@ -143,8 +150,8 @@ class Build:
         return Kalman(q=s["q"], r=max(self.noise, 1e-6) ** 2, p0=s["p0"])
 
 
-class Shaped(eqx.Module):
-    """A series' regressors of size one, or their sums over the samples that a change is taken over."""
+class NormalisedSeries(eqx.Module):
+    """Regressors of a series scaled to size one, or their sums over the samples of a change of the output."""
 
     basis: Volterra
     scale: Any
@@ -174,7 +181,7 @@ class Shaped(eqx.Module):
         return ("1",) * self.size
 
     def kernels(self, w: Any, length: int | None = None) -> Mapping[int, Any]:
-        """Of the weights as they are in front of the series."""
+        """Of the weights of the series before scaling."""
         return self.basis.kernels(np.asarray(w) / self.scale, length)
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N P"]:
@@ -191,8 +198,8 @@ class Shaped(eqx.Module):
         return np.asarray(self.respond(jnp.asarray(u)))
 
 
-def _samples(x: Rows, hold: int) -> Float[np.ndarray, "N K"]:
-    """Regressors and output, or their changes; nothing is learnt from rows that are zero."""
+def _training_rows(x: SeriesRegression, hold: int) -> Float[np.ndarray, "N K"]:
+    """Regressors and output, or their changes; rows that are zero have no influence."""
     joined = np.column_stack([x.phi, x.y])
     if hold:
         joined[hold:] = joined[hold:] - joined[:-hold]
@@ -200,7 +207,7 @@ def _samples(x: Rows, hold: int) -> Float[np.ndarray, "N K"]:
     return joined
 
 
-def _halves(r: Recording, c: int, hold: int, size: float, length: int) -> list[Recording]:
+def _equal_parts(r: Recording, c: int, hold: int, size: float, length: int) -> list[Recording]:
     """Parts of one length, with the output or its changes as the only channel."""
     y = r.y[:, [c]].astype(float)
     if hold:

@@ -1,51 +1,52 @@
-"""The black box that everybody tries first: a linear difference equation, by least squares."""
+"""ARX: a linear difference equation, by least squares."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
-from rotflex_jax.compare.held_in import free_run_cost, one_period, parted
+from rotflex_jax.compare.evaluation import require_one_sampling_period, split_for_validation, validation_cost
 from rotflex_jax.compare.method import Fitted, Progress
 from rotflex_jax.errors import InputError
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class DifferenceEquation:
     """A linear difference equation of all outputs together.
 
         y[k] = A_1 y[k-1] + ... + A_n y[k-n] + B_1 u[k-1] + ... + B_n u[k-n]
 
     Attributes:
-        A: Of the outputs (C, n, C), oldest sample first.
-        B: Of the input (C, n), oldest sample first.
+        A: Coefficients of the outputs, oldest sample first.
+        B: Coefficients of the input, oldest sample first.
         Ts: Sampling period it holds for [s].
     """
 
-    A: np.ndarray
-    B: np.ndarray
+    A: Float[np.ndarray, "C n C"]
+    B: Float[np.ndarray, "C n"]
     Ts: float
 
     @property
     def order(self) -> int:
-        """How many samples it looks back."""
+        """Number of past samples that it uses."""
         return self.B.shape[1]
 
-    def predict(self, recording: Recording) -> np.ndarray:
-        """One step ahead (N, C); the first samples, which it needs to begin, as measured."""
+    def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """One step ahead; the first samples, which it starts from, as measured."""
         n, y = self.order, recording.y.astype(float)
         lags = lambda x: np.lib.stride_tricks.sliding_window_view(x, n, axis=0)[:-1]  # noqa: E731
         past = np.swapaxes(lags(y), 1, 2).reshape(len(y) - n, -1)
         ahead = past @ self.A.reshape(len(self.B), -1).T + lags(recording.u.astype(float)) @ self.B.T
         return np.concatenate([y[:n], ahead])
 
-    def simulate(self, recording: Recording) -> np.ndarray:
-        """Free run (N, C): the first `n_init` samples as measured, from there on its own outputs.
+    def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """Free run: the first `n_init` samples as measured, from there on its own outputs.
 
         Raises:
-            InputError: It looks back further than `n_init`, or the sampling period is another one.
+            InputError: Its order exceeds `n_init`, or the sampling period is another one.
         """
         n, m, N = self.order, recording.n_init, recording.N
         if n > m:
@@ -61,7 +62,7 @@ class Difference:
         out = np.zeros((N, len(self.B)))
         out[:m] = recording.y[:m]
         lags = np.lib.stride_tricks.sliding_window_view(recording.u.astype(float), n)
-        # An unstable equation grows beyond all numbers; whoever scores the run will see it.
+        # An unstable equation overflows; the evaluation of the run reports it.
         with np.errstate(all="ignore"):
             driven = lags @ self.B.T  # row k - n drives sample k
             A = self.A.reshape(len(self.B), -1)
@@ -82,7 +83,7 @@ class ARX:
 
     Attributes:
         orders: Orders to choose from; those beyond `n_init` are left out.
-        share: Share of each training recording that orders are fitted to; the rest decides.
+        share: Share of each training recording that orders are fitted to; the rest is for validation.
     """
 
     name: str = "arx"
@@ -92,30 +93,30 @@ class ARX:
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Takes no notice of the model."""
-        first, last = parted(train, self.share)
+        """Ignores the model."""
+        first, last = split_for_validation(train, self.share)
         longest = min(r.n_init for r in (*first, *last))
         orders = [n for n in self.orders if n <= longest]
         if not orders:
             raise InputError(
-                f"The lowest order is {min(self.orders)}, but a model may look at only {longest} "
+                f"The lowest order is {min(self.orders)}, but a model may use only {longest} "
                 "samples of the recordings; give them a larger n_init."
             )
-        one_period(train, "a difference equation")
+        require_one_sampling_period(train, "a difference equation")
         costs = []
         for n in orders:
-            costs.append(free_run_cost(least_squares(first, n), last))
+            costs.append(validation_cost(fit_difference_equation(first, n), last))
             say(f"order {n}: log error {costs[-1]:.2f}")
-        found = least_squares(train, orders[int(np.argmin(costs))])
+        found = fit_difference_equation(train, orders[int(np.argmin(costs))])
         return Fitted(found, found.A.size + found.B.size, f"order {found.order}", found.predict)
 
 
-def least_squares(recordings: Sequence[Recording], order: int) -> Difference:
+def fit_difference_equation(recordings: Sequence[Recording], order: int) -> DifferenceEquation:
     """The equation of this order that predicts the next sample best.
 
     Args:
         recordings: All with the same sampling period.
-        order: Samples that the equation looks back.
+        order: Past samples that the equation uses.
     """
     C = recordings[0].y.shape[1]
     rows, targets = [], []
@@ -130,4 +131,4 @@ def least_squares(recordings: Sequence[Recording], order: int) -> Difference:
     size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-300)
     W = (np.linalg.lstsq(X / size, Y, rcond=None)[0] / size[:, None]).T
     A, B = W[:, : order * C].reshape(C, order, C), W[:, order * C :]
-    return Difference(A, B, recordings[0].Ts)
+    return DifferenceEquation(A, B, recordings[0].Ts)

@@ -1,43 +1,47 @@
-"""What a method is: it learns from recordings, and what it learnt can simulate another one."""
+"""What a method is: it learns from recordings, and the result can simulate another one."""
 
+import abc
 import dataclasses
 import difflib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 Progress = Callable[[str], None]
 
 
+@runtime_checkable
 class Simulator(Protocol):
     """What can simulate a recording."""
 
-    def simulate(self, recording: Recording) -> np.ndarray:
-        """Free run: outputs (N, C) from the input and the first `n_init` samples of the outputs."""
+    @abc.abstractmethod
+    def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """Free run: outputs from the input and the first `n_init` samples of the outputs."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """What a method made of the recordings it learnt from.
+    """What a method learned from recordings.
 
     Attributes:
         simulator: Simulates other recordings; a `Model`, or an object of the method's own.
-        parameters: How many numbers were fitted.
+        parameters: Number of fitted parameters.
         note: What a reader of the table must know, as a phrase; "" for nothing.
-        predict: Outputs (N, C) one step ahead, each from the input and the outputs before it; None
+        predict: Outputs one step ahead, each from the input and the outputs before it; None
             for a method that has no predictor.
     """
 
     simulator: Simulator
     parameters: int
     note: str = ""
-    predict: Callable[[Recording], np.ndarray] | None = None
+    predict: Callable[[Recording], Float[np.ndarray, "N C"]] | None = None
 
 
 @runtime_checkable
@@ -50,20 +54,23 @@ class Method(Protocol):
     """
 
     @property
+    @abc.abstractmethod
     def name(self) -> str: ...  # noqa: D102
     @property
+    @abc.abstractmethod
     def title(self) -> str: ...  # noqa: D102
 
+    @abc.abstractmethod
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Learn from recordings that have exactly the model's channels, in its order.
 
         Args:
-            model: The user's physics; a black box takes no notice of it.
+            model: The user's physics; a black box ignores it.
             train: Recordings to learn from.
             say: Called with a short phrase now and then.
 
         Returns:
-            What was learnt. Whatever is raised becomes a row that says so.
+            What was learned. Whatever is raised becomes a row that says so.
         """
         ...
 
@@ -93,14 +100,14 @@ def register(method: Method) -> Method:
     return method
 
 
-def chosen(methods: Iterable[str | Method] | None) -> tuple[Method, ...]:
+def selected_methods(methods: Iterable[str | Method] | None) -> tuple[Method, ...]:
     """Methods given by name or as objects; all registered ones for None."""
     if methods is None:
         return tuple(METHODS.values())
     listed = [methods] if isinstance(methods, (str, Method)) else list(methods)
     found: dict[str, Method] = {}
     for item in listed:
-        method = _named(item) if isinstance(item, str) else item
+        method = _method_by_name(item) if isinstance(item, str) else item
         _check(method)
         if found.get(method.name, method) != method:
             raise InputError(
@@ -113,7 +120,7 @@ def chosen(methods: Iterable[str | Method] | None) -> tuple[Method, ...]:
     return tuple(found.values())
 
 
-def _named(name: str) -> Method:
+def _method_by_name(name: str) -> Method:
     name = name.strip()
     if name in METHODS:
         return METHODS[name]

@@ -1,51 +1,52 @@
-"""Methods that start from the user's physics: as given, fitted, without and with more effects."""
+"""Methods that start from the user's physics: as given, fitted, with more effects, with a learned torque."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
+from rotflex_jax.compare.evaluation import split_for_validation
 from rotflex_jax.compare.method import Fitted, Progress
 from rotflex_jax.discover import discover
-from rotflex_jax.discover.refit import HORIZON
-from rotflex_jax.effects.kinds import Linear
+from rotflex_jax.discover.learned_torque import learn_torque
+from rotflex_jax.discover.likelihood import MAX_PROCESS_NOISE_SHARE
 from rotflex_jax.fit import fit
-from rotflex_jax.fit.greybox import everywhere, torque_scale
-from rotflex_jax.fit.residuals import sensor_noise, stack
-from rotflex_jax.model import Model
+from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 
 @dataclasses.dataclass(frozen=True)
 class Textbook:
-    """The mechanism as it was given, nothing fitted: what the data sheet is worth."""
+    """The mechanism as it was given, nothing fitted."""
 
     name: str = "textbook"
     title: str = "the mechanism with its given numbers"
     family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Takes no notice of the recordings."""
-        return Fitted(model, parameters=0, predict=predictor(model, train))
+        """Ignores the recordings, but for the predictor's noise."""
+        return Fitted(model, parameters=0, predict=one_step_predictor(model, train))
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearPart:
-    """The linear effects of the mechanism alone, fitted: what the nonlinear ones are worth."""
+    """The linear effects of the mechanism alone, fitted."""
 
     name: str = "linear"
     title: str = "the linear effects of the mechanism alone, fitted"
     family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Leaves out every effect that is not linear, then fits as the grey box."""
+        """Leave out every effect that is not linear, then fit as the grey box."""
         mechanism = model.mechanism
-        nonlinear = [e for e in mechanism.effects if not isinstance(e, Linear)]
+        nonlinear = [e for e in mechanism.effects if not e.is_linear]
         for e in nonlinear:
             mechanism = mechanism.without(e.name, e.at)
         left_out = ", ".join(f"{e.name} at {e.at}" for e in nonlinear)
         note = f"without {left_out}" if nonlinear else "the mechanism is linear as it is"
-        return fitted_physics(Model(mechanism, model.solver), train, say, note=note)
+        return fit_mechanism(Model(mechanism, model.solver), train, say, note=note)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,41 +58,40 @@ class GreyBox:
     family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Fits the error that is compared."""
-        return fitted_physics(model, train, say)
+        """Fit the error that is compared."""
+        return fit_mechanism(model, train, say)
 
 
 @dataclasses.dataclass(frozen=True)
 class GreyBoxPredictor:
     """The mechanism, fitted to the predictions of a Kalman filter.
 
-    Missing physics bends the parameters less than in a free run, since the filter puts down a part
-    of the error to unknown torques; in return the free run is not what is minimised.
+    Missing physics biases the parameters less than in a free run, since the filter attributes a part
+    of the error to unknown torques; in return the error of free runs is not minimised.
 
     Attributes:
-        share: Intensity of these torques, as a share of what a torque as large as the motor's would
-            have if it were drawn anew at each sample.
+        share: Intensity of these torques, as a share of that of white noise as large as the motor's torque.
     """
 
     name: str = "grey_box_predictor"
     title: str = "the mechanism, fitted to predictions that admit unknown torques"
     family: str = "physics"
-    share: float = HORIZON
+    share: float = MAX_PROCESS_NOISE_SHARE
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Fits innovations instead of free runs."""
-        return fitted_physics(model, train, say, _unknown_torques(model, train, self.share))
+        """Fit innovations instead of free runs."""
+        return fit_mechanism(model, train, say, _process_noise(model, prepare(model, train), self.share))
 
 
 @dataclasses.dataclass(frozen=True)
 class Discovered:
     """The mechanism with the effects that discovery adds, fitted like the grey box.
 
-    Effects are chosen within the training recordings, whose ends play the held-out part: what the
-    methods are compared on has no say.
+    Effects are chosen within the training recordings, whose ends are the validation part; the test data
+    of the comparison are not used.
 
     Attributes:
-        share: Share of each training recording that discovery learns from; the rest decides.
+        share: Share of each training recording that discovery learns from; the rest is for validation.
     """
 
     name: str = "discovered"
@@ -100,37 +100,66 @@ class Discovered:
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Discovers on parts of the training recordings, then fits to the whole of them."""
-        parts = [recording.split(self.share) for recording in train]
-        result = discover(model, [a for a, _ in parts], [b for _, b in parts], progress=say)
+        """Discover on parts of the training recordings, then fit to all of each."""
+        result = discover(model, *split_for_validation(train, self.share), progress=say)
         found = ", ".join(f"{r.effect} at {r.port}" for r in result.rounds)
         note = f"added {found}" if found else f"added nothing ({result.verdict.replace('_', ' ')})"
-        return fitted_physics(result.model, train, say, note=note)
+        return fit_mechanism(result.model, train, say, note=note)
 
 
-def fitted_physics(
+def fit_mechanism(
     model: Model,
     train: Sequence[Recording],
     say: Progress,
     process_noise: Mapping[str, float] | None = None,
     note: str = "",
 ) -> Fitted:
-    """A fit; one that diverged is raised, one that only stopped early is noted."""
-    found = fit(model, train, process_noise=process_noise, progress=say)
-    if found.status.startswith("diverged"):
-        raise RuntimeError(found.status)
-    stopped = "" if found.status == "converged" else f"fit {found.status}"
-    said = "; ".join(filter(None, (note, stopped)))
-    return Fitted(found.model, len(found.free_names), said, predictor(found.model, train))
+    """A fit of the free parameters; one that diverged raises, one that stopped early is noted."""
+    fitted = fit(model, train, process_noise=process_noise, progress=say)
+    if fitted.status.startswith("diverged"):
+        raise RuntimeError(fitted.status)
+    stopped = "" if fitted.status == "converged" else f"fit {fitted.status}"
+    note = "; ".join(filter(None, (note, stopped)))
+    return Fitted(fitted.model, len(fitted.free_names), note, one_step_predictor(fitted.model, train))
 
 
-def _unknown_torques(model: Model, train: Sequence[Recording], share: float) -> dict[str, float]:
-    """Intensity of white torques along every coordinate, as a share of what the motor can do."""
-    torque = torque_scale(model.mechanism, stack(train, model))
-    return everywhere(model.mechanism, share * torque**2 * train[0].Ts)
+def _process_noise(model: Model, train: Dataset, share: float) -> dict[str, float]:
+    """Intensity of white torques along every coordinate, as a share of the motor's torque."""
+    return process_noise_ports(model.mechanism, share * train.torque_scale**2 * float(train.data.Ts[0]))
 
 
-def predictor(model: Model, train: Sequence[Recording]) -> Callable[[Recording], np.ndarray]:
-    """One step ahead by the steady Kalman filter that admits unknown torques."""
-    torques, noise = _unknown_torques(model, train, HORIZON), sensor_noise(train, model)
-    return lambda recording: model.predict(recording, torques, noise)
+def one_step_predictor(
+    model: Model, train: Sequence[Recording]
+) -> Callable[[Recording], Float[np.ndarray, "N C"]]:
+    """One step ahead by the stationary Kalman filter with unknown torques as process noise."""
+    dataset = prepare(model, train)
+    torques = _process_noise(model, dataset, MAX_PROCESS_NOISE_SHARE)
+    return lambda recording: model.predict(recording, torques, dataset.noise)
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedTorqueMethod:
+    """The grey box with a learned torque at one port, a smooth map of position and speed there.
+
+    Attributes:
+        at: Port; the first one of the mechanism if None.
+        share: Share of each training recording that the map is fitted to; the rest is for validation.
+    """
+
+    name: str = "learned_torque"
+    title: str = "the mechanism with a learned torque at one port"
+    family: str = "learned"
+    at: str | None = None
+    share: float = 0.7
+
+    def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
+        """Fit the mechanism first, then the map beside it."""
+        grey_box = fit_mechanism(model, train, say).simulator
+        assert isinstance(grey_box, Model)
+        at = self.at or next(iter(model.mechanism.port_vectors))
+        first, last = split_for_validation(train, self.share)
+        found = learn_torque(grey_box, first, last, at, progress=say)
+        weights = np.asarray(found.effect.weights).size if found.kept else 0
+        free = len(found.model.mechanism.free_names)
+        note = f"at {at}, reads like {found.formula}" if found.kept else f"no torque at {at} was kept"
+        return Fitted(found.model, max(free, weights), note, one_step_predictor(found.model, train))

@@ -1,4 +1,4 @@
-"""Sparse identification of nonlinear dynamics with an input: a law with few terms, by pysindy."""
+"""Sparse identification of nonlinear dynamics with an input: equations with few terms, by pysindy."""
 
 import dataclasses
 import itertools
@@ -7,16 +7,82 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from jaxtyping import Float
 
-from rotflex_jax.compare.held_in import one_period
+from rotflex_jax.compare.evaluation import require_one_sampling_period
 from rotflex_jax.compare.method import Fitted, Progress
-from rotflex_jax.compare.smoothing import Smoothing, smooth, smoothed_input
-from rotflex_jax.compare.sparse_runs import Piece, costs, refined
-from rotflex_jax.compare.sparse_terms import SparseLaw, Terms
+from rotflex_jax.compare.sparse_law import Piece, SparseLaw, Terms, costs, refined
 from rotflex_jax.errors import InputError
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+
+Smoothing = tuple[str, int | float]
+"""`savgol` with a window in samples, or `spline` with the cutoff of its smoothing in samples."""
+
+
+def smoothed_derivatives(recording: Recording, smoothing: Smoothing) -> Float[np.ndarray, "N K"]:
+    """Outputs, speeds and accelerations after smoothing, C columns each, one block after the other.
+
+    Raises:
+        InputError: A kind of smoothing that does not exist.
+    """
+    y, (kind, width) = recording.y.astype(float), smoothing
+    if kind == "savgol":
+        window = _window_length(width, recording.N)
+        parts = [
+            np.asarray(
+                scipy.signal.savgol_filter(y, window, min(3, window - 1), deriv=d, delta=recording.Ts, axis=0)
+            )
+            for d in range(3)
+        ]
+        return np.concatenate(parts, axis=1)
+    if kind != "spline":
+        raise InputError(f"A smoothing is 'savgol' or 'spline', but {kind!r} was given; name one of these.")
+    splines = [_spline(c, width) for c in y.T]
+    t = np.arange(recording.N, dtype=float)
+    return np.concatenate(
+        [
+            np.stack([s.derivative(d)(t) / recording.Ts**d if d else s(t) for s in splines], axis=1)
+            for d in range(3)
+        ],
+        axis=1,
+    )
+
+
+def smoothed_input(
+    recording: Recording, smoothing: Smoothing, order: int, held: bool = True
+) -> Float[np.ndarray, " N"]:
+    """The input as it appears in smoothed derivatives of that order.
+
+    A filter that differentiates is a smoothing of the true derivative, by its own kernel integrated as
+    many times. An acceleration so smoothed belongs to an input smoothed by the same kernel: a regression on
+    the input itself is biased, the more the faster the input changes.
+    """
+    u = recording.u.astype(float)
+    # A second difference lies between the input held before it and the one held after it, a first one on
+    # the input that follows.
+    between = u if not held else (u + np.concatenate([u[:1], u[:-1]])) / 2
+    after = u if held else (u + np.concatenate([u[1:], u[-1:]])) / 2
+    kind, width = smoothing
+    if kind == "spline":
+        return _spline(between, width)(np.arange(len(u), dtype=float))
+    window = _window_length(width, len(u))
+    once = -np.cumsum(scipy.signal.savgol_coeffs(window, min(3, window - 1), deriv=order, use="dot"))
+    # Summed by parts: of first differences once, of second ones twice and a sample later.
+    kernel, x = (once, after) if order == 1 else (np.concatenate([[0.0], -np.cumsum(once)[:-1]]), between)
+    return np.correlate(np.pad(x, window // 2, mode="edge"), kernel, mode="valid")
+
+
+def _window_length(width: float, N: int) -> int:
+    return min(int(width) // 2 * 2 + 1, (N - 1) // 2 * 2 + 1)
+
+
+def _spline(x: np.ndarray, width: float) -> "scipy.interpolate.BSpline":
+    """The smoother of a random walk of the acceleration's integral: its cutoff is the width."""
+    t = np.arange(len(x), dtype=float)
+    return scipy.interpolate.make_smoothing_spline(t, x, lam=(width / (2 * np.pi)) ** 4)
+
 
 Span = tuple[float, float]
 """From which share of a recording to which."""
@@ -24,13 +90,13 @@ Span = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class SINDy:
-    """A law of motion with few terms, by sequentially thresholded least squares.
+    """Equations of motion with few terms, by sequentially thresholded least squares.
 
     States are the outputs and their speeds, from smoothing; that a speed is the rate of its output is
-    not fitted. How the data are smoothed, the threshold, and whether the law gives accelerations or
-    rates are those with the best free runs over the part of the training recordings that was left out, the
-    last and then the first. The input is smoothed as the accelerations are. Not for coarse sensors at a
-    high sampling rate, where smoothing decides the answer: the note says how much it did here.
+    not fitted. The smoothing, the threshold, and whether the equations give accelerations or rates are
+    those with the best free runs over a validation part of the training recordings, the last and then the
+    first. The input is smoothed as the accelerations are. Not for coarse sensors at a
+    high sampling rate, where the result depends on the smoothing: the note says how much.
 
     Source: Brunton, Proctor and Kutz 2016, PNAS 113; ensembles Fasel et al. 2022, Proc. R. Soc. A 478;
     weak form Messenger and Bortz 2021, Multiscale Model. Simul. 19.
@@ -40,15 +106,14 @@ class SINDy:
         title: In words.
         variant: `plain`, `ensemble` (median of fits to bags of samples) or `weak` (without
             accelerations).
-        smoothings: Ways to smooth to choose from.
+        smoothings: Kinds of smoothing to choose from.
         thresholds: To choose from, for terms and rates of size one.
         orders: To choose from: 2 for accelerations, 1 for rates of the outputs.
         degrees: To choose from: 1 without powers in the library, 3 with them.
-        share: First part of each recording; the rest decides.
-        seconds: Length of the free runs that decide [s]; those over all of a recording must not diverge.
+        share: First part of each recording; the rest is for validation.
+        seconds: Length of the validation runs [s]; free runs over all of a recording must not diverge.
         bags: Fits of an ensemble.
-        free_runs: Whether the numbers of the law that was found are refined for free runs, which is no part
-            of SINDy.
+        free_runs: Whether the weights are refined for free runs, which is not part of SINDy.
     """
 
     name: str = "sindy"
@@ -70,25 +135,25 @@ class SINDy:
     family: str = "sindy"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Takes no notice of the model, but for how its input runs between samples."""
+        """Ignores the model, but for the shape of its input between samples."""
         ps = _pysindy()
         held = getattr(getattr(model, "solver", None), "between", "held") != "smooth"
-        one_period(train, "the smoothing")
+        require_one_sampling_period(train, "the smoothing")
         tried: list[tuple[float, tuple[int, int], Smoothing, float]] = []
-        # Learnt from the first part and judged on the rest, then the other way round.
+        # Fitted to the first part and validated on the rest, then the other way round.
         folds: tuple[tuple[Span, Span], ...] = (
             ((0.0, self.share), (self.share, 1.0)),
             ((1 - self.share, 1.0), (0.0, 1 - self.share)),
         )
         for smoothing in self.smoothings:
-            states = [smooth(r, smoothing) for r in train]
+            states = [smoothed_derivatives(r, smoothing) for r in train]
             for order, degree in itertools.product(self.orders, self.degrees):
-                terms = _terms(train[0], states, order, degree, held)
+                terms = _library(train[0], states, order, degree, held)
                 total = np.zeros(len(self.thresholds))
-                for learnt, judged in folds:
-                    rows = self._rows(terms, train, states, smoothing, learnt)
+                for fitted, validated in folds:
+                    rows = self._rows(terms, train, states, smoothing, fitted)
                     W = np.stack([self._weights(ps, rows, threshold) for threshold in self.thresholds])
-                    total += costs(terms, W, self._pieces(train, states, judged), train, states)
+                    total += costs(terms, W, self._pieces(train, states, validated), train, states)
                 tried += [
                     (float(c) / 2, (order, degree), smoothing, t)
                     for c, t in zip(total, self.thresholds, strict=True)
@@ -97,17 +162,17 @@ class SINDy:
         cost, (order, degree), smoothing, threshold = min(tried)
         if not np.isfinite(cost):
             raise RuntimeError("every choice of smoothing and threshold diverges in free run")
-        states = [smooth(r, smoothing) for r in train]
-        terms = _terms(train[0], states, order, degree, held)
-        W, said = self._weights(ps, self._rows(terms, train, states, smoothing, (0.0, 1.0)), threshold), ""
+        states = [smoothed_derivatives(r, smoothing) for r in train]
+        terms = _library(train[0], states, order, degree, held)
+        W, remark = self._weights(ps, self._rows(terms, train, states, smoothing, (0.0, 1.0)), threshold), ""
         if self.free_runs:
             first = self._weights(
                 ps, self._rows(terms, train, states, smoothing, (0.0, self.share)), threshold
             )
-            W, said = self._refined(terms, W, first, train, states, say)
+            W, remark = self._refined(terms, W, first, train, states, say)
         law = SparseLaw(terms, W, train[0].Ts)
         chosen = f"{smoothing[0]} over {smoothing[1]:g} samples, threshold {threshold:g}"
-        words = f"{chosen}, order {order}, powers to {degree}; {_sensitivity(tried)}{said}"
+        words = f"{chosen}, order {order}, powers to {degree}; {_describe_sensitivity(tried)}{remark}"
         return Fitted(law, int(np.count_nonzero(W)), words, law.predict)
 
     def _refined(
@@ -119,16 +184,16 @@ class SINDy:
         states: list[np.ndarray],
         say: Progress,
     ) -> tuple[np.ndarray, str]:
-        """Weights refined for free runs, if that helps those of the first part over the rest."""
+        """Weights refined for free runs, if refinement of those of the first part helps over the rest."""
         last = self._pieces(train, states, (self.share, 1.0))
         part = refined(terms, first, self._pieces(train, states, (0.0, self.share)), train[0].Ts)
         before, after = costs(terms, np.stack([first, part]), last, train, states)
         say(f"refined for free runs: log error {before:.2f} to {after:.2f}")
         if not after < before:
-            return W, "; refining its numbers for free runs did not help and was dropped"
+            return W, "; refining its weights for free runs did not help and was dropped"
         whole = refined(terms, W, self._pieces(train, states, (0.0, 1.0)), train[0].Ts)
         there = costs(terms, whole[None], last, train, states)[0]
-        return (whole if np.isfinite(there) else part), "; its numbers refined for free runs"
+        return (whole if np.isfinite(there) else part), "; its weights refined for free runs"
 
     def _rows(
         self,
@@ -147,13 +212,13 @@ class SINDy:
                 u = r.u.astype(float)
                 if terms.held:
                     u = (u + np.concatenate([u[:1], u[:-1]])) / 2
-                T, dT = _tests(j - i, terms.order, r.Ts)
-                rows.append(T @ terms.values(_state(x[i:j], terms), u[i:j]))
+                T, dT = _test_functions(j - i, terms.order, r.Ts)
+                rows.append(T @ terms.values(_state_columns(x[i:j], terms), u[i:j]))
                 targets.append(dT @ r.y[i:j].astype(float))
             else:
                 i, j = max(i, edge), min(j, r.N - edge)
                 u = smoothed_input(r, smoothing, terms.order, terms.held)
-                rows.append(terms.values(_state(x[i:j], terms), u[i:j]))
+                rows.append(terms.values(_state_columns(x[i:j], terms), u[i:j]))
                 targets.append(x[i:j, terms.order * C : (terms.order + 1) * C])
         return np.vstack(rows), np.vstack(targets)
 
@@ -169,13 +234,13 @@ class SINDy:
             if self.variant == "ensemble":
                 seeds = np.random.default_rng(0)
                 bags = [seeds.integers(0, len(phi), len(phi)) for _ in range(self.bags)]
-                W = np.median([_thresholded(ps, phi[b], rate[b], threshold) for b in bags], axis=0)
+                W = np.median([_sparse_weights(ps, phi[b], rate[b], threshold) for b in bags], axis=0)
             else:
-                W = _thresholded(ps, phi, rate, threshold)
+                W = _sparse_weights(ps, phi, rate, threshold)
         return W / size[:, None] * out
 
     def _pieces(self, train: Sequence[Recording], states: list[np.ndarray], span: Span) -> list[Piece]:
-        """Stretches that free runs are made over, all of one length, from a part of each recording."""
+        """Segments of one length for free runs, from a part of each recording."""
         bounds = [[round(s * r.N) for s in span] for r in train]
         length = min(min(j - i for i, j in bounds), max(8, round(self.seconds / train[0].Ts)))
         return [
@@ -185,27 +250,29 @@ class SINDy:
         ]
 
 
-def _terms(recording: Recording, states: list[np.ndarray], order: int, degree: int, held: bool) -> Terms:
+def _library(recording: Recording, states: list[np.ndarray], order: int, degree: int, held: bool) -> Terms:
     C = len(recording.channels)
     speed = np.concatenate([x[:, (order - 1) * C : order * C] for x in states])
     width = np.maximum(0.03 * np.sqrt(np.mean(speed**2, axis=0)), 1e-12)
     return Terms(recording.channels, order, degree, tuple(width.tolist()), held)
 
 
-def _state(x: np.ndarray, terms: Terms) -> np.ndarray:
+def _state_columns(x: np.ndarray, terms: Terms) -> np.ndarray:
     return x[..., : terms.order * len(terms.channels)]
 
 
-def _thresholded(ps: Any, phi: np.ndarray, rate: np.ndarray, threshold: float) -> Float[np.ndarray, "P C"]:
+def _sparse_weights(ps: Any, phi: np.ndarray, rate: np.ndarray, threshold: float) -> Float[np.ndarray, "P C"]:
     with warnings.catch_warnings():
-        # Where a threshold leaves no term, the law is zero, and its free run says what that is worth.
+        # Where a threshold leaves no term, the weights are zero, which their free runs evaluate.
         warnings.simplefilter("ignore")
         optimiser = ps.STLSQ(threshold=threshold, alpha=1e-6, max_iter=30)
         optimiser.fit(phi, rate)
     return np.asarray(optimiser.coef_, float).T
 
 
-def _tests(n: int, order: int, Ts: float) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K n"]]:
+def _test_functions(
+    n: int, order: int, Ts: float
+) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K n"]]:
     """Smooth bumps that end at zero, and their derivatives with the sign of integration by parts."""
     half = max(6, min(60, n // 8))
     t = np.arange(-half, half + 1) / half
@@ -219,7 +286,7 @@ def _tests(n: int, order: int, Ts: float) -> tuple[Float[np.ndarray, "K n"], Flo
     return T, dT
 
 
-def _sensitivity(tried: list[tuple[float, tuple[int, int], Smoothing, float]]) -> str:
+def _describe_sensitivity(tried: list[tuple[float, tuple[int, int], Smoothing, float]]) -> str:
     """How much the choices matter, in words."""
     best = min(tried)
     finite = [t[0] for t in tried if np.isfinite(t[0])]

@@ -2,18 +2,69 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from rotflex_jax.compare.horizon import Horizon
+from rotflex_jax.compare.evaluation import Horizon
 from rotflex_jax.compare.method import Simulator
-from rotflex_jax.compare.printed import aligned, cells
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.recording import Recording
+from rotflex_jax.text.markup import bullets, card, folded, table
+from rotflex_jax.text.numbers import digits, readable
 
-Errors = dict[str, float]
+
+def cells(comparison: "Comparison") -> list[list[str]]:
+    """The table in words: headings, the methods that came through, the sensor noise."""
+    units = dict(zip(comparison.test[0].channels, comparison.test[0].units, strict=True))
+    head = ["method"]
+    for what in (f"{comparison.window_seconds:g} s rms", "rms", "worst"):
+        head += [f"{c} {what} [{readable(0.0, unit)[1]}]" for c, unit in units.items()]
+    head += [f"{c} fit [%]" for c in units]
+    head += [f"{c} 1 step [{readable(0.0, unit)[1]}]" for c, unit in units.items()]
+    head += ["fitted", "fit [s]", "simulate [s]"]
+    body = []
+    for row in comparison.rows:
+        if row.status == "ok":
+            lengths = [
+                digits(readable(errors[c], unit)[0])
+                for errors in (row.rmse_windows, row.rmse, row.worst)
+                for c, unit in units.items()
+            ]
+            shares = [f"{row.fit_percent[c]:.2f}" for c in units]
+            ahead = [digits(_one_step(row, c, unit)) for c, unit in units.items()]
+            times = [digits(row.fit_seconds), digits(row.simulate_seconds)]
+            body.append([row.method, *lengths, *shares, *ahead, str(row.parameters), *times])
+    floor = [digits(readable(comparison.noise_floor[c], unit)[0]) for c, unit in units.items()]
+    noise = ["sensor noise", *floor, *floor]
+    return [head, *body, noise + [""] * (len(head) - len(noise))]
+
+
+def aligned(cells: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a plain table; headings in two lines, so that it stays narrow."""
+    halves = [[h.rpartition(" ")[0] for h in cells[0]], [h.rpartition(" ")[2] for h in cells[0]]]
+    halves[0][0], halves[1][0] = "", cells[0][0]
+    rows = [*halves, *cells[1:]]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            [
+                row[0].ljust(widths[0]),
+                *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
+            ]
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _one_step(row: "Row", channel: str, unit: str) -> float | None:
+    return readable(row.rmse_one_step[channel], unit)[0] if channel in row.rmse_one_step else None
+
+
+ChannelErrors = dict[str, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,18 +78,18 @@ class Row:
         status: `ok`, `diverged` or `failed`.
         reason: Why it failed or diverged; "" where it did not.
         note: What else to know: its order, what it left out or added.
-        rmse: Channel -> root mean square error of one free run over the held-out data [unit].
+        rmse: Channel -> root mean square error of one free run over the test data [unit].
         nrmse: The same over the standard deviation of the measurement [-].
         fit_percent: 100 (1 - nrmse) [%].
         worst: Largest error of that free run [unit].
-        rmse_windows: Root mean square error of free runs that start anew every few seconds [unit].
+        rmse_windows: Root mean square error of free runs that start again every few seconds [unit].
         rmse_one_step: Root mean square error one step ahead [unit]; empty without a predictor.
         horizon: Error of free runs by how far they have gone; None where the method failed.
-        parameters: How many numbers were fitted; None where the method failed.
+        parameters: Number of fitted parameters; None where the method failed.
         fit_seconds: Time to learn [s], with the compilation of code that no earlier method needed.
-        simulate_seconds: Time of the free runs over the held-out data, compiled before [s].
-        simulator: What the method learnt; None where it failed.
-        simulated: Its free run over each held-out recording (N, C).
+        simulate_seconds: Time of the free runs over the test data, compiled before [s].
+        simulator: The model that was learned; None where it failed.
+        simulated: Its free run over each test recording.
     """
 
     method: str
@@ -47,18 +98,18 @@ class Row:
     status: str = "ok"
     reason: str = ""
     note: str = ""
-    rmse: Errors = dataclasses.field(default_factory=dict)
-    nrmse: Errors = dataclasses.field(default_factory=dict)
-    fit_percent: Errors = dataclasses.field(default_factory=dict)
-    worst: Errors = dataclasses.field(default_factory=dict)
-    rmse_windows: Errors = dataclasses.field(default_factory=dict)
-    rmse_one_step: Errors = dataclasses.field(default_factory=dict)
+    rmse: ChannelErrors = dataclasses.field(default_factory=dict)
+    nrmse: ChannelErrors = dataclasses.field(default_factory=dict)
+    fit_percent: ChannelErrors = dataclasses.field(default_factory=dict)
+    worst: ChannelErrors = dataclasses.field(default_factory=dict)
+    rmse_windows: ChannelErrors = dataclasses.field(default_factory=dict)
+    rmse_one_step: ChannelErrors = dataclasses.field(default_factory=dict)
     horizon: Horizon | None = None
     parameters: int | None = None
     fit_seconds: float | None = None
     simulate_seconds: float | None = None
     simulator: Simulator | None = dataclasses.field(default=None, repr=False)
-    simulated: tuple[np.ndarray, ...] = dataclasses.field(default=(), repr=False)
+    simulated: tuple[Float[np.ndarray, "_ C"], ...] = dataclasses.field(default=(), repr=False)
 
     @property
     def score(self) -> float:
@@ -101,8 +152,8 @@ class Comparison:
 
     Attributes:
         rows: One per method, the smallest free-run error first, what diverged or failed last.
-        train: Recordings that were learnt from.
-        test: Recordings that no method saw beyond their first `n_init` samples.
+        train: Training recordings.
+        test: Test recordings, of whose outputs no method had more than the first `n_init` samples.
         noise_floor: Channel -> standard deviation of the sensor noise [unit].
         window_seconds: Length of the windows [s].
         elapsed_s: Time taken [s].
@@ -111,7 +162,7 @@ class Comparison:
     rows: tuple[Row, ...]
     train: tuple[Recording, ...]
     test: tuple[Recording, ...]
-    noise_floor: Errors
+    noise_floor: ChannelErrors
     window_seconds: float
     elapsed_s: float
 
@@ -185,7 +236,7 @@ class Comparison:
 
     def plot(self) -> Any:
         """Measured and simulated outputs of the best method of each family, as a matplotlib Figure."""
-        from rotflex_jax.report.comparison_figures import overlays  # matplotlib only where it draws
+        from rotflex_jax.compare.figures import overlays  # matplotlib is loaded only where it draws
 
         return overlays(self)
 
@@ -195,7 +246,7 @@ class Comparison:
         Returns:
             Path of the HTML page.
         """
-        from rotflex_jax.report.comparison import write
+        from rotflex_jax.compare.page import write  # matplotlib is loaded only where it draws
 
         return write(self, Path(folder))
 
@@ -208,9 +259,14 @@ class Comparison:
         return "\n".join([*aligned(self.cells()), *self.remarks()])
 
     def _repr_html_(self) -> str:
-        from rotflex_jax.display.cards import comparison_card  # the layer above, when a notebook asks
-
-        return comparison_card(self)
+        """Every method on the same held-out data, best first."""
+        head, *rows = self.cells()
+        best = f", best: {self.best.method}" if self.best else ""
+        return card(
+            f"Comparison of {len(self.rows)} methods in free run on held-out data{best}",
+            table(head, rows),
+            folded("What there is to say about each", bullets(self.remarks())),
+        )
 
     def remarks(self) -> list[str]:
         """What there is to say about each method: why it failed, what it chose."""
@@ -233,5 +289,5 @@ def _described(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _plain(values: Errors) -> dict[str, float | None]:
+def _plain(values: ChannelErrors) -> dict[str, float | None]:
     return {k: float(v) if math.isfinite(v) else None for k, v in values.items()}

@@ -8,5 +8,5 @@ from rotflex_jax.data.datasets import (
     list_datasets as list_datasets,
     load_dataset as load_dataset,
 )
-from rotflex_jax.data.io import load as load, save_csv as save_csv
-from rotflex_jax.data.rotflex import load_rotflex as load_rotflex
+from rotflex_jax.data.files import load as load, save_csv as save_csv
+from rotflex_jax.data.readers import load_rotflex as load_rotflex

@@ -1,20 +1,21 @@
-"""Public benchmarks with their official protocol: what to learn from, what to judge on, and how.
+"""Public benchmarks with their official protocol: training and test recordings, and the error.
 
     benchmark = rf.data.benchmark("emps")
     result = rf.discover(rf.joints.emps(), *benchmark.train.split(0.7))
     benchmark.score(result.model)
 
 The tests are free runs, the first state comes from the first `n_init` samples, and the error is the root
-mean square of what follows. Published results stand beside, each as its source has it.
+mean square of what follows. Published results are listed, each as its source has it.
 """
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Real
 
 from rotflex_jax.data.datasets import load_dataset
 from rotflex_jax.errors import InputError
@@ -24,20 +25,21 @@ from rotflex_jax.recording import Recording
 BASELINES = "Champneys, Beintema, Tóth, Schoukens, Rogers 2024, arXiv 2405.10779, tables 3 and 4"
 
 
+@runtime_checkable
 class Simulates(Protocol):
-    """What can be scored."""
+    """A model that can be scored."""
 
-    def simulate(self, recording: Recording) -> np.ndarray:
-        """Free run (N, C)."""
+    def simulate(self, recording: Recording) -> Real[np.ndarray, "N C"]:
+        """Free run."""
         ...
 
 
 @dataclass(frozen=True)
 class Published:
-    """A result of others.
+    """A published result.
 
     Args:
-        method: what it was reached with.
+        method: of identification.
         errors: name of the test to error, in the unit of the benchmark.
         source: where it is published.
     """
@@ -49,7 +51,7 @@ class Published:
 
 @dataclass(frozen=True)
 class Constant:
-    """A number that others found for the machine.
+    """A published parameter of the machine.
 
     Args:
         parameter: full name in the ready-made mechanism.
@@ -68,12 +70,12 @@ class Benchmark:
 
     Args:
         name: of the data set.
-        train: to learn from; split it as you like.
-        tests: name to the recording to judge on, `n_init` set.
+        train: for training and validation; split it as you like.
+        tests: name to test recording, `n_init` set.
         unit: of the errors.
         factor: errors in that unit per unit of the channel.
-        published: results of others.
-        constants: what others found for the machine.
+        published: results.
+        constants: published parameters of the machine.
         source: who made the data.
     """
 
@@ -99,7 +101,7 @@ class Benchmark:
 
         Args:
             test: name of the test.
-            y_hat: what the model makes of it, (N,) or (N, 1).
+            y_hat: output of the model, (N,) or (N, 1).
         """
         if test not in self.tests:
             raise InputError(f"{self.name} has no test {test!r}; choose one of {', '.join(self.tests)}.")

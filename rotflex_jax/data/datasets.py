@@ -1,7 +1,7 @@
-"""Public recordings, each known by address and hash, fetched only when asked for.
+"""Public recordings, each with its address and hash, downloaded on request.
 
-None comes with the package: most carry no licence that would allow it. A folder of one's own, in
-the argument `folder` or the environment variable ROTFLEX_DATA, takes the place of the network.
+None comes with the package: most have no licence that would allow it. A local folder, in the argument
+`folder` or the environment variable ROTFLEX_DATA, replaces the network.
 """
 
 import hashlib
@@ -10,20 +10,20 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from rotflex_jax.data.by_hand import BY_HAND
-from rotflex_jax.data.io import load
-from rotflex_jax.data.registry import DATASETS, Dataset, PublicFile
+from rotflex_jax.data.files import load
+from rotflex_jax.data.readers import unpacked
+from rotflex_jax.data.registry import BY_HAND, DATASETS, PublicDataset, PublicFile
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.recording import Recording
 
 FOLDER_VARIABLE = "ROTFLEX_DATA"
 
 
-def list_datasets() -> tuple[Dataset, ...]:
+def list_datasets() -> tuple[PublicDataset, ...]:
     """The public recordings that can be fetched.
 
     >>> [dataset.name for dataset in list_datasets()]
-    ['rotflex', 'emps', 'silverbox', 'rotary_arm']
+    ['rotflex', 'emps', 'silverbox', 'rotary_arm', 'two_dof_link', 'bam_xl330', 'so101']
     """
     return tuple(DATASETS.values())
 
@@ -31,7 +31,8 @@ def list_datasets() -> tuple[Dataset, ...]:
 def fetch(name: str, folder: str | os.PathLike[str] | None = None) -> list[Path]:
     """The files of a data set: from a folder if one is given, else downloaded once into a cache.
 
-    The hash of every file is checked, wherever it comes from.
+    The hash of every file is checked, wherever it comes from. A file of the folder may be packed by gzip,
+    as `NAME.gz`; its hash is that of what is in it.
 
     Args:
         name: of the data set.
@@ -68,26 +69,35 @@ def load_dataset(name: str, folder: str | os.PathLike[str] | None = None) -> lis
         InputError: as `fetch`, and as `Recording`.
     """
     recordings: list[Recording] = []
-    for path in fetch(name, folder):
+    paths = fetch(name, folder)
+    for file, path in zip(DATASETS[name].files, paths, strict=True):
+        if file.companion:
+            continue
         read = DATASETS[name].reader(path)
         recordings += read if isinstance(read, list) else [read]
     return recordings
 
 
 def demo_recording() -> Recording:
-    """A synthetic recording that comes with the package: a joint with two effects hidden in it."""
+    """A synthetic recording that comes with the package: a joint with two effects that the model lacks."""
     with as_file(files("rotflex_jax.data") / "demo.csv") as path:
         return load(path)
 
 
-def _in_folder(file: PublicFile, folder: Path) -> Path:
+def find(file: PublicFile, folder: Path) -> Path | None:
+    """Where a folder of recordings has the file, plain or packed by gzip; None where it has not."""
     path = folder / file.name
-    if not path.is_file():
+    return next((p for p in (path, path.with_name(f"{path.name}.gz")) if p.is_file()), None)
+
+
+def _in_folder(file: PublicFile, folder: Path) -> Path:
+    path = find(file, folder)
+    if path is None:
         raise InputError(
-            f"{path} does not exist, though the folder was given for public recordings; put the "
-            "file there, or leave the folder out to download it."
+            f"{folder / file.name} does not exist, though the folder was given for public recordings; "
+            "put the file there, or leave the folder out to download it."
         )
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    found = hashlib.sha256(unpacked(path)).hexdigest()
     if found != file.sha256:
         raise InputError(
             f"{path} has the SHA-256 {found[:12]}..., but the public file has "

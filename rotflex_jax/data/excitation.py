@@ -1,8 +1,8 @@
-"""Voltages to record with: noise, multisine, pseudo-random binary, steps, sweep, pulse.
+"""Input signals: noise, multisine, pseudo-random binary, steps, sweep, pulse.
 
-Filtered noise is the best single choice where nothing is known. Steps separate what depends on the
-position, a sweep or a multisine finds play, a binary signal finds delays and further modes; but two
-levels never show a dead zone or a saturation.
+Filtered noise is the best single choice where nothing is known. Steps show effects of the position, a sweep
+or a multisine shows play, a binary signal shows delays and further modes; but two levels never show a dead
+zone or a saturation.
 
 Every input is an array of N voltages [V] at the sampling period Ts [s], the same for the same seed,
 which is an integer or a NumPy generator. An argument out of range raises `InputError`.
@@ -58,8 +58,8 @@ def multisine(
 
     u[k] = A sum_h cos(2 pi h k / P + phase_h),  P = N / periods,  A = rms sqrt(2 / harmonics)
 
-    Phases are random; clipping the signal and keeping the phases of what is left brings the peak
-    down, so that the same power fits within the amplifier.
+    Phases are random; repeatedly clipping the signal and taking the phases of the clipped one lowers the
+    peak, so that the same power fits within the amplifier.
 
     Args:
         N: samples, a multiple of `periods`.
@@ -67,7 +67,7 @@ def multisine(
         band: lowest and highest frequency [Hz].
         rms: root mean square over a period, exactly [V].
         periods: how often the signal repeats.
-        optimise_crest: whether to bring the peak down; otherwise the phases stay random.
+        optimise_crest: whether to lower the peak; otherwise the phases stay random.
         seed: of the phases.
 
     Source:
@@ -96,7 +96,7 @@ def multisine(
     amplitude = rms * np.sqrt(2 / len(harmonics))
     phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(harmonics))
 
-    def signal(phases: np.ndarray) -> np.ndarray:
+    def signal(phases: Float[np.ndarray, " H"]) -> Float[np.ndarray, " P"]:
         spectrum = np.zeros(P // 2 + 1, dtype=complex)
         spectrum[harmonics] = 0.5 * P * amplitude * np.exp(1j * phases)
         return np.fft.irfft(spectrum, P)
@@ -112,7 +112,7 @@ def multisine(
 def prbs(N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed: Seed = 0) -> Voltage:
     """A maximum-length pseudo-random binary sequence: two levels, each bit held for a while.
 
-    As long as needed not to repeat. Not for a dead zone or a saturation: two levels hide them.
+    As long as needed not to repeat. Not for a dead zone or a saturation: two levels do not show them.
 
     Args:
         N: samples.
@@ -145,7 +145,7 @@ def steps(
 ) -> Voltage:
     """Random levels, each held for a random time, both uniform.
 
-    Not for play in the gears or a sensor bias, which steps hide.
+    Not for play in the gears or a sensor bias, which steps do not show.
 
     Args:
         N: samples.
@@ -196,7 +196,7 @@ def pulse(N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, dela
         Ts: sampling period [s].
         amplitude: height, of either sign [V].
         width: how long it lasts [s].
-        delay: when it begins [s].
+        delay: when it starts [s].
 
     >>> pulse(5, 0.1, amplitude=3.0, width=0.2, delay=0.1)
     array([0., 3., 3., 0., 0.])

@@ -1,14 +1,88 @@
-"""Readers of other public recordings with friction or a nonlinear spring, not of this joint."""
+"""Readers of the public recordings: a file, or the files of one run, to Recordings.
 
+Angles become radians. A log whose clock is uneven is resampled, and says so in `source`.
+The ROTFLEX set has two closed-loop runs of a student laboratory at 500 Hz with 4096-count encoders:
+reference a square wave of 30 degrees, feedback of theta in one and of theta + alpha in the other. Between
+the steps dry friction holds the hub away from the reference.
+"""
+
+import csv
+import gzip
+import json
+import math
 import os
+import zlib
 from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.data.binary import read_mat
 from rotflex_jax.data.files import readable_file
+from rotflex_jax.data.tables import unreadable
+from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.samples import even_spacing
+
+LABORATORY = MappingProxyType(
+    {
+        "R_m": (2.6, "ohm"),
+        "k_t": (0.00768, "N m/A"),
+        "k_m": (0.00768, "V s/rad"),
+        "K_g": (70.0, "-"),
+        "eta_g": (0.9, "-"),
+        "eta_m": (0.69, "-"),
+        "B_hub": (0.004, "N m s/rad"),
+        "J_hub": (0.002584, "kg m^2"),
+        "J_arm": (0.003894, "kg m^2"),
+        "K": (1.0142, "N m/rad"),
+    }
+)
+"""The laboratory's own parameters: name to value and unit, without dry friction."""
+
+COUNT = 2 * math.pi / 4096
+"""One count of the encoders [rad]."""
+
+
+def load_rotflex(path: str | os.PathLike[str]) -> Recording:
+    """Reads one run: motor voltage, servo angle and deflection, degrees turned into radians.
+
+    A student laboratory logged two closed-loop runs at 500 Hz with 4096-count encoders: reference a
+    square wave of 30 degrees, feedback of theta in one and of theta + alpha in the other. Dry friction
+    holds the hub still between the steps, at angles that the controller would not have chosen.
+
+    Args:
+        path: of the MAT file.
+
+    Returns:
+        The recording, channels theta and alpha [rad].
+
+    Raises:
+        InputError: the file is missing, damaged, or has not the variables of such a run.
+    """
+    file = readable_file(path)
+    variables = read_mat(file)
+    missing = {"data_vm", "data_theta", "data_alpha"} - set(variables)
+    if missing:
+        raise InputError(
+            f"{file.name} lacks {', '.join(sorted(missing))}, which the public ROTFLEX runs have; "
+            "read another file with load(path, input=..., outputs=...)."
+        )
+    t, u = np.asarray(variables["data_vm"], dtype=np.float64).T
+    theta = np.asarray(variables["data_theta"])[:, 2]  # time, reference, measured
+    alpha = np.asarray(variables["data_alpha"])[:, 1]
+    return Recording(
+        u=u,
+        y=np.deg2rad(np.column_stack([theta, alpha])),
+        Ts=even_spacing(t, f"{file.name}: the time"),
+        source=file.name,
+        start=float(t[0]),
+        resolution={"theta": COUNT, "alpha": COUNT},
+    )
+
 
 ARM_LENGTH = 0.45
 """Hub to tip of the rotary arm [m]."""
@@ -50,7 +124,7 @@ def load_silverbox(path: str | os.PathLike[str]) -> list[Recording]:
         path: of the MAT file.
 
     Returns:
-        The official parts, channel output [V]: a multisine to learn from, one to judge on, an arrow
+        The official parts, channel output [V]: a multisine for training, one for testing, an arrow
         of growing amplitude, and the arrow within the amplitudes of the first part.
 
     Source:
@@ -101,3 +175,250 @@ def load_rotary_arm(path: str | os.PathLike[str]) -> Recording:
         source=file.name,
         resolution={"theta": 1e-3, "alpha": 1e-3 / ARM_LENGTH},
     )
+
+
+LINK_STEP = MappingProxyType({1: COUNT / 100, 2: COUNT / 50})
+"""Encoder step of each stage of the two-link machine, behind its gear [rad]."""
+
+GAUGE_RAD_PER_VOLT = MappingProxyType({1: 1.286e-4 * 106.03674540682414, 2: 1.235e-4 * 151.36857892763405})
+"""Deflection of each link per volt of its strain gauge, by the laboratory's file [rad/V]."""
+
+GAUGE_FILTER_FREQUENCY, GAUGE_FILTER_DAMPING = 4 * math.pi, 0.9
+"""Low pass that the deflections went through before they were logged, 2 Hz [rad/s], and its damping ratio."""
+
+
+def load_two_dof_link(path: str | os.PathLike[str], *, filtered: bool = False) -> list[Recording]:
+    """Reads a run of the serial link with two flexible stages: motor current to servo angle and deflection.
+
+    A run is one file with all signals, or six files with one signal each, of which any is named here.
+    The input is the measured current. The converter reads it before it writes the next command, so that
+    reading k + 1 is the current held from sample k on.
+
+    The deflections were logged behind a second-order low pass (2 Hz, damping ratio 0.9), integrated by
+    Euler's method at 2 ms. That filter is inverted sample by sample, without any loss: the result lies on
+    the counts of the converter again. While the gauge's reading at rest was being found, the log has a
+    deflection of zero; that beginning is left out.
+
+    Args:
+        path: of a MAT file.
+        filtered: whether the deflections are to be left behind their filter.
+
+    Returns:
+        A recording of stage 1 and one of stage 2, channels theta and alpha [rad], that end two samples
+        before the file. Stage 2 is carried by link 1, whose motion its recording does not have.
+
+    Raises:
+        InputError: the file is missing, damaged, or has not the variables of such a run.
+    """
+    file = readable_file(path)
+    kind, _, signal = file.stem.rpartition("_")
+    names = [f"data_{part}{stage}{k}" for stage in (1, 2) for part, k in (("Im", ""), ("th", 1), ("th", 2))]
+    parts = [name.removeprefix("data_") for name in names]
+    files = [file.with_name(f"{kind}_{part}.mat") for part in parts] if signal in parts else [file]
+    variables: dict[str, Any] = {}
+    for each in files:
+        variables |= read_mat(readable_file(each))
+    label = f"{kind}_*.mat" if signal in parts else file.name
+    missing = [name for name in names if np.shape(variables.get(name, 0.0))[1:] != (3,)]
+    if missing:
+        raise InputError(
+            f"{label} lacks {', '.join(missing)}, which a run of the two-link machine has; "
+            "read another file with load(path, input=..., outputs=...)."
+        )
+    # Every signal has the columns time, reference or command, measurement.
+    signals = {
+        part: np.asarray(variables[name], dtype=float) for part, name in zip(parts, names, strict=True)
+    }
+    t = signals["Im1"][:, 0]
+    if any(not np.array_equal(x[:, 0], t) for x in signals.values()):
+        raise InputError(f"{label}: the signals have different times; take all files from one run.")
+    period = even_spacing(t, f"{label}: the time")
+    recordings = []
+    for stage in (1, 2):
+        theta, logged = (np.deg2rad(signals[f"th{stage}{k}"][:, 2]) for k in (1, 2))
+        deflection = _before_gauge_filter(logged, period)
+        first = int(np.argmax(deflection != 0))
+        alpha = (logged[:-2] if filtered else deflection)[first:]
+        recordings.append(
+            Recording(
+                u=signals[f"Im{stage}"][1:-1, 2][first:],
+                y=np.column_stack([theta[:-2][first:], alpha]),
+                Ts=period,
+                input_name="current",
+                input_unit="A",
+                source=f"{label}, stage {stage}, deflection {'behind' if filtered else 'before'} its filter",
+                start=float(t[first]),
+                resolution={
+                    "theta": LINK_STEP[stage],
+                    "alpha": None if filtered else _gauge_step(alpha, stage),
+                },
+            )
+        )
+    return recordings
+
+
+def _before_gauge_filter(y: Float[np.ndarray, " N"], Ts: float) -> Float[np.ndarray, " N-2"]:
+    """Input x of the filter `y' = v, v' = w^2 (x - y) - 2 d w v`, integrated by Euler's method."""
+    w, d = GAUGE_FILTER_FREQUENCY, GAUGE_FILTER_DAMPING
+    v = np.diff(y) / Ts
+    return y[:-2] + (np.diff(v) / Ts + 2 * d * w * v[:-1]) / w**2
+
+
+def _gauge_step(alpha: Float[np.ndarray, " N"], stage: int) -> float | None:
+    """Step of the deflection behind a converter of 20 V and 14 or 16 bits [rad], None if it has none."""
+    steps = [GAUGE_RAD_PER_VOLT[stage] * 20 / 2**bits for bits in (14, 16)]
+    counts = [(alpha - alpha[0]) / step for step in steps]  # less the gauge's reading at rest
+    fits = (step for step, n in zip(steps, counts, strict=True) if np.max(np.abs(n - np.round(n))) < 0.01)
+    return next(fits, None)
+
+
+BAM_PERIOD = 0.005
+"""Sampling period that the logs of the XL-330 are resampled to; they were taken every 5.1 to 7.1 ms [s]."""
+
+
+def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
+    """Reads a run of a position servo that lifts a pendulum: goal angle to angle.
+
+    Goal and angle were logged together, at uneven times, and are resampled to 5 ms by linear
+    interpolation. Where the torque is switched off the arm falls freely; the recording ends there.
+
+    The toolkit has no model of the servo's own position loop yet, so this is for importing and for models
+    of one's own.
+
+    Args:
+        path: of the JSON file.
+
+    Returns:
+        The recording, input goal [rad], channel theta [rad]; trajectory and gain are in its `source`.
+
+    Raises:
+        InputError: the file is missing, damaged, or no log of such a run.
+
+    Source:
+        Duclusaud, Passault, Padois, Ly 2024, Extended friction models for the physics simulation of servo
+        actuators, arXiv 2410.08650.
+    """
+    file = readable_file(path)
+    try:
+        run = json.loads(file.read_text(encoding="utf-8"))
+        entries = run["entries"]
+        on = [bool(entry["torque_enable"]) for entry in entries]
+        columns = ("timestamp", "goal_position", "position")
+        stop = on.index(False) if False in on else len(on)
+        rows = [[entry[name] for name in columns] for entry in entries[:stop]]
+        t, goal, theta = np.array(rows, dtype=float).T
+        what = f"{file.name}, {run['trajectory']}, gain {run['kp']}"
+    except (ValueError, KeyError, TypeError) as error:
+        raise unreadable(file, "a log of the XL-330", error) from error
+    Ts = BAM_PERIOD
+    return Recording(
+        u=_resampled(t, goal, Ts, file.name),
+        y=_resampled(t, theta, Ts, file.name),
+        Ts=Ts,
+        input_name="goal",
+        input_unit="rad",
+        source=f"{what}, resampled to 5 ms{'' if stop == len(on) else ', up to where the torque is off'}",
+        start=float(t[0]),
+        resolution={"theta": COUNT},
+    )
+
+
+SO101_JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+"""Joints of the SO-101 arm, in the order of its logs."""
+
+SO101_PERIOD = 0.02006
+"""Sampling period that the logs of the SO-101 are resampled to, that of their own clock on average [s]."""
+
+JAW_STEP = 1 / 1523
+"""Step of the jaw, whose position is a share of its travel of 1523 counts."""
+
+
+def load_so101(path: str | os.PathLike[str]) -> list[Recording]:
+    """Reads a motion of the six servos of an SO-101 arm: goal angle to angle, joint by joint.
+
+    A motion is two files, `*.control.csv` and `*.state_motor.csv`, plain or packed by gzip, of which either
+    is named here. Both have one clock that wanders by up to 1 %: goals and angles are resampled to 20.06 ms
+    by linear interpolation. A joint whose goal does not change has no recording. The jaw's positions are a
+    share of its travel, from 0 to 1, whatever the log says. A servo goes on at full speed and then stands,
+    which looks as if a sensor were saturated; that finding is accepted.
+
+    Args:
+        path: of one of the two files.
+
+    Returns:
+        The recordings, input goal [rad], channel theta [rad], both without a unit for the jaw; motion and
+        joint are in their `source`.
+
+    Raises:
+        InputError: a file is missing, damaged, or no log of such a motion.
+    """
+    file = readable_file(path)
+    motion = file.name.partition(".")[0]
+    t, goals = _so101_table(_packed_or_not(file.with_name(f"{motion}.control.csv")))
+    stamps, angles = _so101_table(_packed_or_not(file.with_name(f"{motion}.state_motor.csv")))
+    if not np.array_equal(t, stamps):
+        raise InputError(f"{motion}: goals and angles have different times; take both files from one motion.")
+    recordings = []
+    for joint, goal, theta in zip(SO101_JOINTS, goals.T, angles.T, strict=True):
+        if np.ptp(goal) == 0:
+            continue
+        unit, step = ("", JAW_STEP) if joint == "Jaw" else ("rad", COUNT)
+        recordings.append(
+            Recording(
+                u=_resampled(t, goal, SO101_PERIOD, motion),
+                y=_resampled(t, theta, SO101_PERIOD, motion),
+                Ts=SO101_PERIOD,
+                units=unit,
+                input_name="goal",
+                input_unit=unit,
+                source=f"{motion}, {joint}, resampled to 20.06 ms",
+                start=float(t[0]),
+                accept="saturated",
+                resolution={"theta": step},
+            )
+        )
+    return recordings
+
+
+def _so101_table(path: Path) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N 6"]]:
+    """Time [s] and positions [rad] of a log."""
+    try:
+        rows = list(csv.DictReader(unpacked(path).decode().splitlines()))
+        t = np.array([float(row["timestamp"]) for row in rows]) * 1e-6
+        positions = np.array([json.loads(row["positions"]) for row in rows], dtype=float)
+        if positions.ndim != 2 or positions.shape[1] != len(SO101_JOINTS):
+            raise ValueError(f"there must be positions of {len(SO101_JOINTS)} joints")
+    except (ValueError, KeyError, TypeError, csv.Error) as error:
+        raise unreadable(path, "a log of the SO-101", error) from error
+    return t, positions
+
+
+def _packed_or_not(path: Path) -> Path:
+    """The file, or the one beside it that gzip has packed."""
+    packed = path.with_name(f"{path.name}.gz")
+    return readable_file(packed if packed.exists() and not path.exists() else path)
+
+
+def unpacked(path: Path) -> bytes:
+    """Content of a file, unpacked if its name ends in .gz.
+
+    Raises:
+        InputError: a packed file that is damaged.
+    """
+    if path.suffix != ".gz":
+        return path.read_bytes()
+    try:
+        return gzip.decompress(path.read_bytes())
+    except (OSError, EOFError, zlib.error) as error:
+        raise unreadable(path, "a file packed by gzip", error) from error
+
+
+def _resampled(t: Float[np.ndarray, " N"], x: Float[np.ndarray, " N"], Ts: float, label: str) -> np.ndarray:
+    """A signal at uneven times, at even ones by linear interpolation, from the first sample on."""
+    steps = np.diff(t)
+    if len(t) < 2 or steps.min() <= 0 or steps.max() > 2 * np.median(steps):
+        raise InputError(
+            f"{label} must have times that increase without a gap of two samples, but has not; "
+            "take the original file."
+        )
+    return np.interp(t[0] + Ts * np.arange(int((t[-1] - t[0]) / Ts + 1e-6) + 1), t, x)

@@ -1,10 +1,10 @@
 """Discovery: which physical effect does the model lack?"""
 
-from rotflex_jax.discover.learned import learn_torque
-from rotflex_jax.discover.learned_result import LearnedTorqueResult
-from rotflex_jax.discover.locate import locate
-from rotflex_jax.discover.loop import discover
-from rotflex_jax.discover.result import Discovery, Ranked, Round, Stage, Where
+from rotflex_jax.discover.discovery import Discovery
+from rotflex_jax.discover.learned_torque import LearnedTorqueResult, learn_torque
+from rotflex_jax.discover.localise import locate
+from rotflex_jax.discover.result import Ranked, Round, Stage, Where
+from rotflex_jax.discover.search import discover
 
 __all__ = [
     "Discovery",

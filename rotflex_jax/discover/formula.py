@@ -1,4 +1,4 @@
-"""Reads a learned map as a formula: a few physical terms that say the same of the recordings."""
+"""Reads a learned map as a formula: a few physical terms that explain the recordings as well."""
 
 import dataclasses
 import functools
@@ -6,21 +6,22 @@ import itertools
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from jaxtyping import Float, Real
 
-from rotflex_jax.discover.smooth_map import Mapped
+from rotflex_jax.discover.spline_map import FittedMap
 from rotflex_jax.effects.learned import LearnedTorque
 
-# Most terms of a formula, the share that the last of them must explain, and what its number costs [nat].
-MOST, SHARE, NATS = 4, 0.02, 10.0
-# A term of whose trace less than this is left beside the physics says nothing of its own.
-OWN = 1e-3
+# Most terms of a formula, the share that the last of them must explain, and what its coefficient costs [nat].
+MAX_TERMS, MIN_TERM_SHARE, TERM_NATS = 4, 0.02, 10.0
+# A term of whose trace less than this share is left beside the physics explains nothing of its own.
+MIN_OWN_SHARE = 1e-3
 # Samples at which terms are compared with splines.
-ENOUGH = 5000
+COMPARED_SAMPLES = 5000
 
-Law = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+TermFunction = Callable[[Float[np.ndarray, "..."], Float[np.ndarray, "..."], float], Float[np.ndarray, "..."]]
 
-# In `q`, position [rad], and `w`, speed [rad/s], with a number `n` of their own where they need one.
-LAWS: dict[str, tuple[str, Law]] = {
+# In `q`, position [rad], and `w`, speed [rad/s], with a parameter `n` of their own where they need one.
+FUNCTIONS: dict[str, tuple[str, TermFunction]] = {
     "1": ("", lambda q, w, n: np.ones_like(q)),
     "q": ("/rad", lambda q, w, n: q),
     "q^2": ("/rad^2", lambda q, w, n: q**2),
@@ -43,14 +44,14 @@ class Term:
     """One term of a formula.
 
     Attributes:
-        law: Key of `LAWS`.
-        n: Its own number: a speed [rad/s], or waves per turn.
+        function: Key of `FUNCTIONS`.
+        n: Its own parameter: a speed [rad/s], or waves per turn.
         coefficient: [N m and `unit`].
-        std: Its deviation.
+        std: Its standard deviation.
         share: Of what the map explains, added by this term.
     """
 
-    law: str
+    function: str
     n: float
     coefficient: float = 1.0
     std: float = 0.0
@@ -59,19 +60,21 @@ class Term:
     @property
     def name(self) -> str:
         """As written in a formula."""
-        return self.law.format(n=self.n)
+        return self.function.format(n=self.n)
 
     @property
     def unit(self) -> str:
         """Of the coefficient."""
-        return "N m" + LAWS[self.law][0]
+        return "N m" + FUNCTIONS[self.function][0]
 
-    def __call__(self, position: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    def __call__(
+        self, position: Real[np.ndarray, "..."], speed: Real[np.ndarray, "..."]
+    ) -> Float[np.ndarray, "..."]:
         """Torque [N m]."""
-        return self.coefficient * LAWS[self.law][1](position, speed, self.n)
+        return self.coefficient * FUNCTIONS[self.function][1](position, speed, self.n)
 
     def __str__(self) -> str:
-        return f"{self.coefficient:.3g} {self.name}" if self.law != "1" else f"{self.coefficient:.3g}"
+        return f"{self.coefficient:.3g} {self.name}" if self.function != "1" else f"{self.coefficient:.3g}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +82,7 @@ class Formula:
     """A sum of terms that stands for a learned map.
 
     Attributes:
-        terms: In the order they were chosen; none where no term is worth it.
+        terms: In the order they were chosen; none where no term explains enough.
     """
 
     terms: tuple[Term, ...]
@@ -89,7 +92,9 @@ class Formula:
         """What the terms explain together of what the map explains."""
         return sum(t.share for t in self.terms)
 
-    def __call__(self, position: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    def __call__(
+        self, position: Real[np.ndarray, "..."], speed: Real[np.ndarray, "..."]
+    ) -> Float[np.ndarray, "..."]:
         """Torque [N m] by the formula."""
         q, w = np.broadcast_arrays(np.asarray(position, float), np.asarray(speed, float))
         return sum((t(q, w) for t in self.terms), np.zeros(q.shape))
@@ -98,28 +103,33 @@ class Formula:
         return " + ".join(map(str, self.terms)).replace("+ -", "- ") or "0"
 
 
-def candidates(position: np.ndarray, speed: np.ndarray) -> list[Term]:
+def candidates(position: Float[np.ndarray, " N"], speed: Float[np.ndarray, " N"]) -> list[Term]:
     """Terms worth trying on samples of this size; waves only where the port travels far enough."""
     turning, span = float(np.sqrt(np.mean(speed**2))), float(np.ptp(position))
     waves = [float(n) for n in range(1, 13) if n * span > 2.0]
     out = []
-    for law in LAWS:
-        own = [0.1 * turning, 0.2 * turning, 0.4 * turning, 0.8 * turning] if "exp" in law else waves
-        out += [Term(law, n) for n in own] if "{n" in law else [Term(law, 0.0)]
+    for function in FUNCTIONS:
+        own = [0.1 * turning, 0.2 * turning, 0.4 * turning, 0.8 * turning] if "exp" in function else waves
+        out += [Term(function, n) for n in own] if "{n" in function else [Term(function, 0.0)]
     return out
 
 
-def read(mapped: Mapped, effect: LearnedTorque, position: np.ndarray, speed: np.ndarray) -> Formula:
+def read_formula(
+    fitted: FittedMap,
+    effect: LearnedTorque,
+    position: Float[np.ndarray, " N"],
+    speed: Float[np.ndarray, " N"],
+) -> Formula:
     """The formula of a map, by a search for few terms in the metric of the recordings.
 
-        minimise  (c - D a)' H (c - D a),   H: what the recordings know of the weights c, physics apart
+        minimise  (c - D a)' H (c - D a),   H: information on the weights c, with the physics projected out
 
     A column of `D` has the weights that come nearest to a term. In this metric a term that the physics
-    of the model can imitate (`w` beside a damper) weighs nothing, and a rounded step is as good as a sharp
-    one where no sample tells them apart. The coefficients are those of the data, not of the smoothed map.
+    of the model can imitate (`w` beside a damper) has no size, and a rounded step is as good as a sharp
+    one where no sample distinguishes them. The coefficients are those of the data, not of the smoothed map.
 
     Args:
-        mapped: Fitted map.
+        fitted: Fitted map.
         effect: Its shape.
         position: Of the port along the recordings [rad].
         speed: [rad/s].
@@ -127,33 +137,33 @@ def read(mapped: Mapped, effect: LearnedTorque, position: np.ndarray, speed: np.
     Source: S. Chen, S. Billings and W. Luo, Int. J. Control 50, 1989 (error reduction); S. Brunton,
     J. Proctor and N. Kutz, PNAS 113, 2016 (formulas from a dictionary).
     """
-    pick = np.linspace(0, len(position) - 1, min(ENOUGH, len(position))).astype(int)
+    pick = np.linspace(0, len(position) - 1, min(COMPARED_SAMPLES, len(position))).astype(int)
     q, w = position[pick], speed[pick]
     Phi = effect.design(q, w) * effect.scale
-    H, slope = mapped.information.projected()
-    z = mapped.hypothesis.z[[mapped.hypothesis.free[i] for i in mapped.information.weights]]
+    H, slope = fitted.equations.projected()
+    z = fitted.hypothesis.z[[fitted.hypothesis.free[i] for i in fitted.equations.weights]]
     b = H @ z - slope
-    whole = mapped.information.H[np.ix_(mapped.information.weights, mapped.information.weights)]
+    whole = fitted.equations.H[np.ix_(fitted.equations.weights, fitted.equations.weights)]
     ridge = 1e-6 * np.trace(Phi.T @ Phi) / Phi.shape[1] * np.eye(Phi.shape[1])
     terms = candidates(q, w)
     F = np.stack([t(q, w) for t in terms], axis=1)
     D = np.linalg.solve(Phi.T @ Phi + ridge, Phi.T @ F)
     G, r = D.T @ H @ D, D.T @ b
     own = np.diag(G) / np.maximum(np.einsum("ij,ik,kj->j", D, whole, D), 1e-300)
-    able = [i for i in range(len(terms)) if own[i] > OWN]
-    total = float(b @ mapped.covariance @ b) / mapped.information.excess
+    able = [i for i in range(len(terms)) if own[i] > MIN_OWN_SHARE]
+    total = float(b @ fitted.covariance @ b) / fitted.equations.excess
     chosen: list[int] = []
     explained = [0.0]
     for more in _sets(G, r, able):
         value = _explained(G, r, more)
-        if value - explained[-1] < max(2 * NATS * mapped.information.excess, SHARE * total):
+        if value - explained[-1] < max(2 * TERM_NATS * fitted.equations.excess, MIN_TERM_SHARE * total):
             break
         chosen = more
         explained.append(value)
     if not chosen:
         return Formula(())
     inverse = np.linalg.inv(G[np.ix_(chosen, chosen)])
-    a, std = inverse @ r[chosen], np.sqrt(mapped.information.excess * np.diag(inverse))
+    a, std = inverse @ r[chosen], np.sqrt(fitted.equations.excess * np.diag(inverse))
     shares = np.diff([_explained(G, r, chosen[:k]) for k in range(len(chosen) + 1)]) / total
     return Formula(
         tuple(
@@ -166,12 +176,12 @@ def read(mapped: Mapped, effect: LearnedTorque, position: np.ndarray, speed: np.
 def _sets(G: np.ndarray, r: np.ndarray, able: list[int]) -> Iterator[list[int]]:
     """The best set of one term, of two, of three and so on, the strongest term first.
 
-    One and two are tried out in full, since two terms may say together what neither does nearly; larger
+    One and two are tried out in full, since two terms may explain together what neither does alone; larger
     sets grow by one and exchange members as long as that helps.
     """
     value = functools.partial(_explained, G, r)
     best: list[int] = []
-    for size in range(1, min(MOST, len(able)) + 1):
+    for size in range(1, min(MAX_TERMS, len(able)) + 1):
         if size <= 2:
             best = list(max(itertools.combinations(able, size), key=lambda pick: value(list(pick))))
         else:

@@ -1,13 +1,17 @@
-"""A hypothesis: which effects are on, with which numbers, on one set of recordings."""
+"""A hypothesis (which effects are on, with which parameters), and its changes by one effect."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
-from rotflex_jax.discover.lanes import Bench, Directions, Lane
-from rotflex_jax.discover.supermodel import Place
-from rotflex_jax.discover.whiten import Whitener
+from rotflex_jax.discover.batched_predictor import Directions, ParameterSet
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
+from rotflex_jax.discover.whitening import Whitener
+from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.parameters import Transform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,87 +19,194 @@ class Hypothesis:
     """One model on one set of recordings, with everything a comparison needs.
 
     Attributes:
-        places: Candidates and calibrations that are switched on, in the order they came.
+        locations: Candidates and calibrations that are switched on, in the order they were added.
         free: Parameters common to all recordings that are fitted.
         local: Parameters that each recording has for itself and that are fitted.
-        z: Unconstrained values (P,).
-        own: Unconstrained values of the local parameters (R, len(local)).
-        x0: First states (R, m): positions, speeds, and what else the part of the super-model has.
-        K: Gains (R, n, C).
-        process_noise: Port -> intensity that gave `K`.
+        z: Unconstrained values of all parameters.
+        local_z: Unconstrained values of the local parameters of each recording.
+        x0: First states: positions, speeds, and what else the reduced model has.
+        K: Gains of the predictor.
+        process_noise: Port -> intensity that gave `K` [(N m)^2 s].
         whitener: Fixed while parameters move.
-        densities: Log-likelihood of each training sample (R, N) [nat].
+        densities: Log-likelihood of each sample [nat]; minus infinity before it is evaluated.
     """
 
-    places: tuple[Place, ...]
+    locations: tuple[EffectLocation, ...]
     free: tuple[int, ...]
     local: tuple[int, ...]
-    z: np.ndarray
-    own: np.ndarray
-    x0: np.ndarray
-    K: np.ndarray
+    z: Float[np.ndarray, " P"]
+    local_z: Float[np.ndarray, "R L"]
+    x0: Float[np.ndarray, "R m"]
+    K: Float[np.ndarray, "R n C"]
     process_noise: dict[str, float]
     whitener: Whitener
-    densities: np.ndarray = dataclasses.field(default_factory=lambda: np.array(-np.inf))
+    densities: Float[np.ndarray, "R N"] | Float[np.ndarray, ""] = dataclasses.field(
+        default_factory=lambda: np.array(-np.inf)
+    )
 
-    def seated(self, bench: Bench, places: tuple[Place, ...]) -> np.ndarray:
-        """First states for other places: those that both have as they are, the others at rest."""
-        return seat(bench, places, self.x0, self.places)
+    def initial_state_for(
+        self, s: SuperModel, locations: tuple[EffectLocation, ...]
+    ) -> Float[np.ndarray, "R m"]:
+        """First states with other effects on: what both have as it is, the rest at rest."""
+        return embed_initial_state(s, locations, self.x0, self.locations)
 
     @property
     def log_likelihood(self) -> float:
-        """Of the training recordings [nat]."""
+        """Of the recordings [nat]."""
         total = float(np.sum(self.densities))
         return total if np.isfinite(total) else -np.inf
 
-    def values(self, bench: Bench) -> np.ndarray:
-        """Physical values (R, P)."""
+    def values(self, s: SuperModel) -> Float[np.ndarray, "R P"]:
+        """Physical values."""
+        return self.physical(s)[0]
+
+    def mean_values(self, s: SuperModel) -> Float[np.ndarray, " P"]:
+        """Physical values, of local parameters the mean over recordings."""
+        return self.values(s).mean(axis=0)
+
+    def physical(self, s: SuperModel) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, "R P"]]:
+        """Physical values and their derivative by the unconstrained ones."""
         z = np.tile(self.z, (len(self.x0), 1))
         if self.local:
-            z[:, list(self.local)] = self.own
-        return constrain(bench, z)[0]
+            z[:, list(self.local)] = self.local_z
+        return s.transform.physical(z)
 
-    def lane(self, bench: Bench) -> Lane:
-        """The numbers to run."""
-        return Lane(self.values(bench), self.x0, bench.supermodel.gates(self.places), self.K)
+    def parameter_set(self, s: SuperModel) -> ParameterSet:
+        """What it runs with."""
+        return ParameterSet(self.values(s), self.x0, s.gates(self.locations), self.K)
 
     @property
     def moved(self) -> int:
-        """Number of directions a fit moves: common, then local, then first states."""
+        """Number of directions that a fit moves: common, then local, then first states."""
         return len(self.free) + len(self.local) + self.x0.shape[1]
 
-    def directions(self, bench: Bench, count: int) -> Directions:
-        """Tangents of all that a fit moves, in unconstrained coordinates, filled up with zeros."""
-        R, P = len(self.x0), len(self.z)
-        z = np.tile(self.z, (R, 1))
-        if self.local:
-            z[:, list(self.local)] = self.own
-        stretch = constrain(bench, z)[1]
-        E, m = len(bench.supermodel.mechanism.effects), self.x0.shape[1]
+    def directions(self, s: SuperModel, count: int) -> Directions:
+        """Directions of all that a fit moves, in unconstrained coordinates, filled up with zeros."""
+        (R, m), P, E = self.x0.shape, len(self.z), len(s.mechanism.effects)
+        derivative = self.physical(s)[1]
         d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
         for k, i in enumerate((*self.free, *self.local)):
-            d.values[k, :, i] = stretch[:, i]
+            d.values[k, :, i] = derivative[:, i]
         start = len(self.free) + len(self.local)
         d.x0[start : start + m] = np.eye(m)
         return d
 
 
-def seat(bench: Bench, places: tuple[Place, ...], x0: np.ndarray, of: tuple[Place, ...] = ()) -> np.ndarray:
-    """First states (R, m) for a hypothesis with `places` from those of one with other places.
+def embed_initial_state(
+    s: SuperModel,
+    locations: tuple[EffectLocation, ...],
+    x0: Float[np.ndarray, "R k"],
+    of: tuple[EffectLocation, ...] = (),
+) -> Float[np.ndarray, "R m"]:
+    """First states with some effects on from those with other effects on.
 
     Args:
-        bench: Where it runs.
-        places: What is switched on.
-        x0: States known; only positions and speeds will do.
+        s: The super-model.
+        locations: What is switched on.
+        x0: States known; positions and speeds are enough.
         of: What is switched on where they come from.
     """
-    s = bench.supermodel
-    before, after = (list(s.part(s.gates(p)).states) for p in (of, places))
+    before, after = (list(s.active(s.gates(on)).states) for on in (of, locations))
     full = np.tile(rest_state(s.mechanism.structure, np.float64), (len(x0), 1))
     full[:, before[: x0.shape[1]]] = x0
     return full[:, after]
 
 
-def constrain(bench: Bench, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Physical values of unconstrained ones (..., P), and their derivative."""
-    return bench.supermodel.transform.physical(z)
+@dataclasses.dataclass(frozen=True)
+class CandidateStart:
+    """Where a refit of a candidate starts.
+
+    Attributes:
+        location: Effect and port.
+        values: Parameter values.
+        others: Values at the next best shapes.
+        expected_gain: Log-likelihood that the score test expects [nat]; 0 where there was none.
+    """
+
+    location: EffectLocation
+    values: Float[np.ndarray, " K"]
+    others: tuple[Float[np.ndarray, " K"], ...] = ()
+    expected_gain: float = 0.0
+
+
+def with_candidate(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
+    """The hypothesis with one more effect, or with it in the place of simpler ones that it contains."""
+    name, port = start.location
+    simpler = [EffectLocation(c, port) for c in CATALOG[name].contains if (c, port) in h.locations]
+    if not simpler or CATALOG[name].state_part != "memory":
+        return with_effect(s, h, start, share)
+    return replacing(s, h, simpler, start, share)
+
+
+def replacing(
+    s: SuperModel, h: Hypothesis, simpler: Sequence[EffectLocation], start: CandidateStart, share: float
+) -> Hypothesis:
+    """The hypothesis with a richer effect in the place of simpler ones, whose parameters it takes over."""
+    values, known = h.mean_values(s), {}
+    for location in simpler:
+        indices = s.parameter_indices(location)
+        names = [s.mechanism.parameter_names[i].rpartition(".")[2] for i in indices]
+        known |= dict(zip(names, values[indices], strict=True))
+        h = without(s, h, location)
+    c, own = s.candidates[start.location], start.values.copy()
+    for k, i in enumerate(c.parameters):
+        parameter = s.mechanism.parameter_names[i].rpartition(".")[2]
+        if parameter in known:
+            # What the simpler effect has already keeps its size; the share is for the rest.
+            own[k] = known[parameter] / (share if c.amplitudes[k] else 1.0)
+    return with_effect(s, h, dataclasses.replace(start, values=own), share)
+
+
+def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
+    """The hypothesis with one more effect, at a share of the amplitude of its start."""
+    c = s.candidates[start.location]
+    specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
+    size = np.abs(np.array(c.probes[0])).max(axis=0)
+    values = np.where(c.amplitudes, share * start.values, start.values)
+    for k, spec in enumerate(specs):
+        # A bound at zero is the end of a logarithm: start a little inside.
+        if np.isfinite(spec.lower):
+            values[k] = max(values[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
+    z = h.z.copy()
+    z[list(c.parameters)] = Transform.of(specs).unconstrain(values)
+    locations = (*h.locations, start.location)
+    x0 = h.initial_state_for(s, locations)
+    return dataclasses.replace(h, locations=locations, free=(*h.free, *c.parameters), z=z, x0=x0)
+
+
+def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis:
+    """The hypothesis less one effect, its other parameters as they are."""
+    removed = set(s.parameter_indices(location))
+    kept = [k for k, i in enumerate(h.local) if i not in removed]
+    locations = tuple(p for p in h.locations if p != location)
+    return dataclasses.replace(
+        h,
+        locations=locations,
+        x0=h.initial_state_for(s, locations),
+        free=tuple(i for i in h.free if i not in removed),
+        local=tuple(h.local[k] for k in kept),
+        local_z=h.local_z[:, kept],
+    )
+
+
+def is_physical(s: SuperModel, h: Hypothesis, location: EffectLocation) -> bool:
+    """Whether the parameters of an effect lie in their physical range."""
+    values, specs = h.mean_values(s), s.mechanism.parameter_specifications
+    return all(
+        specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(location)
+    )
+
+
+def generalisations(s: SuperModel, h: Hypothesis) -> list[CandidateStart]:
+    """Effects with memory that contain another one that is on, as starts.
+
+    The search adds effects, but such an effect is not the simpler one and something more, and its slope at
+    shapes that are far from the one found is not informative.
+    """
+    out = []
+    for location, c in s.candidates.items():
+        simpler = [n for n in CATALOG[location.effect].contains if CATALOG[n].state_part == "memory"]
+        if location not in h.locations and any((n, location.port) in h.locations for n in simpler):
+            first, *others = (np.array(group[0], float) for group in c.probes)
+            out.append(CandidateStart(location, first, tuple(others)))
+    return out

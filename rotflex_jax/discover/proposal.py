@@ -1,30 +1,33 @@
-"""What to record next where two effects remain: the standard inputs, ranked."""
+"""The next experiment for a result in which two effects look alike."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from rotflex_jax.discover.result import Discovery
+from rotflex_jax.discover.result import SearchResult
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.recording import Recording
 
-# Length of a proposal, and of the recording from which the rival's numbers come [s]; a ranking needs no more.
-SECONDS = 10.0
+Found = TypeVar("Found", bound=SearchResult)
+
+# Length of a proposal, and of the recording to which the rival is fitted [s]; a ranking needs no more.
+PROPOSAL_SECONDS = 10.0
 
 
-def with_proposal(found: Discovery) -> Discovery:
-    """The result with the standard input that tells the first two alike apart, if there are two."""
-    if found.verdict != "ambiguous":
+def with_proposal(found: Found) -> Found:
+    """The result with the standard input that best distinguishes the first two that look alike, if any."""
+    if found.verdict != Verdict.AMBIGUOUS:
         return found
     try:
-        return dataclasses.replace(found, proposal=proposed(found, seconds=SECONDS, improve=False))
+        return dataclasses.replace(found, proposal=proposed(found, seconds=PROPOSAL_SECONDS, improve=False))
     except InputError as error:  # no reason to lose what was found
         return dataclasses.replace(found, notes=(*found.notes, f"No next experiment is proposed: {error}"))
 
 
-def proposed(found: Discovery, **changes: Any) -> Experiment | None:
+def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
     """The next experiment for the first effect of a result that has an equal.
 
     Args:
@@ -42,7 +45,7 @@ def proposed(found: Discovery, **changes: Any) -> Experiment | None:
         "Ts": longest.Ts,
         "noise": found.noise_floor,
         "process_noise": found.final.process_noise,
-        "reference": longest.u[: round(SECONDS / longest.Ts)],
+        "reference": longest.u[: round(PROPOSAL_SECONDS / longest.Ts)],
     }
     return next_experiment(found.model, first, second, **(settings | changes))
 

@@ -1,47 +1,206 @@
-"""What discovery returns: stages, rounds, ranking, places of failure, a verdict, what to do next."""
+"""What a search found, as data: stages, rounds, ranking, places of failure, a verdict."""
 
 import dataclasses
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+import math
+from typing import Any
 
-from rotflex_jax.discover.findings import Ranked, Round, Stage, Where, plain
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.experiment import Experiment
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
-
-if TYPE_CHECKING:
-    from rotflex_jax.discover.learned_result import LearnedTorqueResult
-    from rotflex_jax.discover.photographs import Photographs
-
-# Name of the file beside a report that holds the input to play next.
-NEXT = "next_experiment.csv"
-
-__all__ = ["NEXT", "VERDICTS", "Discovery", "Ranked", "Round", "Stage", "Where"]
-
-VERDICTS = ("found", "nothing_missing", "ambiguous", "unexplained", "not_excited")
 
 
 @dataclasses.dataclass(frozen=True)
-class Discovery:
-    """Result of the loop.
+class Stage:
+    """One model of the search, fitted, and evaluated on validation recordings.
 
     Attributes:
-        verdict: One of `VERDICTS`; speaks of the end state.
-        sentence: The verdict in words.
-        train: Recordings that were fitted.
-        test: Recordings that were held out.
-        baseline: The user's model, fitted.
-        rounds: What was added, in order.
-        ranking: All candidates as the baseline's score test saw them, best first.
-        where: Where the baseline fails.
-        noise_floor: Channel -> deviation of the sensor noise.
-        elapsed_s: Time taken [s].
-        notes: Remarks for a reader.
-        proposal: Where two effects remain: the standard input that tells them apart best.
+        model: Fitted model.
+        estimates: Parameters with intervals; calibrations (offset, bias) among them.
+        held_out_rmse: Channel -> error of one free run over the validation recordings.
+        held_out_rmse_windows: Channel -> error of free runs that start again every `window_seconds`.
+        simulated: Free run over each validation recording.
+        windowed: The same, started again every `window_seconds`.
+        window_seconds: [s].
+        process_noise: Port -> intensity of the process torque that the data ask for [(N m)^2 s]; small
+            where the model is right.
+        process_noise_nats: Log-likelihood that the process torque gains; near zero where the model is right.
+        log_likelihood: Of the validation recordings [nat].
     """
 
-    verdict: str
+    model: Model
+    estimates: tuple[Estimate, ...]
+    held_out_rmse: dict[str, float]
+    held_out_rmse_windows: dict[str, float]
+    simulated: tuple[Float[np.ndarray, "_ C"], ...]
+    windowed: tuple[Float[np.ndarray, "_ C"], ...]
+    window_seconds: float
+    process_noise: dict[str, float]
+    process_noise_nats: float
+    log_likelihood: float
+
+    def errors(self) -> dict[str, Any]:
+        """The two validation errors as plain JSON."""
+        return {
+            "held_out_rmse": plain(self.held_out_rmse),
+            "held_out_rmse_windows": {
+                "seconds": self.window_seconds,
+                **plain(self.held_out_rmse_windows),
+            },
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Round:
+    """One round of the search: an effect that was added.
+
+    Attributes:
+        effect: Name of the effect.
+        port: Where it acts.
+        equivalent: Other (effect, port) that these recordings cannot distinguish from it.
+        parameters: Its own estimates, by short name.
+        stage: The model with it, refitted and evaluated.
+        score: Penalised score of the candidate [nat].
+        held_out_gain_nats: Gain in log-likelihood of the validation recordings [nat].
+        sentence: What was found, in words.
+        equation: Its equation.
+    """
+
+    effect: str
+    port: str
+    equivalent: tuple[tuple[str, str], ...]
+    parameters: dict[str, Estimate]
+    stage: Stage
+    score: float
+    held_out_gain_nats: float
+    sentence: str
+    equation: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "effect": self.effect,
+            "port": self.port,
+            "equivalent": [{"effect": e, "port": p} for e, p in self.equivalent],
+            "parameters": {n: e.to_dict() for n, e in self.parameters.items()},
+            **self.stage.errors(),
+            "evidence": {
+                "score": _number(self.score),
+                "held_out_gain_nats": _number(self.held_out_gain_nats),
+            },
+            "sentence": self.sentence,
+            "equation": self.equation,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranked:
+    """One candidate in the score test of the baseline.
+
+    Attributes:
+        effect: Name of the effect.
+        port: Where it would act.
+        score: Penalised score [nat]; negative where the data speak against it.
+        excited: False where this recording could not have shown an effect of a plausible size.
+        unconfounded: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
+        smallest: Detection limit: factor of a plausible size that would just have been visible.
+    """
+
+    effect: str
+    port: str
+    score: float
+    excited: bool
+    unconfounded: float
+    smallest: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "effect": self.effect,
+            "port": self.port,
+            "score": _number(self.score),
+            "excited": self.excited,
+            "unconfounded": _number(self.unconfounded),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Where:
+    """One statement of where the model fails.
+
+    Attributes:
+        statement: A plain sentence.
+        share: Share of the squared error that it speaks of.
+        p_value: Chance of such a share if the error were spread evenly.
+        kind: time, frequency, speed, deflection or reversal.
+        channel: Whose error.
+        edges: Bin edges [unit].
+        profile: Share of the squared error in each bin.
+        expected: Share of the samples (for frequency: of the noise) in each bin.
+        unit: Of the edges.
+    """
+
+    statement: str
+    share: float
+    p_value: float
+    kind: str
+    channel: str
+    edges: Float[np.ndarray, " G"]
+    profile: Float[np.ndarray, " B"]
+    expected: Float[np.ndarray, " B"]
+    unit: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "statement": self.statement,
+            "share": _number(self.share),
+            "p_value": _number(self.p_value),
+            "kind": self.kind,
+            "channel": self.channel,
+        }
+
+
+def _number(value: float) -> float | None:
+    """A float that JSON can carry."""
+    return float(value) if math.isfinite(value) else None
+
+
+def plain(values: dict[str, float]) -> dict[str, float | None]:
+    """Floats that JSON can carry."""
+    return {k: _number(v) for k, v in values.items()}
+
+
+# Name of the file beside a report that holds the input to play next.
+NEXT = "next_experiment.csv"
+# An error of at most this times the sensor noise counts as having reached it.
+NEAR_FLOOR = 1.5
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchResult:
+    """What a search found, as data; `Discovery` adds what can be done with it.
+
+    Attributes:
+        verdict: Speaks of the end state.
+        sentence: The verdict in words.
+        train: Recordings that were fitted.
+        test: Validation recordings.
+        baseline: The user's model, fitted.
+        rounds: What was added, in order.
+        ranking: All candidates in the score test of the baseline, best first.
+        where: Where the baseline fails.
+        noise_floor: Channel -> standard deviation of the sensor noise.
+        elapsed_s: Time taken [s].
+        notes: Remarks for a reader.
+        proposal: Where two effects remain: the standard input that distinguishes them best.
+    """
+
+    verdict: Verdict
     sentence: str
     train: tuple[Recording, ...]
     test: tuple[Recording, ...]
@@ -73,7 +232,7 @@ class Discovery:
         """Plain JSON types, schema 1."""
         return {
             "schema": 1,
-            "verdict": self.verdict,
+            "verdict": self.verdict.value,
             "sentence": self.sentence,
             "baseline": self.baseline.errors(),
             "noise_floor": plain(self.noise_floor),
@@ -84,69 +243,6 @@ class Discovery:
             "notes": list(self.notes),
             "elapsed_s": self.elapsed_s,
         }
-
-    def latent_torque(self, progress: Callable[[str], None] | None = None) -> "Photographs":
-        """Torques that the baseline and the final model lack, on a fitted and a held-out recording."""
-        from rotflex_jax.discover.photographs import photographs  # which knows of this module
-
-        longest = [max(group, key=lambda r: r.N) for group in (self.train, self.test)]
-        return photographs(self.baseline, self.final if self.rounds else None, longest, progress)
-
-    def learned_torque(
-        self, at: str = "hub", progress: Callable[[str], None] | None = None
-    ) -> "LearnedTorqueResult":
-        """A smooth map of position and speed learned on top of the final model, for what is unexplained.
-
-        Args:
-            at: Port of the torque.
-            progress: Called with a line of text at each stage.
-        """
-        from rotflex_jax.discover.learned import learn_torque  # which knows of this module
-
-        seconds = self.baseline.window_seconds
-        return learn_torque(self.model, self.train, self.test, at, window_seconds=seconds, progress=progress)
-
-    def save(self, path: str | Path) -> Path:
-        """Write the final model as JSON, with its estimates; `Model.load` reads the model."""
-        from rotflex_jax.export.files import Saved, save
-
-        seen = self.train[0]
-        return save(Saved(self.model, self.final.estimates, Ts=seen.Ts, n_init=seen.n_init), path)
-
-    def next_experiment(self, **changes: Any) -> Experiment | None:
-        """Design the input that tells the first effect found from its equal; None where it has none.
-
-        The model, its noise and the machine's limits are those of the recordings: no more voltage, slew or
-        deflection than they hold.
-
-        Args:
-            changes: Other arguments of `rotflex_jax.next_experiment`, its `limits` for instance.
-        """
-        from rotflex_jax.discover.proposal import proposed  # it needs this module
-
-        return proposed(self, **changes)
-
-    def report(self, folder: str | Path, *, learned: bool | None = None) -> Path:
-        """Write `report.html` (self-contained) and `result.json` into a folder; returns the HTML path.
-
-        Where the verdict is ambiguous, the input to play next lies beside them as a file.
-
-        Args:
-            folder: Where to write.
-            learned: Whether to learn a torque for what is left, which takes about as long as a round; where
-                the verdict is `unexplained` if None.
-        """
-        from rotflex_jax.report import write_report  # the layer above, on request
-
-        page = write_report(self, Path(folder), learned=learned)
-        if self.proposal is not None:
-            self.proposal.save_csv(Path(folder) / NEXT)
-        return page
-
-    def _repr_html_(self) -> str:
-        from rotflex_jax.display.cards import discovery_card  # the layer above, when a notebook asks
-
-        return discovery_card(self)
 
     def __str__(self) -> str:
         lines = [self.sentence]

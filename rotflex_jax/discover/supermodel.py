@@ -1,4 +1,4 @@
-"""The baseline with every candidate built in and switched off.
+"""The baseline with every candidate built in and switched off, and the sizes of signals at its ports.
 
 All hypotheses share its numbering of parameters, effects and states. A run has only those of its candidates
 that are switched on: the others would cost most of the time (twenty times the baseline's with all of them),
@@ -7,19 +7,104 @@ and a structure of few effects compiles quickly.
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+import scipy
+from jaxtyping import Float, Shaped
 
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Gear, Linear, Memory, Scale, Sensing
+from rotflex_jax.effects.base import Effect, Scale
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.assembly import effects_of
-from rotflex_jax.mechanism.roles import calibrations as places_of_calibrations
+from rotflex_jax.mechanism.assembly import Layout, own_states
+from rotflex_jax.mechanism.linear import inverse_mass
+from rotflex_jax.mechanism.roles import calibrations as usual_calibrations
+from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
+from rotflex_jax.recording import Recording
 
-Place = tuple[str, str]  # (effect name, port)
+
+def motion(
+    mechanism: Mechanism, y: Float[np.ndarray, "N C"], Ts: float, smooth: float = 0.03
+) -> dict[str, tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]]:
+    """Port -> (position, speed) by smoothing measured outputs over `smooth` seconds.
+
+    Ports that the measured positions do not determine are left out.
+    """
+    layout = Layout.of(mechanism.structure)
+    rows = np.array(layout.output_rows)
+    is_position = np.array([q.is_position for q in mechanism.quantities])
+    if not is_position.any():
+        return {}
+    width = max(2 * round(smooth / Ts / 2) + 1, 5)
+    width = min(width, len(y) - 1 + len(y) % 2)
+    C = rows[is_position, : layout.n]
+    position = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, axis=0))
+    speed = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0))
+    back, out = np.linalg.pinv(C), {}
+    for port, vector in mechanism.port_vectors.items():
+        p = np.array(vector) @ back
+        if np.allclose(p @ C, vector):
+            out[port] = (position @ p, speed @ p)
+    return out
+
+
+def _known_motion(model: Model, recording: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Motion of every port: as measured, or as simulated where no sensor determines it."""
+    measured = motion(model.mechanism, model.measured(recording).astype(float), recording.Ts)
+    unmeasured = {port: v for port, v in model.mechanism.port_vectors.items() if port not in measured}
+    if not unmeasured:
+        return measured
+    n = len(model.mechanism.coordinates)
+    states = model.simulate_states(recording)
+    if not np.all(np.isfinite(states)):
+        return measured
+    q, dq = states[:, :n], states[:, n : 2 * n]
+    return measured | {port: (q @ np.array(v), dq @ np.array(v)) for port, v in unmeasured.items()}
+
+
+def stiffness_and_inertia(mechanism: Mechanism, port: str) -> tuple[float, float]:
+    """Stiffness of the linear springs at a port [N m/rad], and the inertia that a torque there meets."""
+    stiffness = sum(float(e.stamp().stiffness) for e in mechanism.linear_effects(port))
+    p = np.array(mechanism.port_vectors[port])
+    return stiffness, float(1 / (p @ inverse_mass(mechanism) @ p))
+
+
+def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict[str, Scale]:
+    """Port, `input` or channel -> size of its signals.
+
+    Args:
+        model: Its ports and outputs.
+        recordings: Measured data.
+        torque: Torque that moves the machine [N m].
+    """
+    voltage = max(float(np.max(np.abs(r.u))) for r in recordings)
+    mechanism = model.mechanism
+    out = {}
+    found = [_known_motion(model, r) for r in recordings]
+    for port in mechanism.port_vectors:
+        known = [m[port] for m in found if port in m]
+        speed = max((float(np.sqrt(np.mean(s**2))) for _, s in known), default=1.0)
+        position = max((float(np.max(np.abs(q - q.mean()))) for q, _ in known), default=0.1)
+        stiffness, inertia = stiffness_and_inertia(mechanism, port)
+        out[port] = Scale(voltage, max(speed, 1e-6), max(position, 1e-6), torque, stiffness, inertia)
+    whole = Scale(voltage, 1.0, 1.0, torque)
+    for channel in mechanism.channels:
+        y = np.concatenate([model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings])
+        out[channel] = Scale(voltage, 1.0, max(float(np.std(y)), 1e-9), torque)
+    return out | {"input": whole}
+
+
+class EffectLocation(NamedTuple):
+    """Which effect, and at which port (or `input`, or channel) it acts; equal to the plain tuple."""
+
+    effect: str
+    port: str
+
+    def __str__(self) -> str:
+        return f"{self.effect} at {self.port}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,33 +112,34 @@ class Candidate:
     """One effect that may be missing.
 
     Attributes:
-        place: Effect name and port.
+        location: Which effect it is, and where it acts.
         effect: Index in the super-model's effects.
         parameters: Indices of its parameters in the super-model's values.
         probes: Alternatives (shapes), each a list of parameter vectors tried together.
         amplitudes: For each parameter, whether it is an amplitude.
         one_sided: Whether a negative amplitude would not be physical.
-        sudden: Whether a small amplitude does nothing yet: what it does is learnt from runs at its sizes.
+        threshold: Whether a small amplitude does nothing at all, so that only runs at full size show what the
+            effect does.
     """
 
-    place: Place
+    location: EffectLocation
     effect: int
     parameters: tuple[int, ...]
     probes: tuple[tuple[tuple[float, ...], ...], ...]
     amplitudes: tuple[bool, ...]
     one_sided: bool
-    sudden: bool = False
+    threshold: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
-    """The super-model less some effects that are off.
+class ReducedModel:
+    """The super-model without some of the effects that are switched off.
 
     Attributes:
         mechanism: What is left.
-        effects: Places of its effects in the super-model's.
-        parameters: Places of its parameters in the super-model's values.
-        states: Places of its states in the super-model's state.
+        effects: Indices of its effects in the super-model.
+        parameters: Indices of its parameters in the super-model's values.
+        states: Indices of its states in the super-model's state.
     """
 
     mechanism: Mechanism
@@ -69,16 +155,16 @@ class SuperModel:
     Attributes:
         baseline: The user's mechanism.
         mechanism: With calibrations and candidates.
-        calibrations: Places of the calibrations that were added.
-        candidates: By place.
-        parts: Parts formed so far, by the effects left out.
+        calibrations: Those that were added.
+        candidates: By location.
+        reduced: Reduced models formed so far, by the effects left out.
     """
 
     baseline: Mechanism
     mechanism: Mechanism
-    calibrations: tuple[Place, ...]
-    candidates: dict[Place, Candidate]
-    parts: dict[frozenset[int], Part] = dataclasses.field(default_factory=dict)
+    calibrations: tuple[EffectLocation, ...]
+    candidates: dict[EffectLocation, Candidate]
+    reduced: dict[frozenset[int], ReducedModel] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def transform(self) -> Transform:
@@ -87,66 +173,66 @@ class SuperModel:
 
     @functools.cached_property
     def baseline_states(self) -> list[int]:
-        """Places of the baseline's states in the state."""
-        own, count = state_rows(self.mechanism), len(self.baseline.effects)
+        """Indices of the baseline's states in the state."""
+        own, count = own_states(self.mechanism), len(self.baseline.effects)
         moving = range(2 * len(self.baseline.coordinates))
         return sorted([*moving, *(row for i, rows in own.items() if i < count for row in rows)])
 
-    def part(self, gates: np.ndarray) -> Part:
-        """The super-model without the candidates whose gate (..., E) is zero."""
-        return self.probed(np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0), ())
+    def active(self, gates: Shaped[np.ndarray, "*batch E"]) -> ReducedModel:
+        """The super-model without the candidates whose gates are all zero."""
+        return self.with_family(np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0), ())
 
-    def probed(self, gates: np.ndarray, family: Iterable[Candidate]) -> Part:
-        """The super-model with no other candidates than a family and those whose gate (E,) is not zero."""
+    def with_family(self, gates: Shaped[np.ndarray, " E"], family: Iterable[Candidate]) -> ReducedModel:
+        """The super-model with no other candidates than a family and those whose gate is not zero."""
         kept = {c.effect for c in family}
         others = (c.effect for c in self.candidates.values() if c.effect not in kept)
         left_out = frozenset(i for i in others if gates[i] == 0)
-        if left_out not in self.parts:
-            self.parts[left_out] = self._part(left_out)
-        return self.parts[left_out]
+        if left_out not in self.reduced:
+            self.reduced[left_out] = self._reduce(left_out)
+        return self.reduced[left_out]
 
     def families(self, candidates: Iterable[Candidate]) -> list[list[Candidate]]:
-        """Candidates by what it takes to probe them: states of their own, a contact, a torque, a signal."""
-        own = state_rows(self.mechanism)
+        """Candidates by what they add to the equations: states, a contact, a torque, a changed signal."""
+        own = own_states(self.mechanism)
         found: dict[str, list[Candidate]] = {}
         for c in candidates:
             effect = self.mechanism.effects[c.effect]
             if c.effect in own:
                 kind = "states"
-            elif isinstance(effect, Actuation | Sensing):
+            elif effect.acts_on != "port":
                 kind = "signal"
             else:
-                kind = "contact" if isinstance(effect, DryFriction) else "torque"
+                kind = "contact" if effect.dry_contact else "torque"
             found.setdefault(kind, []).append(c)
         return list(found.values())
 
-    def _part(self, left_out: frozenset[int]) -> Part:
+    def _reduce(self, left_out: frozenset[int]) -> ReducedModel:
         kept = [i for i in range(len(self.mechanism.effects)) if i not in left_out]
         effects = tuple(self.mechanism.effects[i] for i in kept)
         mechanism = dataclasses.replace(self.mechanism, effects=effects)
         names = {n: k for k, n in enumerate(self.mechanism.parameter_names)}
-        rows = state_rows(self.mechanism)
+        rows = own_states(self.mechanism)
         moving = range(2 * len(self.mechanism.coordinates))
-        return Part(
+        return ReducedModel(
             mechanism,
             tuple(kept),
             tuple(names[n] for n in mechanism.parameter_names),
             tuple(sorted([*moving, *(row for i in kept for row in rows.get(i, ()))])),
         )
 
-    def effect_index(self, place: Place) -> int:
+    def effect_index(self, location: EffectLocation) -> int:
         """Index of an effect."""
-        return [(e.name, e.at) for e in self.mechanism.effects].index(place)
+        return [(e.name, e.at) for e in self.mechanism.effects].index(location)
 
-    def parameter_indices(self, place: Place) -> list[int]:
+    def parameter_indices(self, location: EffectLocation) -> list[int]:
         """Indices of an effect's parameters in the values."""
-        head = f"{place[1]}.{place[0]}."
+        head = f"{location.port}.{location.effect}."
         return [i for i, n in enumerate(self.mechanism.parameter_names) if n.startswith(head)]
 
     @functools.cached_property
     def local(self) -> list[int]:
         """Parameters that each recording has for itself."""
-        return [i for place in self.calibrations for i in self.parameter_indices(place)]
+        return [i for location in self.calibrations for i in self.parameter_indices(location)]
 
     @functools.cached_property
     def baseline_free(self) -> list[int]:
@@ -154,33 +240,20 @@ class SuperModel:
         names = self.mechanism.parameter_names
         return [names.index(n) for n in self.baseline.free_names]
 
-    def gates(self, switched_on: Iterable[Place]) -> np.ndarray:
-        """Gates (E,): baseline and the named effects on."""
+    def gates(self, switched_on: Iterable[EffectLocation]) -> Float[np.ndarray, " E"]:
+        """One where an effect is on: those of the baseline and those named."""
         on = set(switched_on)
         base = len(self.baseline.effects)
         effects = self.mechanism.effects
         return np.array([1.0 if i < base or (e.name, e.at) in on else 0.0 for i, e in enumerate(effects)])
 
-    def clean(self, values: np.ndarray, places: Iterable[Place]) -> Mechanism:
-        """The user's mechanism with fitted numbers and the named effects, nothing else."""
-        numbers = dict(zip(self.mechanism.parameter_names, values.tolist(), strict=True))
+    def clean(self, values: Float[np.ndarray, " P"], locations: Iterable[EffectLocation]) -> Mechanism:
+        """The user's mechanism with fitted parameters and the named effects, nothing else."""
+        named = dict(zip(self.mechanism.parameter_names, values.tolist(), strict=True))
         mechanism = self.baseline
-        for place in places:
-            mechanism = mechanism + self.mechanism.effects[self.effect_index(place)]
-        return mechanism.with_values({n: numbers[n] for n in mechanism.parameter_names})
-
-
-def state_rows(mechanism: Mechanism) -> dict[int, tuple[int, ...]]:
-    """Effects with states of their own -> places of these in the state."""
-    rows, at = {}, 2 * len(mechanism.coordinates)
-    # The state holds those of linear effects first, then those of a gear, then memories.
-    for kind in (Linear, Gear, Memory):
-        for i, e in effects_of(mechanism, kind):
-            count = 1 if isinstance(e, Memory) else e.order
-            if count:
-                rows[i] = tuple(range(at, at + count))
-                at += count
-    return rows
+        for location in locations:
+            mechanism = mechanism + self.mechanism.effects[self.effect_index(location)]
+        return mechanism.with_values({n: named[n] for n in mechanism.parameter_names})
 
 
 def build(
@@ -196,20 +269,20 @@ def build(
     present = {(e.name, e.at) for e in baseline.effects}
     mechanism = baseline
     calibrations, candidates = [], {}
-    # Fitted from the start, each recording has its own, and reported as found where it matters.
-    for place in places_of_calibrations(baseline):
-        cls = CATALOG[place[0]]
-        if place not in present and _has(baseline, cls, place[1]):
-            mechanism = mechanism + cls(at=place[1])
-            calibrations.append(place)
+    # Fitted from the start with values for each recording, and reported as found where they are needed.
+    for location in (EffectLocation(*c) for c in usual_calibrations(baseline)):
+        cls = CATALOG[location.effect]
+        if location not in present and baseline.accepts(cls, location.port):
+            mechanism = mechanism + cls(at=location.port)
+            calibrations.append(location)
     for cls, port in wanted:
-        place = (cls.name, port)
+        location = EffectLocation(cls.name, port)
         if cls.name not in CATALOG:
             raise InputError(
                 f"{cls.__name__} is to be tried, but is not in the catalogue of effects; put @register above "
                 "it."
             )
-        if place in present or place in calibrations or not _has(baseline, cls, port):
+        if location in present or location in calibrations or not baseline.accepts(cls, port):
             continue
         names = tuple(cls.declared())
         probes = tuple(
@@ -219,24 +292,13 @@ def build(
             continue
         mechanism = mechanism + cls(at=port, **dict(zip(names, probes[0][0], strict=True)))
         last = len(mechanism.parameter_names)
-        candidates[place] = Candidate(
-            place,
+        candidates[location] = Candidate(
+            location,
             len(mechanism.effects) - 1,
             tuple(range(last - len(names), last)),
             probes,
             tuple(n in cls.amplitudes for n in names),
             all(max(s.lower, s.physical[0]) >= 0 for n, s in cls.declared().items() if n in cls.amplitudes),
-            sudden=issubclass(cls, Gear),
+            threshold=not cls.slope_at_zero,
         )
     return SuperModel(baseline, mechanism, tuple(calibrations), candidates)
-
-
-def _has(mechanism: Mechanism, cls: type[Effect], port: str) -> bool:
-    if issubclass(cls, Actuation):
-        return port == "input"
-    if issubclass(cls, Memory) and cls.driven_by == "motor" and not mechanism.has_motor(port):
-        return False
-    if issubclass(cls, Gear):
-        known = not any(isinstance(e, Gear) for e in mechanism.effects)
-        return known and mechanism.has_motor(port) and mechanism.has_inertia(port)
-    return port in (mechanism.channels if issubclass(cls, Sensing) else mechanism.port_vectors)

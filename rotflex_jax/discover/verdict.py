@@ -1,61 +1,147 @@
-"""The end state in one word and one sentence."""
+"""The end states of a search. A new one is a member here, and a case of the rule in `end_state.py`."""
 
 from collections.abc import Sequence
+from enum import StrEnum
+from typing import NamedTuple
 
-from rotflex_jax.discover.result import Round, Stage
-from rotflex_jax.discover.score import Score
-from rotflex_jax.recording import Recording
-
-# The model explains the record if short held-out runs come this near to the sensor noise and process
-# torques gain no more than this per measured number [nat].
-NEAR_FLOOR, NATS_PER_NUMBER = 1.5, 0.07
+from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MUTED
 
 
-def judge_end(
-    rounds: Sequence[Round],
-    final: Stage,
-    floor: dict[str, float],
-    ranking: Sequence[Score],
-    test: Sequence[Recording],
-) -> tuple[str, str]:
-    """Verdict and sentence.
+class Presentation(NamedTuple):
+    """How a verdict is shown.
 
-    Args:
-        rounds: What was added.
-        final: Stage after the last round.
-        floor: Deviation of the sensor noise per channel.
-        ranking: Scores of the baseline.
-        test: Held-out recordings.
+    Attributes:
+        headline: Title of a report.
+        phrase: What holds for a recording with this verdict, after a count: "3 ...".
+        tone: Class of the style sheet: good, warn or bad.
+        colour: Of its points in a figure.
+        marker: Of its points; distinguishes verdicts without colour.
+        filled: Whether the marker is filled.
+        advice: What to do next; a text with `{effect}` and `{rivals}` is given for each effect that the
+            recordings cannot distinguish from others.
     """
-    ratios = {c: final.held_out_rmse_windows[c] / floor[c] for c in floor}
-    numbers = sum(r.N for r in test) * len(floor)
-    near = all(ratio < NEAR_FLOOR for ratio in ratios.values())
-    explained = near and final.process_noise_nats < NATS_PER_NUMBER * numbers
-    seconds = final.window_seconds
-    left = ", ".join(f"{c} {_times(r)}" for c, r in ratios.items())
-    reached = f"the held-out error over {seconds:g} s is {left} times the sensor noise"
-    names = " and ".join(f"{r.effect.replace('_', ' ')} at the {r.port}" for r in rounds)
-    explain, others = "explain", "some of them from others (listed with each)"
-    if len(rounds) == 1:
-        explain, others = "explains", "this from others (listed with it)"
-    visible = [s for s in ranking if s.excited]
-    unseen = len(ranking) - len(visible)
-    if not explained:
-        found = f"{names} found, but something" if rounds else "Something"
-        return "unexplained", f"{found} remains that no candidate explains: {reached}."
-    if any(r.equivalent for r in rounds):
-        return "ambiguous", (f"{names} {explain} the recording, but it cannot tell {others}: {reached}.")
-    if rounds:
-        return "found", f"{names} {explain} the recording: {reached}."
-    if ranking and unseen > len(ranking) / 2:
-        return "not_excited", (
-            f"Nothing was found, but {unseen} of {len(ranking)} candidates could not have shown in this "
-            f"recording: move the machine more, over more speeds and voltages."
-        )
-    hidden = f"; {unseen} of {len(ranking)} candidates could not have shown" if unseen else ""
-    return "nothing_missing", f"Nothing is missing: {reached}{hidden}."
+
+    headline: str
+    phrase: str
+    tone: str
+    colour: str
+    marker: str
+    filled: bool
+    advice: tuple[str, ...]
 
 
-def _times(ratio: float) -> str:
-    """A ratio in two decimals, or where those mean nothing, in three digits."""
-    return f"{ratio:.2f}" if ratio < 100 else f"{ratio:.3g}"
+class Verdict(StrEnum):
+    """What a search ended with; the values are those of the JSON."""
+
+    FOUND = (
+        "found",
+        Presentation(
+            "Found: the model explains the recording",
+            "explained by what was found",
+            "good",
+            FINAL,
+            "o",
+            True,
+            (
+                "Use the final model: in Python it is result.model, and its method "
+                "simulate(recording) runs it on any recording of this machine.",
+                "Check it on a recording with another input; an effect that is real keeps its parameters.",
+            ),
+        ),
+    )
+    NOTHING_MISSING = (
+        "nothing_missing",
+        Presentation(
+            "Nothing is missing",
+            "with nothing missing",
+            "good",
+            INK,
+            "D",
+            True,
+            (
+                "Keep the model: on these recordings no effect makes it better.",
+                "Before trusting it elsewhere, record the speeds and voltages you will use and repeat.",
+            ),
+        ),
+    )
+    AMBIGUOUS = (
+        "ambiguous",
+        Presentation(
+            "Found, but not distinguished from others",
+            "explained, by effects that are not distinguished from others",
+            "warn",
+            FURTHER[0],
+            "s",
+            False,
+            (
+                "To distinguish {effect} from {rivals}, record once more with another kind of input (slow "
+                "reversals, larger strokes, faster steps) and give both recordings.",
+                "Until then the final model simulates well, whichever of them is the cause.",
+            ),
+        ),
+    )
+    UNEXPLAINED = (
+        "unexplained",
+        Presentation(
+            "Something remains unexplained",
+            "with something left unexplained",
+            "bad",
+            BASELINE,
+            "^",
+            True,
+            (
+                "Look at the missing torque below, and at the places where the model still fails: the shape "
+                "over speed, position and voltage says what kind of effect to think of.",
+                "Check the recording (sampling, scaling, sensor range) and the constants that are "
+                "held, then try an effect of your own: one small class joins the search.",
+            ),
+        ),
+    )
+    NOT_EXCITED = (
+        "not_excited",
+        Presentation(
+            "The recording could not have shown it",
+            "that could not have shown anything",
+            "warn",
+            MUTED,
+            "x",
+            True,
+            (
+                "Record again with more motion: both directions, many reversals, small and large "
+                "voltages, the whole range of deflection.",
+            ),
+        ),
+    )
+
+    shown: Presentation
+
+    def __new__(cls, value: str, shown: Presentation) -> "Verdict":
+        """A string of this value that knows how it is shown."""
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.shown = shown
+        return member
+
+    @property
+    def label(self) -> str:
+        """The verdict in words, such as "not excited"."""
+        return self.value.replace("_", " ")
+
+    def next_steps(self, ambiguous: Sequence[tuple[str, str]], hidden: int, candidates: int) -> list[str]:
+        """What to do now, in plain words.
+
+        Args:
+            ambiguous: Effects that were found, each with those that cannot be distinguished from it.
+            hidden: How many candidates the recordings do not excite.
+            candidates: How many there were.
+        """
+        steps = []
+        for text in self.shown.advice:
+            pairs = ambiguous if "{effect}" in text else [("", "")]
+            steps += [text.format(effect=effect, rivals=rivals) for effect, rivals in pairs]
+        if hidden and self is not Verdict.NOT_EXCITED:
+            steps.append(
+                f"{hidden} of {candidates} candidates could not have shown here; "
+                "a recording with more motion would decide on them, too."
+            )
+        return steps

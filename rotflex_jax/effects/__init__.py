@@ -1,24 +1,13 @@
-"""Physical effects. One file holds one effect or a close family; each is entered by `register`.
+"""Physical effects. One module holds a family of effects; each is entered in the catalogue by `register`.
 
-To add one, derive a frozen dataclass from a kind (`kinds.py`), decorate it with `register`, and
+To add one, derive a frozen dataclass from a kind (`base.py`), decorate it with `register`, and
 import it here.
 """
 
-from rotflex_jax.effects.backlash import Backlash
-from rotflex_jax.effects.bouc_wen import BoucWen
-from rotflex_jax.effects.catalogue import CATALOG, register
-from rotflex_jax.effects.cogging import Cogging
-from rotflex_jax.effects.coulomb import Coulomb, CoulombAsymmetric
-from rotflex_jax.effects.cubic_spring import CubicSpring
-from rotflex_jax.effects.current_drive import CurrentDrive
-from rotflex_jax.effects.dahl import Dahl
-from rotflex_jax.effects.dead_zone import DeadZone
-from rotflex_jax.effects.delay import Delay
-from rotflex_jax.effects.gravity import Gravity
-from rotflex_jax.effects.heating import Heating
-from rotflex_jax.effects.inertia import Inertia
-from rotflex_jax.effects.joint_play import JointPlay
-from rotflex_jax.effects.kinds import (
+from rotflex_jax.effects.actuation import DeadZone, Delay, Lag, Saturation, VoltageDrift, VoltageOffset
+from rotflex_jax.effects.angle import Cogging, Gravity
+from rotflex_jax.effects.base import (
+    CATALOG,
     Actuation,
     Drive,
     DryFriction,
@@ -31,25 +20,17 @@ from rotflex_jax.effects.kinds import (
     Scale,
     Sensing,
     Stamp,
+    register,
 )
-from rotflex_jax.effects.lag import Lag
+from rotflex_jax.effects.damping import QuadraticDrag, Viscous, ViscousAsymmetric
+from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, Stribeck
+from rotflex_jax.effects.gear import Backlash
+from rotflex_jax.effects.hysteresis import BoucWen, Dahl, LuGre
+from rotflex_jax.effects.inertia import Inertia, SecondMode
 from rotflex_jax.effects.learned import LearnedTorque
-from rotflex_jax.effects.lugre import LuGre
-from rotflex_jax.effects.motor import Motor
-from rotflex_jax.effects.quadratic_drag import QuadraticDrag
-from rotflex_jax.effects.quadratic_spring import QuadraticSpring
-from rotflex_jax.effects.rectifier import Rectifier
-from rotflex_jax.effects.saturation import Saturation
-from rotflex_jax.effects.second_mode import SecondMode
-from rotflex_jax.effects.sensor_bias import SensorBias
-from rotflex_jax.effects.sensor_cubic import SensorCubic
-from rotflex_jax.effects.sensor_gain import SensorGain
-from rotflex_jax.effects.spring import Spring
-from rotflex_jax.effects.stribeck import Stribeck
-from rotflex_jax.effects.viscous import Viscous
-from rotflex_jax.effects.viscous_asymmetric import ViscousAsymmetric
-from rotflex_jax.effects.voltage_drift import VoltageDrift
-from rotflex_jax.effects.voltage_offset import VoltageOffset
+from rotflex_jax.effects.motor import CurrentDrive, Heating, Motor
+from rotflex_jax.effects.sensors import Rectifier, SensorBias, SensorCubic, SensorGain
+from rotflex_jax.effects.springs import CubicSpring, JointPlay, QuadraticSpring, Spring
 
 __all__ = [
     # kinds, from which an effect of your own derives

@@ -1,10 +1,10 @@
-"""A moment of inertia."""
+"""Inertia: a moment of inertia, and a part with a mode of vibration of its own."""
 
 import dataclasses
+import math
 from typing import ClassVar
 
-from rotflex_jax.effects.catalogue import register
-from rotflex_jax.effects.kinds import Linear, Probe, Scale, Stamp
+from rotflex_jax.effects.base import Linear, Probe, Scale, Stamp, register
 from rotflex_jax.parameters import parameter
 
 
@@ -15,7 +15,7 @@ class Inertia(Linear):
 
         T = 1/2 inertia speed^2
 
-    Not for a mass whose leverage changes with the position: the inertia is constant.
+    Not for a mass whose lever arm changes with the position: the inertia is constant.
 
     Args:
         at: Port.
@@ -44,3 +44,73 @@ class Inertia(Linear):
     def sentence(self) -> str:
         """In words."""
         return f"the {self.at} carries a moment of inertia of {self.inertia:.3g} kg m^2"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class SecondMode(Linear):
+    """An inertia on a spring at the port: one more mode, such as the first bending mode of an arm.
+
+        r'' + 2 damping W (r' - p.dq) + W^2 (r - p.q) = 0,    W = 2 pi frequency
+        tau = -inertia r''
+
+    Not where the frequency lies above what the input excites: the part moves with the port there,
+    and its inertia is only added to the port's.
+
+    Args:
+        at: Port.
+        inertia: Of the part [kg m^2].
+        frequency: Of the part while the port is held [Hz].
+        damping: Damping ratio of the part.
+
+    Source: J. P. Den Hartog, Mechanical Vibrations, 4th ed., 1956, section 3.2.
+    """
+
+    name: ClassVar[str] = "second_mode"
+    title: ClassVar[str] = "one more mode of vibration"
+    equation: ClassVar[str] = (
+        "r'' + 2 * damping * W * (r' - speed) + W**2 * (r - position) = 0, W = 2 * pi * frequency, "
+        "tau = -inertia * r''"
+    )
+    amplitudes: ClassVar[tuple[str, ...]] = ("inertia",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "arm")
+
+    inertia: float = parameter(5e-4, unit="kg m^2", lower=0.0, meaning="inertia of the part")
+    frequency: float = parameter(15.0, unit="Hz", lower=1e-3, meaning="frequency while the port is held")
+    damping: float = parameter(0.03, unit="", lower=0.0, meaning="damping ratio")
+
+    @property
+    def order(self) -> int:
+        """Two states: the part's angle from the port, and its own speed."""
+        return 2
+
+    def stamp(self) -> Stamp:
+        """Entries of the equations of motion."""
+        W = 2 * math.pi * self.frequency
+        square, loss = W * W, 2 * self.damping * W
+        return Stamp(
+            damping=self.inertia * loss,
+            own=((0.0, 1.0), (-square, -loss)),
+            from_speed=(-1.0, loss),
+            from_voltage=(0.0, 0.0),
+            torque=(self.inertia * square, self.inertia * loss),
+        )
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction at each of several frequencies."""
+        return (
+            [
+                [{"inertia": 0.05 * scale.inertia, "frequency": f, "damping": 0.05}]
+                for f in (8.0, 11.0, 15.0, 20.0, 27.0)
+            ]
+            if scale.inertia
+            else []
+        )
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"a part of {self.inertia:.3g} kg m^2 at the {self.at} swings on its own at "
+            f"{self.frequency:.3g} Hz with a damping ratio of {self.damping:.2g}"
+        )

@@ -2,19 +2,20 @@
 
 import dataclasses
 import math
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Real
 
-from rotflex_jax.effects.kinds import Force, Scalar
+from rotflex_jax.effects.base import Force, Scalar
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import Specification
-from rotflex_jax.precision import double_precision
+from rotflex_jax.runtime.xla import double_precision
 
-# A cubic B-spline reaches over this many intervals.
-REACH = 4
+SPLINE_SUPPORT = 4
+"""Intervals over which a cubic B-spline is not zero."""
+LearnedType = TypeVar("LearnedType", bound="LearnedTorque")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,20 +24,20 @@ class LearnedTorque(Force):
 
         tau = sum_ij w_ij b_i(position) b_j(asinh(speed / bend))
 
-    The speed is bent so that the splines are dense where friction turns round and wide where it hardly
-    changes. Outside of its ranges the map stays what it is at their end. Splines of one axis add up to one.
+    The speed is transformed so that the splines are dense where friction changes sign and wide
+    elsewhere. Outside of its ranges the map is constant. The splines of one axis add up to one.
 
-    A law with a formula says more with fewer numbers: use this where no effect of the catalogue explains
-    what is seen, and read it (`rf.learn_torque`). Not for a torque that depends on time or on the past, and
-    not for friction that holds a resting port: the map is smooth, so it lets it creep.
+    An effect with a formula has fewer parameters: use this where no effect of the catalogue explains the
+    recording, and interpret it (`rf.learn_torque`). Not for a torque that depends on time or on the past, and
+    not for friction that holds a port at rest: the map is smooth, so the port creeps.
 
     Args:
         at: Port.
         position: Range of positions [rad].
         speed: Range of speeds [rad/s].
-        bend: Speed up to which the map is even [rad/s].
+        bend: Speed below which the transformation is linear [rad/s].
         count: Splines along position and speed; 1 for no dependence, otherwise 4 or more.
-        scale: Size that weights may have [N m]; steps of a fit are measured by it.
+        scale: Typical size of the weights [N m], the scale of a fit's steps.
         weights: Torques [N m], position by position; zero if none are given.
 
     Source: C. de Boor, A Practical Guide to Splines, 1978, chapter 9; P. Eilers and B. Marx, Statist. Sci.
@@ -65,10 +66,11 @@ class LearnedTorque(Force):
                     f"LearnedTorque was given {axis}={(low, high)}, but it needs a range; give the lower "
                     "end first."
                 )
-        if not all(c == 1 or c >= REACH for c in self.count) or not (self.bend > 0 < self.scale):
+        if not all(c == 1 or c >= SPLINE_SUPPORT for c in self.count) or not (self.bend > 0 < self.scale):
             raise InputError(
                 f"LearnedTorque was given count={self.count}, bend={self.bend} and scale={self.scale}, but "
-                f"it needs 1 or at least {REACH} splines along each axis and positive sizes; correct them."
+                f"it needs 1 or at least {SPLINE_SUPPORT} splines along each axis and positive sizes; "
+                "correct them."
             )
         size = self.count[0] * self.count[1]
         if not self.weights:
@@ -89,7 +91,7 @@ class LearnedTorque(Force):
         weight = Specification(unit="N m", typical=self.scale, meaning="torque at a spline")
         return dict.fromkeys(self.values, weight)
 
-    def replace(self, **values: Any) -> Self:
+    def replace(self: LearnedType, **values: Any) -> LearnedType:
         """The same map with other weights, by name or as a whole."""
         weights = list(values.pop("weights", self.weights))
         for name in [n for n in values if n[:1] == "w" and n[1:].isdigit()]:
@@ -103,27 +105,29 @@ class LearnedTorque(Force):
         wide = weights.reshape(self.count + (1,) * jnp.ndim(across[0]))
         return jnp.sum(along * jnp.sum(wide * across[None], axis=1), axis=0)
 
-    def splines(self, position: Any, speed: Any) -> tuple[jax.Array, jax.Array]:
-        """Values of the splines along position (I, ...) and along speed (J, ...)."""
+    def splines(self, position: Scalar, speed: Scalar) -> tuple[Float[Array, "I ..."], Float[Array, "J ..."]]:
+        """Values of the splines along position and along speed."""
         low, high = (math.asinh(s / self.bend) for s in self.speed)
         return (
             _splines(position, *self.position, self.count[0]),
             _splines(jnp.arcsinh(speed / self.bend), low, high, self.count[1]),
         )
 
-    def design(self, position: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """What each weight is multiplied by (N, W)."""
+    def design(
+        self, position: Real[np.ndarray, " N"], speed: Real[np.ndarray, " N"]
+    ) -> Float[np.ndarray, "N W"]:
+        """Regressors of the weights."""
         with double_precision():
             along, across = self.splines(jnp.asarray(position, float), jnp.asarray(speed, float))
             return np.asarray(jnp.einsum("ik,jk->kij", along, across)).reshape(len(position), -1)
 
 
-def _splines(x: Any, low: float, high: float, count: int) -> jax.Array:
+def _splines(x: Any, low: float, high: float, count: int) -> Array:
     """Cubic B-splines (count, ...) on equal intervals, constant beyond the ends."""
     x = jnp.asarray(x)
     if count == 1:
         return jnp.ones((1, *x.shape), x.dtype)
-    s = jnp.clip((x - low) / (high - low), 0.0, 1.0) * (count - REACH + 1)
+    s = jnp.clip((x - low) / (high - low), 0.0, 1.0) * (count - SPLINE_SUPPORT + 1)
     middles = jnp.arange(-1, count - 1, dtype=x.dtype)
     a = jnp.abs(s[None] - middles.reshape((-1,) + (1,) * x.ndim))
     near, far = jnp.maximum(1 - a, 0.0), jnp.maximum(2 - a, 0.0)

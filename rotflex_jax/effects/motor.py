@@ -1,11 +1,10 @@
-"""The direct-current motor with its gear."""
+"""The motor: driven by voltage or by current, and its heating."""
 
 import dataclasses
 import math
 from typing import ClassVar
 
-from rotflex_jax.effects.catalogue import register
-from rotflex_jax.effects.kinds import Linear, Probe, Scale, Stamp
+from rotflex_jax.effects.base import Drive, Linear, Memory, Probe, Scalar, Scale, Stamp, register
 from rotflex_jax.parameters import parameter
 
 
@@ -71,11 +70,6 @@ class Motor(Linear):
             torque=(gain,),
         )
 
-    @classmethod
-    def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """None: a recording with a voltage has its motor in the model from the start."""
-        return []
-
     def sentence(self) -> str:
         """In words."""
         gain = self.efficiency * self.torque_constant * self.gear_ratio / self.resistance
@@ -83,4 +77,93 @@ class Motor(Linear):
         return (
             f"the motor gives the {self.at} {gain:.3g} N m per volt at rest and runs free at "
             f"{speed:.3g} rad/s per volt"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class CurrentDrive(Linear):
+    """A motor on a current amplifier: torque in proportion to the command, without back-EMF.
+
+        tau = gain v
+
+    Not for a motor on a voltage amplifier, whose back-EMF brakes it: `Motor`.
+
+    Args:
+        at: Port it drives.
+        gain: Torque per command [N m/V].
+
+    Source: M. W. Spong, S. Hutchinson and M. Vidyasagar, Robot Modeling and Control, 2006, section 6.1.
+    """
+
+    name: ClassVar[str] = "current_drive"
+    title: ClassVar[str] = "motor on a current amplifier"
+    equation: ClassVar[str] = "tau = gain * v"
+    amplitudes: ClassVar[tuple[str, ...]] = ("gain",)
+    motor: ClassVar[bool] = True
+
+    at: str = "hub"
+    gain: float = parameter(0.1, unit="N m/V", lower=0.0, meaning="torque per command")
+
+    def stamp(self) -> Stamp:
+        """Entries of the equations of motion."""
+        return Stamp(drive=self.gain)
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the drive gives the {self.at} {self.gain:.3g} N m/V"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Heating(Memory):
+    """The armature's resistance rises with its own heat: R becomes R (1 + rate z).
+
+        dz/dt = m^2 / (1 + rate z) - z / time,    tau = -rate z / (1 + rate z) m
+
+    `m` is the torque of the cold motor at this port, so `tau` is the lost torque and the heat is that of
+    the current. Not for a recording that is short against `time` and evenly driven:
+    the loss is then equivalent to a lower torque constant.
+
+    Args:
+        at: Port of the motor.
+        rate: Relative rise of the resistance per second and squared torque [1/((N m)^2 s)].
+        time: Time constant of cooling [s].
+
+    Source: First-order thermal model of an armature; J. F. Gieras, Permanent Magnet Motor
+    Technology, 3rd ed., 2010, section 8.4.
+    """
+
+    name: ClassVar[str] = "heating"
+    title: ClassVar[str] = "motor that warms up"
+    equation: ClassVar[str] = (
+        "dz/dt = m**2 / (1 + rate * z) - z / time, tau = -rate * z / (1 + rate * z) * m, "
+        "m torque of the cold motor"
+    )
+    ports: ClassVar[tuple[str, ...]] = ("hub",)
+    amplitudes: ClassVar[tuple[str, ...]] = ("rate",)
+    driven_by: ClassVar[Drive] = "motor"
+    searched: ClassVar[tuple[str, ...]] = ("hub",)
+
+    rate: float = parameter(0.5, unit="1/((N m)^2 s)", lower=0.0, meaning="rise of the resistance by heat")
+    time: float = parameter(30.0, unit="s", lower=1e-2, meaning="time constant of cooling")
+
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the state [(N m)^2]."""
+        return drive * drive / (1 + self.rate * z) - z / self.time
+
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        return -self.rate * z / (1 + self.rate * z) * drive
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction at each of two times of cooling."""
+        return [[{"rate": 0.01 / scale.torque**2, "time": time}] for time in (10.0, 100.0)]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the motor at the {self.at} warms up: its resistance rises by {self.rate:.3g} per second and "
+            f"(N m)^2 of torque, and cools with a time constant of {self.time:.3g} s"
         )

@@ -1,28 +1,34 @@
-"""The next experiment for two effects that a recording cannot tell apart: rank, then improve."""
+"""The next experiment for two effects that a recording cannot distinguish: rank inputs, then optimise."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from rotflex_jax.effects.kinds import Effect
+from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment.ascent import LOOKS, improved
-from rotflex_jax.experiment.contest import Contest, Meeting, other_shapes
-from rotflex_jax.experiment.hypotheses import Hypothesis, hypothesis, place_of
-from rotflex_jax.experiment.imitation import best_imitation, truth
-from rotflex_jax.experiment.limits import Limits
-from rotflex_jax.experiment.menu import SHARES, Standard, standard_inputs
+from rotflex_jax.experiment.discrimination import (
+    Discrimination,
+    DiscriminationProblem,
+    starts_with_other_shapes,
+)
+from rotflex_jax.experiment.input_optimisation import MAX_EVALUATIONS, optimise_input
 from rotflex_jax.experiment.result import Experiment, Rated
-from rotflex_jax.fit.fitted import Fit
+from rotflex_jax.experiment.rival_fit import best_rival_fit, free_run_from_rest
+from rotflex_jax.experiment.rival_model import RivalModel, effect_location, rival_model
+from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs
+from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 
 Progress = Callable[[str], None]
 
-# One period of a design [s], and the share by which a number that no fit has given an interval is doubted.
-PERIOD, DOUBT = 4.0, 0.05
+# One period of a design [s].
+DESIGN_PERIOD = 4.0
+# Uncertainty of a parameter without a standard deviation from a fit, as a share of its value.
+DEFAULT_UNCERTAINTY = 0.05
 
 
 def next_experiment(
@@ -35,41 +41,40 @@ def next_experiment(
     Ts: float = 0.002,
     noise: Mapping[str, float] | None = None,
     process_noise: Mapping[str, float] | None = None,
-    reference: np.ndarray | None = None,
+    reference: Float[np.ndarray, " N"] | None = None,
     improve: bool = True,
     starts: int = 2,
-    looks: int = LOOKS,
+    looks: int = MAX_EVALUATIONS,
     progress: Progress | None = None,
 ) -> Experiment:
-    """The input that best tells two effects apart, within what the machine bears.
+    """The input that best distinguishes two effects, within the limits of the machine.
 
         maximise over u   min over (A true, B true)  min over n  1/2 sum_k |L (y_k(u) - y_hat_k(u; n))|^2
 
-    `y` is the run of the machine with one effect, `y_hat` the prediction by the machine with the other, at
-    its best over all that a new recording leaves open (n): the rival's numbers, every free parameter, first
-    state, offset, bias. Half the sum is the log-likelihood by which the truth is expected to win [nat]. The
-    standard inputs are ranked; the best are then improved along the slope through both simulations.
+    `y` is the run of the model with one effect, `y_hat` the prediction by the model with the other, fitted
+    to it over all that a new recording leaves open (n): the rival's parameters, every free parameter, first
+    state, offset, bias. Half the sum is the log-likelihood by which the true model is expected to win [nat].
+    The standard inputs are ranked; the best are then optimised by the gradient through both simulations.
 
-    Not where the fitted model is far from the machine: the design rests on its prediction of small
-    differences, at frequencies that the recording may not have held. Compare with the standard inputs in
-    `table`, which ask less of the model.
+    Not where the fitted model is far from the machine: the design relies on its prediction of small
+    differences, at frequencies that the recording may not contain. Compare with the standard inputs in
+    `table`, which demand less of the model.
 
     Args:
         model: Fitted model, with one of the effects or with neither; a `Fit` brings noise and intervals.
-        a: The first effect: "delay@input", ("delay", "input") or an effect with its numbers. An effect that
-            is in the model has the model's numbers; one that is only named, those with which it imitates
-            the other under `reference`; if both are only named, the first has the catalogue's.
+        a: The first effect: "delay@input", ("delay", "input") or an effect with its parameters. An effect
+            that is in the model has the model's parameters; one that is only named is fitted to the other
+            under `reference`; if both are only named, the first has the catalogue's parameters.
         b: The second effect.
-        limits: What the machine may be asked for.
+        limits: Limits of the machine.
         seconds: Length of the experiment [s].
         Ts: Sampling period [s].
-        noise: Channel -> deviation of the sensor noise.
-        process_noise: Port -> intensity of the process torque that the fit asked for [(N m)^2 s]; None for
-            a free run.
-        reference: Voltage of the recording in which the two look alike (N,) [V]; noise if None.
-        improve: Whether to improve the best standard inputs, or only to rank them.
-        starts: Standard inputs to improve.
-        looks: Evaluations of each climb at most.
+        noise: Channel -> standard deviation of the sensor noise.
+        process_noise: Port -> intensity of the process torque in the fit [(N m)^2 s]; None for a free run.
+        reference: Voltage of the recording that does not distinguish the two [V]; noise if None.
+        improve: Whether to optimise the best standard inputs, or only to rank them.
+        starts: Standard inputs to optimise.
+        looks: Evaluations of each optimisation at most.
         progress: Called with a line of text now and then.
 
     Returns:
@@ -84,8 +89,8 @@ def next_experiment(
     fitted = (
         Model(model) if isinstance(model, Mechanism) else model.model if isinstance(model, Fit) else model
     )
-    N, P = lengths(seconds, Ts)
-    sd = _deviations(fitted, model, noise)
+    N, P = sample_counts(seconds, Ts)
+    sd = _noise_std(fitted, model, noise)
     for port in process_noise or {}:
         if port not in fitted.mechanism.port_vectors:
             raise InputError(
@@ -93,43 +98,43 @@ def next_experiment(
                 f"{', '.join(fitted.mechanism.port_vectors)}; name one of these."
             )
     say("fitting each effect to the other")
-    pair = _rivals(fitted, a, b, dict(process_noise or {}), sd, Ts, reference, limits)
-    contest = Contest(pair, Ts, limits, _doubts(model, pair[0]))
-    listed = []
+    pair = _rival_pair(fitted, a, b, dict(process_noise or {}), sd, Ts, reference, limits)
+    problem = DiscriminationProblem(pair, Ts, limits, _parameter_variations(model, pair[0]))
+    ranked = []
     offered = standard_inputs(N, Ts, limits)
     for k, s in enumerate(offered):
         say(f"ranking standard inputs: {k + 1} of {len(offered)}")
-        listed.append(_rated(contest, s))
-    contest = contest.visible([m for *_, m in listed])
-    listed = [_counted(contest, *row) for row in listed]
-    listed.sort(key=lambda r: -r[0].nats)
-    for rated, u, _ in listed[:2]:
-        for share in SHARES:
-            listed.append(_rated(contest, Standard(rated.input, f"{rated.setting}, x {share:g}", share * u)))
-    listed.sort(key=lambda r: -r[0].nats)
+        ranked.append(_rate_input(problem, s))
+    problem = problem.without_nested_direction([result for *_, result in ranked])
+    ranked = [_count_directions(problem, *row) for row in ranked]
+    ranked.sort(key=_evidence, reverse=True)
+    for rated, u, _ in ranked[:2]:
+        for share in REDUCED_AMPLITUDES:
+            reduced = StandardInput(rated.input, f"{rated.setting}, x {share:g}", share * u)
+            ranked.append(_rate_input(problem, reduced))
+    ranked.sort(key=_evidence, reverse=True)
     count = max(1, round(N / P))
     designs = []
-    for k, (rated, u, _) in enumerate(listed[:starts] if improve else []):
+    for k, (rated, u, _) in enumerate(ranked[:starts] if improve else []):
         say(f"improving {rated.input}, {rated.setting} ({k + 1} of {starts})")
-        period = improved(contest, u[:P], looks, say)
+        period = optimise_input(problem, u[:P], looks, say)
         whole = limits.playable(np.tile(period, count + 1)[:N], Ts)
-        designs.append(
-            _rated(contest, Standard("design", f"from {rated.input}, {rated.setting}", whole), True)
-        )
-    every = sorted([*designs, *listed], key=lambda r: -r[0].nats)
-    chosen, u, meeting = every[0]
-    left = np.array([i.remainder for i in meeting.imitations])
-    L = np.array([np.linalg.inv(h.L) for h in (pair[1], pair[0])])
+        design = StandardInput("design", f"from {rated.input}, {rated.setting}", whole)
+        designs.append(_rate_input(problem, design, thorough=True))
+    table = sorted([*designs, *ranked], key=_evidence, reverse=True)
+    chosen, u, result = table[0]
+    whitened = np.array([fit.residuals for fit in result.rival_fits])
+    L = np.array([np.linalg.inv(rival.L) for rival in (pair[1], pair[0])])
     return Experiment(
         separates=(pair[0].label, pair[1].label),
         chosen=chosen,
         u=u,
         Ts=Ts,
         period=P * Ts if chosen.input == "design" else N * Ts,
-        table=tuple(r for r, _, _ in every),
-        numbers={h.label: {n: float(v) for n, v in h.effect().values.items()} for h in pair},
-        outputs=meeting.outputs,
-        differences=np.einsum("knc,kdc->knd", left, L),
+        table=tuple(rated for rated, _, _ in table),
+        numbers={model.label: {n: float(v) for n, v in model.effect().values.items()} for model in pair},
+        outputs=result.outputs,
+        differences=np.einsum("knc,kdc->knd", whitened, L),
         channels=fitted.mechanism.channels,
         noise=dict(zip(fitted.mechanism.channels, sd.tolist(), strict=True)),
         limits=limits,
@@ -138,35 +143,49 @@ def next_experiment(
 
 
 def _notes(model: Fit | Model | Mechanism, chosen: Rated) -> tuple[str, ...]:
-    """Reasons to doubt the promise."""
-    out = []
+    """Reasons to doubt the expected evidence."""
+    notes = []
     if isinstance(model, Fit) and model.status != "converged":
-        out.append(
-            f"The fit that this rests on has not converged ({model.status}): do not trust the promise."
+        notes.append(
+            f"The fit that this rests on has not converged ({model.status}): "
+            "do not trust the expected evidence."
         )
     if not chosen.settled:
-        out.append("An imitation by the rival has not converged; the promise is its first-order estimate.")
-    return tuple(out)
+        notes.append(
+            "A fit of the rival has not converged; the expected evidence is its first-order estimate."
+        )
+    return tuple(notes)
 
 
-def _rated(c: Contest, s: Standard, thorough: bool = False) -> tuple[Rated, np.ndarray, Meeting]:
-    """An input within all limits, what it is worth, and the meeting under it."""
-    u = c.within(s.u)
-    m = c.meet(u, thorough=thorough)
-    peaks = dict(zip(c.pair[0].mechanism.channels, c.peaks(u).tolist(), strict=True))
-    slew = float(np.max(np.abs(np.diff(u, prepend=0.0)))) / c.Ts
-    each = (m.imitations[0].nats, m.imitations[1].nats)
-    settled = all(i.converged for i in m.imitations)
-    return Rated(s.kind, s.setting, m.nats, each, float(np.max(np.abs(u))), slew, peaks, settled), u, m
+# An input with its rating and its result, as they are ranked.
+_RatedInput = tuple[Rated, np.ndarray, Discrimination]
 
 
-def _counted(c: Contest, rated: Rated, u: np.ndarray, m: Meeting) -> tuple[Rated, np.ndarray, Meeting]:
+def _evidence(row: _RatedInput) -> float:
+    return row[0].nats
+
+
+def _rate_input(problem: DiscriminationProblem, s: StandardInput, thorough: bool = False) -> _RatedInput:
+    """An input within all limits, its evidence, and the result under it."""
+    u = problem.scaled_to_limits(s.u)
+    result = problem.evaluate(u, thorough=thorough)
+    peaks = dict(zip(problem.pair[0].mechanism.channels, problem.peaks(u).tolist(), strict=True))
+    slew = float(np.max(np.abs(np.diff(u, prepend=0.0)))) / problem.Ts
+    each = (result.rival_fits[0].nats, result.rival_fits[1].nats)
+    settled = all(fit.converged for fit in result.rival_fits)
+    rated = Rated(s.kind, s.setting, result.nats, each, float(np.max(np.abs(u))), slew, peaks, settled)
+    return rated, u, result
+
+
+def _count_directions(
+    problem: DiscriminationProblem, rated: Rated, u: np.ndarray, result: Discrimination
+) -> _RatedInput:
     """The same with only the directions that count."""
-    m = dataclasses.replace(m, counted=c.counted)
-    return dataclasses.replace(rated, nats=m.nats), u, m
+    result = dataclasses.replace(result, counted=problem.counted)
+    return dataclasses.replace(rated, nats=result.nats), u, result
 
 
-def _rivals(
+def _rival_pair(
     model: Model,
     a: Any,
     b: Any,
@@ -175,39 +194,40 @@ def _rivals(
     Ts: float,
     reference: np.ndarray | None,
     limits: Limits,
-) -> tuple[Hypothesis, Hypothesis]:
-    """Both hypotheses, the one whose numbers are not known fitted to the other."""
-    places = place_of(a), place_of(b)
-    if places[0] == places[1]:
+) -> tuple[RivalModel, RivalModel]:
+    """Both rival models; the one whose effect has no known parameters is fitted to the other."""
+    locations = effect_location(a), effect_location(b)
+    if locations[0] == locations[1]:
         raise InputError(
-            f"Both effects were given as {'@'.join(places[0])}, but two different ones are to be told apart; "
-            "change one of them."
+            f"Both effects were given as {'@'.join(locations[0])}, but two different ones are to be "
+            "distinguished; change one of them."
         )
-    made = [
-        hypothesis(model, e, other, process_noise, noise, Ts) for e, other in ((a, places[1]), (b, places[0]))
+    pair = [
+        rival_model(model, effect, other, process_noise, noise, Ts)
+        for effect, other in ((a, locations[1]), (b, locations[0]))
     ]
     present = {(e.name, e.at) for e in model.mechanism.effects}
-    known = [isinstance(e, Effect) or p in present for e, p in zip((a, b), places, strict=True)]
+    known = [isinstance(e, Effect) or p in present for e, p in zip((a, b), locations, strict=True)]
     true, rival = (1, 0) if known[1] and not known[0] else (0, 1)
     if reference is None:
-        quiet = [s for s in standard_inputs(round(8.0 / Ts), Ts, limits) if s.kind == "noise"][1]
-        reference = Contest((made[0], made[1]), Ts, limits).within(quiet.u)
+        second_noise = [s for s in standard_inputs(round(8.0 / Ts), Ts, limits) if s.kind == "noise"][1]
+        reference = DiscriminationProblem((pair[0], pair[1]), Ts, limits).scaled_to_limits(second_noise.u)
     u = np.asarray(reference, float)
-    h = made[rival]
-    own = f"{places[rival][1]}.{places[rival][0]}."
+    fitted = pair[rival]
+    prefix = f"{locations[rival][1]}.{locations[rival][0]}."
     if known[rival]:
-        held = {i for i, n in enumerate(h.mechanism.parameter_names) if n.startswith(own)}
-        h = dataclasses.replace(h, moved=tuple(i for i in h.moved if i not in held))
-    y = truth(made[true], u, Ts)
-    best = best_imitation(h, u, y, Ts, [h.start, *other_shapes(h)])
-    fitted = h.with_numbers(best.numbers).mechanism
+        held = {i for i, n in enumerate(fitted.mechanism.parameter_names) if n.startswith(prefix)}
+        fitted = dataclasses.replace(fitted, free=tuple(i for i in fitted.free if i not in held))
+    y = free_run_from_rest(pair[true], u, Ts)
+    best = best_rival_fit(fitted, u, y, Ts, [fitted.start, *starts_with_other_shapes(fitted)])
+    mechanism = fitted.with_unknowns(best.unknowns).mechanism
     # Offset and bias belong to a recording: the next one has its own.
-    fitted = fitted.with_values(dict.fromkeys(h.calibrations, 0.0))
-    made[rival] = dataclasses.replace(made[rival], mechanism=fitted)
-    return made[0], made[1]
+    mechanism = mechanism.with_values(dict.fromkeys(fitted.calibrations, 0.0))
+    pair[rival] = dataclasses.replace(pair[rival], mechanism=mechanism)
+    return pair[0], pair[1]
 
 
-def lengths(seconds: float, Ts: float) -> tuple[int, int]:
+def sample_counts(seconds: float, Ts: float) -> tuple[int, int]:
     """Samples of the experiment and of one period."""
     if not (0 < Ts < 0.5 and seconds / Ts >= 200):
         raise InputError(
@@ -215,32 +235,32 @@ def lengths(seconds: float, Ts: float) -> tuple[int, int]:
             "least 200 samples; give for instance seconds=20, Ts=0.002."
         )
     N = round(seconds / Ts)
-    return N, min(N, round(PERIOD / Ts))
+    return N, min(N, round(DESIGN_PERIOD / Ts))
 
 
-def _deviations(model: Model, given: Any, noise: Mapping[str, float] | None) -> np.ndarray:
-    """Sensor noise per channel."""
+def _noise_std(model: Model, given: Any, noise: Mapping[str, float] | None) -> np.ndarray:
+    """Standard deviation of the sensor noise per channel (C,)."""
     channels = model.mechanism.channels
     known = given.noise if noise is None and isinstance(given, Fit) else noise
     if known is None or set(known) != set(channels) or not all(v > 0 for v in known.values()):
         raise InputError(
             f"The sensor noise was given as {known}, but every channel ({', '.join(channels)}) needs a "
-            "positive deviation; give noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
+            "positive standard deviation; give noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
         )
     return np.array([float(known[c]) for c in channels])
 
 
-def _doubts(model: Fit | Model | Mechanism, h: Hypothesis) -> list[np.ndarray]:
-    """Values (P,) with one free number of the machine moved by two deviations, or by a fixed share."""
-    names, out = h.mechanism.parameter_names, []
+def _parameter_variations(model: Fit | Model | Mechanism, rival: RivalModel) -> list[np.ndarray]:
+    """Values (P,) with one free parameter changed by two standard deviations, or by a fixed share."""
+    m, variations = rival.mechanism, []
     known = model.parameters if isinstance(model, Fit) else ()
     std = {e.name: float(e.std) for e in known if np.isfinite(e.std)}
-    for i in h.moved:
-        reach = 2 * std[names[i]] if names[i] in std else DOUBT * abs(h.mechanism.values[i])
+    for i in rival.free:
+        name, spec = m.parameter_names[i], m.parameter_specifications[i]
+        reach = 2 * std[name] if name in std else DEFAULT_UNCERTAINTY * abs(m.values[i])
         for step in (-reach, reach):
-            values = h.mechanism.values
-            spec = h.mechanism.parameter_specifications[i]
+            values = m.values
             values[i] = np.clip(values[i] + step, spec.lower, spec.upper)
             if reach > 0:
-                out.append(values)
-    return out
+                variations.append(values)
+    return variations

@@ -1,4 +1,4 @@
-"""The next experiment: what to play, what it will tell, and what the machine will do."""
+"""The next experiment: the input to play, the evidence it is expected to give, and the predicted motion."""
 
 import dataclasses
 import math
@@ -7,24 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment.limits import Limits
+from rotflex_jax.experiment.standard_inputs import Limits
 
 
 @dataclasses.dataclass(frozen=True)
 class Rated:
-    """One input and what it is worth.
+    """One input and the evidence that it is expected to give.
 
     Attributes:
         input: `noise`, `multisine`, `prbs`, `steps`, `sweep`, or `design`.
-        setting: What was chosen for it.
-        nats: Log-likelihood by which the truth is expected to win, whichever of the two it is [nat].
+        setting: Its parameters in words.
+        nats: Log-likelihood by which the true model is expected to win, whichever it is [nat].
         each: The same if the first is true, and if the second is [nat].
         voltage: Peak [V].
         slew: Fastest change [V/s].
         peaks: Channel -> largest predicted |output|.
-        settled: Whether the imitations have converged.
+        settled: Whether the fits of the rival models have converged.
     """
 
     input: str
@@ -43,51 +44,51 @@ class Rated:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """What to record next to tell two effects apart.
+    """What to record next to distinguish two effects.
 
     Attributes:
         separates: The two effects as `name@port`.
-        chosen: The input and what it is worth.
-        u: Voltage (N,) [V], held over each sample.
+        chosen: The input and its expected evidence.
+        u: Voltage [V], held over each sample.
         Ts: Sampling period [s].
         period: Time after which the input repeats [s]; its whole length where it does not.
         table: Standard inputs beside the design, best first.
-        numbers: Effect -> the numbers it was given.
-        outputs: Runs if the first, or the second is true (2, N, C).
-        differences: What the best imitation leaves of each, in units of the outputs (2, N, C).
+        numbers: Effect -> its parameters.
+        outputs: Runs if the first, or the second is true.
+        differences: Residuals of the rival fitted to each run, in units of the outputs.
         channels: Names of the outputs.
-        noise: Channel -> deviation of the sensor noise.
-        limits: What the machine may be asked for.
+        noise: Channel -> standard deviation of the sensor noise.
+        limits: Limits of the machine.
         notes: What a reader must know before playing it.
     """
 
     separates: tuple[str, str]
     chosen: Rated
-    u: np.ndarray
+    u: Float[np.ndarray, " N"]
     Ts: float
     period: float
     table: tuple[Rated, ...]
     numbers: dict[str, dict[str, float]]
-    outputs: np.ndarray
-    differences: np.ndarray
+    outputs: Float[np.ndarray, "2 N C"]
+    differences: Float[np.ndarray, "2 N C"]
     channels: tuple[str, ...]
     noise: dict[str, float]
     limits: Limits
     notes: tuple[str, ...] = ()
 
     @property
-    def t(self) -> np.ndarray:
+    def t(self) -> Float[np.ndarray, " N"]:
         """Time of every sample [s]."""
         return self.Ts * np.arange(len(self.u))
 
     @property
-    def input(self) -> tuple[np.ndarray, np.ndarray]:
+    def input(self) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
         """Voltage [V] and time [s]."""
         return self.u, self.t
 
     @property
     def evidence(self) -> dict[str, float]:
-        """Nats expected in total, and per second of rig time."""
+        """Expected log-likelihood [nat] in total, and per second of the experiment."""
         seconds = len(self.u) * self.Ts
         return {"nats": self.chosen.nats, "nats_per_second": self.chosen.nats / seconds}
 
@@ -97,7 +98,7 @@ class Experiment:
         return next(r for r in self.table if r.input != "design")
 
     def save_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write what to play: a remark with the units, then `t,voltage`.
+        """Write the input: a comment with the units, then `t,voltage`.
 
         Add the measured columns `theta` and `alpha` and `rotflex_jax.load` reads the file.
 
@@ -120,7 +121,7 @@ class Experiment:
 
     def plot(self) -> Any:
         """Figure: input in time, its spectrum, predicted difference of the two against sensor noise."""
-        from rotflex_jax.report.experiment import experiment_figure  # the layer above, on request
+        from rotflex_jax.experiment.figure import experiment_figure  # the layer above, on request
 
         return experiment_figure(self)
 

@@ -1,7 +1,7 @@
-"""A fitted model as C code for a controller: one header, C99, no memory but its own, double precision.
+"""A fitted model as C code for a controller: one header, C99, no dynamic memory, double precision.
 
-Nothing is written twice: the code is unfolded from the same functions that the simulator runs, with all
-numbers of the model computed in beforehand. Effects of a user's own come along by themselves.
+The code is unfolded from the same functions that the simulator runs, with all constants of the model
+evaluated beforehand. Effects that a user defines are included automatically.
 """
 
 import re
@@ -9,18 +9,18 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from rotflex_jax.effects.kinds import Effect
+from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
-from rotflex_jax.export.expression import OPERATIONS, Expression, Scalar, ordered
-from rotflex_jax.export.program import Program, program
+from rotflex_jax.export.expression import OPERATIONS, Expression, Operand, ordered
+from rotflex_jax.export.program import SampleProgram, sample_program
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.mechanism.states import state_names
-from rotflex_jax.model import Model
+from rotflex_jax.mechanism.linear import state_names
+from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
 
-# An expression that is used once is written where it is used, unless the line grows beyond this.
-_LINE = 90
+# Characters: a longer expression gets a variable of its own even if it is used once.
+_LONGEST_EXPRESSION = 90
 
 
 def to_c(model: Model, Ts: float, prefix: str = "rotflex") -> str:
@@ -30,29 +30,28 @@ def to_c(model: Model, Ts: float, prefix: str = "rotflex") -> str:
         rotflex_init(&s);
         for (;;) rotflex_step(&s, u, y);    /* y at the start of the sample over which u is held */
 
-    It gives what `Model.simulate` gives, to rounding. Not for another sampling period: the matrix
-    exponential in it belongs to `Ts`.
+    It agrees with `Model.simulate` to rounding. Not for another sampling period: its matrix exponential
+    holds for `Ts`.
 
     Args:
-        model: Mechanism with its numbers, or a Model.
+        model: Mechanism with its parameter values, or a Model.
         Ts: Sampling period of the controller [s].
-        prefix: What the names in the code begin with.
+        prefix: Prefix of the names in the code.
 
     Returns:
         The text of a header that contains everything; functions are `static`.
 
     Raises:
-        InputError: An effect that has no counterpart in straight code, named; a sampling period or prefix
-            that cannot be.
+        InputError: An effect that C code cannot express, by name; an invalid sampling period or prefix.
     """
     if not (np.isfinite(Ts) and Ts > 0):
         raise InputError(f"Ts was given as {Ts!r}, but C code needs a sampling period in seconds; give one.")
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix):
         raise InputError(f"The prefix {prefix!r} begins no name in C; give letters, digits and underscores.")
-    return "\n".join(_lines(model, float(Ts), prefix, program(model, float(Ts)))) + "\n"
+    return "\n".join(_lines(model, float(Ts), prefix, sample_program(model, float(Ts)))) + "\n"
 
 
-def _number(value: Scalar) -> str:
+def _number(value: Operand) -> str:
     if isinstance(value, bool):
         return "1" if value else "0"
     if np.isnan(value):
@@ -66,7 +65,7 @@ def _number(value: Scalar) -> str:
 class _Printer:
     """Statements for expressions, each written once."""
 
-    def __init__(self, leaf: Callable[[Expression], str], roots: list[Scalar]) -> None:
+    def __init__(self, leaf: Callable[[Expression], str], roots: list[Operand]) -> None:
         self.leaf, self.text, self.count = leaf, {}, 0
         self.uses: dict[Expression, int] = {}
         for e in ordered(roots):
@@ -77,8 +76,8 @@ class _Printer:
             if isinstance(r, Expression):
                 self.uses[r] = self.uses.get(r, 0) + 1
 
-    def statements(self, roots: list[Scalar]) -> Iterator[str]:
-        """What must stand before the roots can be used."""
+    def statements(self, roots: list[Operand]) -> Iterator[str]:
+        """Statements that must precede the use of the roots."""
         for e in ordered(roots):
             if e in self.text:
                 continue
@@ -86,7 +85,7 @@ class _Printer:
                 self.text[e] = self.leaf(e)
                 continue
             text = OPERATIONS[e.op].text.format(*(self(a) for a in e.args))
-            if self.uses.get(e, 0) > 1 or len(text) > _LINE:
+            if self.uses.get(e, 0) > 1 or len(text) > _LONGEST_EXPRESSION:
                 name = f"t{self.count}"
                 self.count += 1
                 kind = "int" if e.truth else "double"
@@ -94,7 +93,7 @@ class _Printer:
                 text = name
             self.text[e] = text
 
-    def __call__(self, value: Scalar) -> str:
+    def __call__(self, value: Operand) -> str:
         return self.text[value] if isinstance(value, Expression) else _number(value)
 
 
@@ -110,7 +109,7 @@ def _bare(text: str) -> str:
     return text[1:-1]
 
 
-def _lines(model: Model, Ts: float, prefix: str, code: Program) -> Iterator[str]:
+def _lines(model: Model, Ts: float, prefix: str, code: SampleProgram) -> Iterator[str]:
     mechanism, name = model.mechanism, prefix.upper()
     names, substeps = state_names(mechanism), model.solver.substeps
     firsts, pasts, counted = _sequence_states(code)
@@ -122,7 +121,7 @@ def _lines(model: Model, Ts: float, prefix: str, code: Program) -> Iterator[str]
     yield f"#define {name}_TS {_number(Ts)} /* sampling period [s] */\n"
     yield "typedef struct {"
     yield f"    double x[{len(names)}]; /* {', '.join(names)} */"
-    yield "    int begun;   /* whether a command has come yet */"
+    yield "    int started; /* whether there has been a command */"
     if counted:
         yield "    double count; /* samples so far */"
     if firsts:
@@ -130,12 +129,13 @@ def _lines(model: Model, Ts: float, prefix: str, code: Program) -> Iterator[str]
     for i, e in enumerate(pasts):
         yield f"    double past{i}[{e.args[1]}]; /* the last commands, the oldest at place{i} */"
         yield f"    int place{i};"
-    if code.memories:
-        yield f"    double carry[{len(code.memories)}]; /* what the actuation remembers */"
+    if code.sequence_states:
+        yield f"    double carry[{len(code.sequence_states)}]; /* states of the actuation */"
     yield f"}} {prefix}_state;\n"
     yield "/* Rest. The first positions and speeds may be written to s->x afterwards. */"
     yield f"static void {prefix}_init({prefix}_state *s)\n{{"
-    yield f"    static const {prefix}_state rest = {{.x = {{{', '.join(map(_number, start))}}}, .begun = 0}};"
+    x = ", ".join(map(_number, start))
+    yield f"    static const {prefix}_state rest = {{.x = {{{x}}}, .started = 0}};"
     yield "    *s = rest;\n}\n"
     yield "/* y: what the sensors read now. u: command that is held from now over one sample [V]. */"
     yield f"static void {prefix}_step({prefix}_state *s, double u, double y[{len(mechanism.channels)}])\n{{"
@@ -148,7 +148,7 @@ def _lines(model: Model, Ts: float, prefix: str, code: Program) -> Iterator[str]
 
 
 def _heading(mechanism: Mechanism, model: Model, Ts: float) -> Iterator[str]:
-    yield "/* Made by rotflex_jax from a fitted model; every number of the model is folded in."
+    yield "/* Generated by rotflex_jax from a fitted model; all its constants are evaluated."
     yield f" * Sampling period {Ts:g} s, {type(model.solver).__name__} step."
     yield " *"
     gates = model.gates or (1.0,) * len(mechanism.effects)
@@ -166,15 +166,15 @@ def _comment(effect: Effect) -> str:
     return effect.equation.replace("*/", "* /")
 
 
-def _sequence_states(code: Program) -> tuple[list[Expression], list[Expression], bool]:
-    """What the way from the command to the voltage remembers."""
-    roots = [code.voltage, *(m.start for m in code.memories), *(m.next for m in code.memories)]
+def _sequence_states(code: SampleProgram) -> tuple[list[Expression], list[Expression], bool]:
+    """First commands, delayed commands and whether samples are counted, from the command to the voltage."""
+    roots = [code.voltage, *(m.start for m in code.sequence_states), *(m.next for m in code.sequence_states)]
     below = list(ordered(roots))
     found = {op: [e for e in below if e.op == op] for op in ("first", "past", "count")}
     return found["first"], found["past"], bool(found["count"])
 
 
-def _reading(code: Program) -> Iterator[str]:
+def _reading(code: SampleProgram) -> Iterator[str]:
     printer = _Printer(lambda e: f"s->x[{e.args[0]}]", code.outputs)
     lines = list(printer.statements(code.outputs))
     yield "    {"
@@ -183,10 +183,10 @@ def _reading(code: Program) -> Iterator[str]:
     yield "    }"
 
 
-def _driving(code: Program, firsts: list[Expression], pasts: list[Expression]) -> Iterator[str]:
-    """The voltage `v` from the command, with states brought up to date."""
-    roots = [code.voltage, *(m.next for m in code.memories)]
-    starts = [m.start for m in code.memories]
+def _driving(code: SampleProgram, firsts: list[Expression], pasts: list[Expression]) -> Iterator[str]:
+    """The voltage `v` from the command, with the states of the actuation updated."""
+    roots = [code.voltage, *(m.next for m in code.sequence_states)]
+    starts = [m.start for m in code.sequence_states]
 
     def leaf(e: Expression) -> str:
         if e.op == "first":
@@ -199,31 +199,32 @@ def _driving(code: Program, firsts: list[Expression], pasts: list[Expression]) -
     yield "    double v;\n    {"
     waiting = list(enumerate(starts))
     for e in ordered([*starts, *roots]):
-        # A carry begins before anything that is made of it.
+        # A state is initialised before any expression that contains it.
         while waiting and e.op == "carry" and waiting[0][0] <= e.args[0]:
             i, start = waiting.pop(0)
             yield from (f"    {line}" for line in printer.statements([start]))
-            yield f"        if (!s->begun) s->carry[{i}] = {_bare(printer(start))};"
+            yield f"        if (!s->started) s->carry[{i}] = {_bare(printer(start))};"
         yield from (f"    {line}" for line in printer.statements([e]))
         if e.op in ("first", "past"):
             base = printer(e.args[0])
         if e.op == "first":
-            yield f"        if (!s->begun) {leaf(e)} = {_bare(base)};"
+            yield f"        if (!s->started) {leaf(e)} = {_bare(base)};"
         if e.op == "past":
             i, d = pasts.index(e), e.args[1]
             early = _bare(base) if len(e.args) == 2 else _number(e.args[2])
-            yield f"        if (!s->begun) for (int k = 0; k < {d}; k++) s->past{i}[k] = {early};"
+            yield f"        if (!s->started) for (int k = 0; k < {d}; k++) s->past{i}[k] = {early};"
             yield f"        const double late{i} = s->past{i}[s->place{i}];"
             yield f"        s->past{i}[s->place{i}] = {_bare(base)};"
             yield f"        s->place{i} = (s->place{i} + 1) % {d};"
     yield f"        v = {_bare(printer(code.voltage))};"
-    news = [f"        const double new{i} = {_bare(printer(m.next))};" for i, m in enumerate(code.memories)]
+    states = enumerate(code.sequence_states)
+    news = [f"        const double new{i} = {_bare(printer(m.next))};" for i, m in states]
     yield from news
     yield from (f"        s->carry[{i}] = new{i};" for i in range(len(news)))
-    yield "        s->begun = 1;\n    }"
+    yield "        s->started = 1;\n    }"
 
 
-def _moving(code: Program, substeps: int) -> Iterator[str]:
+def _moving(code: SampleProgram, substeps: int) -> Iterator[str]:
     printer = _Printer(lambda e: "v" if e.op == "v" else f"s->x[{e.args[0]}]", code.state)
     indent = "    " if substeps == 1 else "        "
     yield "    {" if substeps == 1 else f"    for (int step = 0; step < {substeps}; step++) {{"

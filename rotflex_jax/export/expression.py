@@ -1,7 +1,7 @@
-"""Scalar expressions: what is left of a computation when everything that is known has been computed.
+"""Scalar expressions: a computation in which all constants have been evaluated.
 
-Equal expressions are one object, so common parts are found by themselves; an operation on numbers is a
-number, and neutral elements fall away. `x 0` is taken for zero: laws are finite.
+Equal expressions are one object, so common subexpressions are shared; an operation on numbers is a number,
+and neutral elements are removed. `x 0` counts as zero, since effects are finite.
 """
 
 import weakref
@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-Scalar = Any  # an Expression, a float, or a bool
+Operand = Any  # an Expression, a float, or a bool
 
 
 class Operation(NamedTuple):
     """One operation on scalars.
 
     Attributes:
-        text: In C, with the places of its arguments.
-        value: On numbers.
-        truth: Whether the result is true or false.
+        text: C code, with placeholders of its arguments.
+        value: The operation on numbers.
+        truth: Whether the result is a truth value.
     """
 
     text: str
@@ -28,7 +28,7 @@ class Operation(NamedTuple):
     truth: bool = False
 
 
-# By the names that JAX gives its primitives. What scipy loads late is named only when it is called.
+# By the names of JAX's primitives. Functions of scipy, which is imported lazily, stand in lambdas.
 OPERATIONS: dict[str, Operation] = {
     "add": Operation("({} + {})", np.add),
     "sub": Operation("({} - {})", np.subtract),
@@ -87,32 +87,32 @@ OPERATIONS: dict[str, Operation] = {
 
 
 class Expression:
-    """An operation on scalars that are not all known, or a name.
+    """An operation on scalars of which some are variables, or a variable.
 
     Attributes:
-        op: Of `OPERATIONS`, or another word that the printer knows.
-        args: What it acts on.
-        truth: Whether it is true or false.
+        op: Of `OPERATIONS`, or the name of a variable that the printer knows.
+        args: Arguments.
+        truth: Whether it is a truth value.
     """
 
     __slots__ = ("__weakref__", "args", "op", "truth")
-    # numpy leaves the arithmetic of arrays that hold expressions to the expressions.
+    # Arithmetic of numpy arrays that contain expressions is that of the expressions.
     __array_ufunc__ = None
 
     op: str
     args: tuple[Any, ...]
     truth: bool
 
-    def __add__(self, other: Scalar) -> Scalar:
+    def __add__(self, other: Operand) -> Operand:
         return make("add", self, other)
 
-    def __radd__(self, other: Scalar) -> Scalar:
+    def __radd__(self, other: Operand) -> Operand:
         return make("add", other, self)
 
-    def __mul__(self, other: Scalar) -> Scalar:
+    def __mul__(self, other: Operand) -> Operand:
         return make("mul", self, other)
 
-    def __rmul__(self, other: Scalar) -> Scalar:
+    def __rmul__(self, other: Operand) -> Operand:
         return make("mul", other, self)
 
 
@@ -130,8 +130,8 @@ def node(op: str, *args: Any, truth: bool = False) -> Expression:
     return found
 
 
-def make(op: str, *args: Scalar) -> Scalar:
-    """The result of an operation: a number if all is known, an expression otherwise."""
+def make(op: str, *args: Operand) -> Operand:
+    """The result of an operation: a number if all arguments are numbers, an expression otherwise."""
     operation = OPERATIONS[op]
     if not any(isinstance(a, Expression) for a in args):
         with np.errstate(all="ignore"):
@@ -145,48 +145,48 @@ def make(op: str, *args: Scalar) -> Scalar:
     return node(op, *args, truth=truth)
 
 
-def _is(a: Scalar, number: float) -> bool:
+def _is(a: Operand, number: float) -> bool:
     return not isinstance(a, (Expression, bool)) and a == number
 
 
-def _sum(a: Scalar, b: Scalar) -> Scalar | None:
+def _sum(a: Operand, b: Operand) -> Operand | None:
     return b if _is(a, 0.0) else a if _is(b, 0.0) else None
 
 
-def _difference(a: Scalar, b: Scalar) -> Scalar | None:
+def _difference(a: Operand, b: Operand) -> Operand | None:
     return a if _is(b, 0.0) else make("neg", b) if _is(a, 0.0) else None
 
 
-def _product(a: Scalar, b: Scalar) -> Scalar | None:
+def _product(a: Operand, b: Operand) -> Operand | None:
     if _is(a, 0.0) or _is(b, 0.0):
         return 0.0
     return b if _is(a, 1.0) else a if _is(b, 1.0) else None
 
 
-def _quotient(a: Scalar, b: Scalar) -> Scalar | None:
+def _quotient(a: Operand, b: Operand) -> Operand | None:
     return a if _is(b, 1.0) else 0.0 if _is(a, 0.0) else None
 
 
-def _both(a: Scalar, b: Scalar) -> Scalar | None:
+def _both(a: Operand, b: Operand) -> Operand | None:
     if a is False or b is False:
         return False
     return b if a is True else a if b is True else None
 
 
-def _either(a: Scalar, b: Scalar) -> Scalar | None:
+def _either(a: Operand, b: Operand) -> Operand | None:
     if a is True or b is True:
         return True
     return b if a is False else a if b is False else None
 
 
-def _chosen(c: Scalar, a: Scalar, b: Scalar) -> Scalar | None:
+def _chosen(c: Operand, a: Operand, b: Operand) -> Operand | None:
     if not isinstance(c, Expression):
         return a if c else b
     # Not for -0.0 and 0.0, which are equal but not the same.
     return a if a is b or (type(a) is type(b) is float and repr(a) == repr(b)) else None
 
 
-_SIMPLER: dict[str, Callable[..., Scalar | None]] = {
+_SIMPLER: dict[str, Callable[..., Operand | None]] = {
     "add": _sum,
     "sub": _difference,
     "mul": _product,
@@ -198,11 +198,11 @@ _SIMPLER: dict[str, Callable[..., Scalar | None]] = {
 }
 
 
-def whole_power(x: Scalar, n: int) -> Scalar:
+def integer_power(x: Operand, n: int) -> Operand:
     """`x^n` by repeated squaring."""
     if n < 0:
-        return make("div", 1.0, whole_power(x, -n))
-    result: Scalar = 1.0
+        return make("div", 1.0, integer_power(x, -n))
+    result: Operand = 1.0
     while n:
         result = make("mul", result, x) if n & 1 else result
         n >>= 1
@@ -210,8 +210,8 @@ def whole_power(x: Scalar, n: int) -> Scalar:
     return result
 
 
-def ordered(roots: list[Scalar]) -> Iterator[Expression]:
-    """All expressions below the roots, arguments before what uses them."""
+def ordered(roots: list[Operand]) -> Iterator[Expression]:
+    """All expressions that the roots consist of, arguments before the expressions that use them."""
     seen: set[Expression] = set()
     stack = [(r, False) for r in reversed(roots) if isinstance(r, Expression)]
     while stack:

@@ -7,16 +7,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from rotflex_jax.effects.kinds import Actuation, DryFriction, Effect, Force, Gear, Memory
+from rotflex_jax.effects.base import Force, Memory
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.mechanism.assembly import Layout, effects_of, equations, rest_state
-from rotflex_jax.mechanism.linearise import zero_order_hold
-from rotflex_jax.mechanism.sensors import read_outputs
-from rotflex_jax.mechanism.states import state_names
-from rotflex_jax.mechanism.torques import flows, torques
-from rotflex_jax.model import Model
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.linear import state_names, zero_order_hold
+from rotflex_jax.mechanism.simulate import read_outputs
+from rotflex_jax.mechanism.step import memory_rates, torques
+from rotflex_jax.models.model import Model
+from rotflex_jax.runtime.xla import double_precision
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,21 +24,21 @@ class LinearModel:
     """`x' = A x + B u`, `y = C x + D u`, all deviations from an operating point.
 
     Attributes:
-        A: (n, n).
-        B: (n, 1).
-        C: (channels, n).
-        D: (channels, 1); zero, since a voltage moves nothing at once.
+        A: State matrix.
+        B: Input matrix.
+        C: Output matrix.
+        D: Feedthrough; zero, since a voltage acts on speeds first.
         Ts: Sampling period [s]; None for continuous time.
         states: Names.
         inputs: Names.
         outputs: Names.
-        dropped: What the linear model is without, one sentence each.
+        dropped: Effects that the linear model does not contain, one sentence each.
     """
 
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
+    A: Float[np.ndarray, "n n"]
+    B: Float[np.ndarray, "n 1"]
+    C: Float[np.ndarray, "C n"]
+    D: Float[np.ndarray, "C 1"]
     Ts: float | None
     states: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -85,13 +85,12 @@ def state_space(
 ) -> LinearModel:
     """The model linearised about an operating point.
 
-    Linear effects enter exactly, torque laws and memories with their slope, sensors with theirs. Memories
-    stand at the value at which they would rest at the operating point, as far as the speed lets them.
-    What has no slope is left out and named: dry friction, what happens to the voltage before the motor,
-    the play of a gear. Not for a friction that decides the motion: simulate that.
+    Linear effects enter exactly, torques, memories and sensors by their slope. Memories are at their steady
+    value at the operating point, where they have one. Effects without a slope are left out and named: dry
+    friction, actuation, the play of a gear. Not where friction dominates the motion: simulate that.
 
     Args:
-        model: Mechanism with its numbers, or a Model.
+        model: Mechanism with its parameter values, or a Model.
         Ts: Sampling period [s] of a discrete model; None for continuous time.
         positions: Of the coordinates; zero if None.
         speeds: Of the coordinates; zero if None.
@@ -107,33 +106,33 @@ def state_space(
     point = [_point(x, layout.n, what) for x, what in ((positions, "positions"), (speeds, "speeds"))]
     start = layout.linear
     with double_precision():
-        gates = model.numbers()[1]
+        gates = model.parameters_and_gates()[1]
         eq = equations(mechanism, gates)
         smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
 
-        def slope(x: jax.Array, u: jax.Array) -> jax.Array:
+        def slope(x: Array, u: Array) -> Array:
             L, z = x[:start], x[start:]
             dL = eq.A @ L + eq.B * u[0]
             if smooth:
                 dL = dL + eq.ports @ torques(mechanism, L, z, u[0], gates)
-            return jnp.concatenate([dL, flows(mechanism, L, z, u[0], gates)]) if z.shape[0] else dL
+            return jnp.concatenate([dL, memory_rates(mechanism, L, z, u[0], gates)]) if z.shape[0] else dL
 
         x = rest_state(mechanism.structure, np.float64)
         x[: 2 * layout.n] = np.concatenate(point)
         u = jnp.asarray([float(voltage)])
-        x = _settled(slope, jnp.asarray(x), u, start)
+        x = _steady_memories(slope, jnp.asarray(x), u, start)
         A, B = (np.asarray(m) for m in jax.jacfwd(slope, argnums=(0, 1))(x, u))
         C = np.asarray(jax.jacfwd(lambda s: read_outputs(mechanism, gates, s))(x))
     names = state_names(mechanism)
-    # A gear is tight here, so its rotor has no state of its own.
-    kept = [i for i in range(layout.size) if not layout.rotor <= i < start]
+    # The gear has no play here, so its rotor has no states of its own.
+    rows = [i for i in range(layout.size) if not layout.rotor <= i < start]
     linear = LinearModel(
-        A=A[np.ix_(kept, kept)],
-        B=B[kept],
-        C=C[:, kept],
+        A=A[np.ix_(rows, rows)],
+        B=B[rows],
+        C=C[:, rows],
         D=np.zeros((len(C), 1)),
         Ts=None,
-        states=tuple(names[i] for i in kept),
+        states=tuple(names[i] for i in rows),
         inputs=("voltage",),
         outputs=mechanism.channels,
         dropped=tuple(_dropped(model)),
@@ -150,8 +149,8 @@ def _point(given: Sequence[float] | None, n: int, what: str) -> np.ndarray:
     return values
 
 
-def _settled(slope: Any, x: jax.Array, u: jax.Array, start: int) -> jax.Array:
-    """The state with its memories, currents included, at rest where they have a place of rest."""
+def _steady_memories(slope: Any, x: Array, u: Array, start: int) -> Array:
+    """The state with its memories, currents included, at their steady values where they have one."""
     for k in range(start, len(x)):
         for _ in range(20):
             rate, gain = slope(x, u)[k], jax.jacfwd(lambda s: slope(s, u))(x)[k, k]
@@ -164,15 +163,9 @@ def _settled(slope: Any, x: jax.Array, u: jax.Array, start: int) -> jax.Array:
 
 
 def _dropped(model: Model) -> list[str]:
-    reasons: dict[type[Effect], str] = {
-        DryFriction: "has no slope at rest",
-        Actuation: "acts on the voltage before the motor, which is the input here",
-        Gear: "has no slope within the play; the gear is taken as tight",
-    }
     gates = model.gates or (1.0,) * len(model.mechanism.effects)
     return [
-        f"{e.title} at {e.at} {reason}"
+        f"{e.title} at {e.at} {e.not_linearised}"
         for e, gate in zip(model.mechanism.effects, gates, strict=True)
-        for kind, reason in reasons.items()
-        if isinstance(e, kind) and gate
+        if e.not_linearised and gate
     ]

@@ -1,7 +1,7 @@
 from .forward_regression import forward_regression as forward_regression
 from .greybox import fit as fit
-from .least_squares import least_squares as least_squares
 from .many_starts import ManyStarts as ManyStarts, many_starts as many_starts
-from .series_fit import SeriesFit as SeriesFit
+from .result import Fit as Fit
+from .series import SeriesFit as SeriesFit, least_squares as least_squares
 
 __all__: list[str]

@@ -1,4 +1,4 @@
-"""Few weights instead of many: regressors are chosen one by one, as long as unseen data gain."""
+"""Few weights instead of many: regressors are chosen one by one, as long as validation blocks gain."""
 
 from collections.abc import Sequence
 
@@ -8,14 +8,13 @@ from jaxtyping import Float
 from rotflex_jax.basis import Basis
 from rotflex_jax.basis.bank import whole
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.linear import factor, solve, squared_error
-from rotflex_jax.fit.rows import Rows, checked
-from rotflex_jax.fit.series_fit import SeriesFit, series_fit
+from rotflex_jax.fit.linear import RegressionRows, checked_recordings, factor, solve, squared_error
+from rotflex_jax.fit.series import SeriesFit, series_fit
+from rotflex_jax.models.series import Series
 from rotflex_jax.recording import Recording
-from rotflex_jax.series import Series
 
-# A column of which less than this share is left depends on those chosen before.
-SPENT = 1e-9
+# A regressor of which less than this share is left depends on those chosen before.
+DEPENDENT_REGRESSOR_SHARE = 1e-9
 
 
 def forward_regression(
@@ -33,20 +32,20 @@ def forward_regression(
         ERR_i = (q_i' y)^2 / (q_i' q_i  y' y),  q_i = what is left of regressor i after those chosen
 
     The regressor with the largest error-reduction ratio comes next. How many is decided on contiguous
-    blocks: each is left out in turn, the choice is made anew without it, and the smallest number is
+    blocks: each is left out in turn, the choice is made again without it, and the smallest number is
     taken whose error there is within one standard error of the least. The ratios add up to the share of
     `y' y` that is explained.
 
     The intervals take the choice for given, so they are too narrow. Not where regressors are strongly
-    correlated and the structure matters: which of two like ones is chosen is a matter of luck.
+    correlated and the structure matters: which of two similar ones is chosen is a matter of chance.
 
     Args:
         basis: Candidates.
         recordings: One or several, of one sampling period.
         channel: Output to model; may be left out where there is one.
-        terms: How many to choose; decided on held-out blocks if None.
+        terms: How many to choose; decided on validation blocks if None.
         most: Most that are tried.
-        skip: Samples at the start of each recording to leave out; its `n_init` if None.
+        skip: RecordingSamples at the start of each recording to leave out; its `n_init` if None.
         blocks: How many, to decide.
 
     Returns:
@@ -66,8 +65,8 @@ def forward_regression(
     >>> forward_regression(Volterra(Delays(4)), recording).selected
     ('u[t]', 'u[t]^2')
     """
-    listed, channel = checked(recordings, channel)
-    rows = Rows.of(basis, listed, channel, skip)
+    listed, channel = checked_recordings(recordings, channel)
+    rows = RegressionRows.of(basis, listed, channel, skip)
     joined = np.concatenate([rows.phi, rows.y[:, None]], axis=1)
     block = rows.blocks(whole(blocks, "blocks", 1))
     parts = [factor(joined[block == k]) for k in range(block[-1] + 1)]
@@ -109,7 +108,7 @@ def forward_path(R: Float[np.ndarray, "K K"], most: int) -> tuple[list[int], lis
     order, ratios = [], []
     for _ in range(most):
         size = np.linalg.norm(left, axis=0)
-        usable = size > SPENT * first
+        usable = size > DEPENDENT_REGRESSOR_SHARE * first
         usable[order] = False
         if not usable.any():
             break

@@ -1,13 +1,19 @@
-"""Linear least squares from a triangular factor: minimum norm, ridge, and what it is worth."""
+"""Linear least squares from a triangular factor, and the rows it is fitted to."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+
+from rotflex_jax.basis import Basis
+from rotflex_jax.basis.bank import require_basis
+from rotflex_jax.errors import InputError
+from rotflex_jax.recording import Recording
 
 # Singular values below this share of the largest one are rounding: the columns depend on each other.
-DEPENDENT = 1e-12
-CHUNK = 8192  # rows that are factored at once
+DEPENDENT_COLUMN_SHARE = 1e-12
+ROWS_PER_FACTOR = 8192  # rows that are factored at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,12 +42,12 @@ def factor(A: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "K K"]:
     """
     K = A.shape[1]
     R = np.zeros((0, K))
-    for start in range(0, len(A), CHUNK):
-        R = np.linalg.qr(np.concatenate([R, A[start : start + CHUNK]]), mode="r")
+    for start in range(0, len(A), ROWS_PER_FACTOR):
+        R = np.linalg.qr(np.concatenate([R, A[start : start + ROWS_PER_FACTOR]]), mode="r")
     return np.concatenate([R, np.zeros((max(K - len(R), 0), K))])
 
 
-def solve(R: Float[np.ndarray, "K K"], ridge: float = 0.0) -> Solution:
+def solve(R: Float[np.ndarray, "K columns"], ridge: float = 0.0) -> Solution:
     """Least squares from the triangular factor of `[phi, y]`.
 
         minimise |y - phi w|^2 + ridge |w|^2
@@ -54,7 +60,7 @@ def solve(R: Float[np.ndarray, "K K"], ridge: float = 0.0) -> Solution:
     # A ridge weighs the weights as they are; without it, columns of one size tell rank from scale.
     unit = np.where(size > 0, size, 1.0) if ridge == 0 else np.ones_like(size)
     U, s, Vt = np.linalg.svd(A / unit, full_matrices=False)
-    kept = s > DEPENDENT * max(s[0], 1e-300)
+    kept = s > DEPENDENT_COLUMN_SHARE * max(s[0], 1e-300)
     U, s, V = U[:, kept], s[kept], Vt[kept].T
     shrink = s**2 / (s**2 + ridge)
     basis = V / unit[:, None]
@@ -64,7 +70,7 @@ def solve(R: Float[np.ndarray, "K K"], ridge: float = 0.0) -> Solution:
     return Solution(w, basis, shrink, len(s), condition)
 
 
-def squared_error(R: Float[np.ndarray, "K K"], w: Float[np.ndarray, " P"]) -> float:
+def squared_error(R: Float[np.ndarray, "K columns"], w: Float[np.ndarray, " P"]) -> float:
     """|y - phi w|^2 of the rows behind a triangular factor."""
     return float(np.sum((R[:, -1] - R[:, :-1] @ w) ** 2))
 
@@ -72,7 +78,7 @@ def squared_error(R: Float[np.ndarray, "K K"], w: Float[np.ndarray, " P"]) -> fl
 def cross_validated_ridge(
     parts: list[Float[np.ndarray, "K K"]], count: int = 31
 ) -> tuple[float, Float[np.ndarray, " G"], Float[np.ndarray, " G"]]:
-    """The ridge whose error on blocks that it did not see is least.
+    """The ridge with the least error on blocks left out in turn.
 
     Args:
         parts: Triangular factor of each block.
@@ -92,3 +98,86 @@ def cross_validated_ridge(
         filtered = s[:, None] / (s[:, None] ** 2 + ridges) * (U.T @ R[:, -1])[:, None]
         errors += np.sum((held[:, -1:] - held[:, :-1] @ (Vt.T @ filtered)) ** 2, axis=0)
     return float(ridges[np.argmin(errors)]), ridges, errors
+
+
+@dataclasses.dataclass(frozen=True)
+class RegressionRows:
+    """Rows of a regression.
+
+    Attributes:
+        phi: Regressors.
+        y: Targets.
+        segments: Number of the recording of each row.
+    """
+
+    phi: Float[np.ndarray, "N P"]
+    y: Float[np.ndarray, " N"]
+    segments: Int[np.ndarray, " N"]
+
+    @classmethod
+    def of(
+        cls, basis: Basis, recordings: Sequence[Recording], channel: str, skip: int | None
+    ) -> "RegressionRows":
+        """Rows of all recordings but their first samples.
+
+        Args:
+            basis: Applied to each recording from its start.
+            recordings: At least one.
+            channel: Output.
+            skip: RecordingSamples at the start of each recording to leave out; its `n_init` if None.
+        """
+        require_basis(basis)
+        parts = []
+        for number, recording in enumerate(recordings):
+            start = recording.n_init if skip is None else skip
+            if not 0 <= start < recording.N:
+                raise InputError(
+                    f"The first {start} samples are left out, but recording {number} has {recording.N}; "
+                    "give a smaller `skip`, or longer recordings."
+                )
+            phi = basis.regressors(recording.u.astype(float))[start:]
+            parts.append((phi, recording.channel(channel)[start:].astype(float), np.full(len(phi), number)))
+        return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+    def blocks(self, count: int) -> Int[np.ndarray, " N"]:
+        """Number of the contiguous block each row belongs to; no block crosses recordings.
+
+        Neighbouring samples are correlated, so that shuffled ones would not be independent.
+        """
+        N = len(self.y)
+        found, first = np.zeros(N, int), 0
+        for segment in np.unique(self.segments):
+            own = np.flatnonzero(self.segments == segment)
+            pieces = min(len(own), max(1, round(count * len(own) / N)))
+            found[own] = first + np.arange(len(own)) * pieces // len(own)
+            first += pieces
+        return found
+
+
+def checked_recordings(
+    recordings: Recording | Sequence[Recording], channel: str | None
+) -> tuple[list[Recording], str]:
+    """A list of recordings of one sampling period, and the channel.
+
+    Raises:
+        InputError: None, different periods, or several channels and no choice.
+    """
+    listed = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if not listed:
+        raise InputError("Argument `recordings` is empty, but a fit needs at least one; give a recording.")
+    periods = sorted({r.Ts for r in listed})
+    if periods[-1] / periods[0] - 1 > 1e-6:
+        raise InputError(
+            f"The recordings have the sampling periods {', '.join(f'{p:g} s' for p in periods)}, but a "
+            "series has one; decimate them to the same."
+        )
+    if channel is None:
+        if len(listed[0].channels) > 1:
+            raise InputError(
+                f"The recording has the channels {', '.join(listed[0].channels)}, but a series has one "
+                "output; say which with `channel`."
+            )
+        channel = next(iter(listed[0].channels))
+    for recording in listed:
+        recording.channel(channel)
+    return listed, channel

@@ -1,31 +1,195 @@
-"""The same fit from many starts: which numbers are the answer, and not the nearest dip."""
+"""The same fit from many starts: which parameters are the answer, and not a local minimum."""
 
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jax.sharding import Mesh
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Int
 
-from rotflex_jax.devices import mesh_of
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.marquardt import ENOUGH, ROUGHLY, Problem, Reached, descend
-from rotflex_jax.fit.residuals import first_states, sensor_noise, stack
+from rotflex_jax.fit.dataset import StackedRecordings, first_states, sensor_noise, stack
+from rotflex_jax.fit.problem import (
+    LARGEST_STEP,
+    directions,
+    normal_equations,
+)
 from rotflex_jax.fit.signs import check_signs
-from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.model import Model
+from rotflex_jax.mechanism import Mechanism, Solver
+from rotflex_jax.mechanism.assembly import whole_state
+from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
+from rotflex_jax.models.model import Model
+from rotflex_jax.optimise.damped_least_squares import (
+    NormalEquations,
+    Rules,
+    bounded_solution,
+    damped,
+    minimise_compiled,
+)
 from rotflex_jax.parameters import Transform
-from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
-from rotflex_jax.threads import one_thread
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread, spread
 
-TOGETHER = 8
+CONVERGED_SHARE = 1e-9
+"""A step that would lower the cost by less than this share of it is not taken."""
+RANKING_SHARE = 1e-3
+"""The same where starts are only put in order."""
+
+
+class SharedInputs(NamedTuple):
+    """What all starts have in common.
+
+    Attributes:
+        values: Of all parameters; those that are not free stay.
+        free: Indices of the free ones.
+        data: The recordings.
+        scale: Size of the error of each channel.
+    """
+
+    values: Float[Any, " P"]
+    free: Int[Any, " K"]
+    data: StackedRecordings
+    scale: Float[Any, " C"]
+
+
+class JointEquations(NamedTuple):
+    """Normal equations of R recordings by K common coordinates and the first state (m,) of each.
+
+    A point and a step are a pair, the common coordinates (K,) and the first states (R, m). A first state is
+    eliminated from the step, for it meets only the samples of its own recording.
+    """
+
+    recordings: NormalEquations
+
+    @property
+    def cost(self) -> Float[Array, ""]:
+        """Half the squared error of all recordings."""
+        return jnp.sum(self.recordings.costs)
+
+    def step(
+        self, damping: Float[Array, ""], limit: Float[Array, " K"]
+    ) -> tuple[tuple[Float[Array, " K"], Float[Array, "R m"]], Bool[Array, ""]]:
+        """Damped step, that of the common coordinates within their limits, and whether these hold it short.
+
+        Far from the answer the linear picture is wrong about where it ends, and without a limit two starts
+        in three from a wide box end elsewhere than at the least cost.
+        """
+        K, (_, g, H) = len(limit), self.recordings
+        common, mixed = damped(jnp.sum(H[:, :K, :K], axis=0), damping), H[:, :K, K:]
+        own = damped(H[:, K:, K:], damping)
+        # What the first states would do by themselves, and what they do with the parameters.
+        inner = jnp.linalg.solve(own, jnp.concatenate([jnp.swapaxes(mixed, 1, 2), g[:, K:, None]], axis=2))
+        left = common - jnp.sum(jnp.einsum("rkm,rml->rkl", mixed, inner[:, :, :K]), axis=0)
+        right = jnp.sum(g[:, :K] - jnp.einsum("rkm,rm->rk", mixed, inner[:, :, K]), axis=0)
+        dz, limited = bounded_solution(left, -right, limit)
+        return (dz, -inner[:, :, K] - jnp.einsum("rmk,k->rm", inner[:, :, :K], dz)), limited
+
+    def predicted_decrease(self, step: tuple[Float[Array, " K"], Float[Array, "R m"]]) -> Float[Array, ""]:
+        """By how much the quadratic model falls along a step."""
+        dz, dx0 = step
+        each = jnp.concatenate([jnp.broadcast_to(dz, (len(dx0), len(dz))), dx0], axis=1)
+        return jnp.sum(self.recordings.predicted_decrease(each))
+
+
+class StartResults(NamedTuple):
+    """Where starts ended.
+
+    Attributes:
+        values: Of all parameters.
+        x0: First states.
+        cost: Half the sum of squared errors.
+        steps: Runs that it took.
+        z: Unconstrained coordinates of the free parameters.
+    """
+
+    values: Float[Any, "S P"]
+    x0: Float[Any, "S R m"]
+    cost: Float[Any, " S"]
+    steps: Int[Any, " S"]
+    z: Float[Any, "S K"]
+
+
+export.register_namedtuple_serialization(StartResults, serialized_name=f"{__name__}.StartResults")
+
+
+@persistent_jit(static=3)
+def minimise_starts(
+    structure: Mechanism,
+    solver: Solver,
+    mesh: Mesh | None,
+    z: Float[Array, "S K"],
+    x0: Float[Array, "S R m"],
+    inputs: SharedInputs,
+    max_steps: int,
+    tolerance: float = CONVERGED_SHARE,
+) -> StartResults:
+    """Where every start leads, on each device one after the other.
+
+    Side by side they would wait for the slowest, and a run with all its sums fills a core as it is.
+
+    Args:
+        structure: Mechanism without numbers; static.
+        solver: Integration rule; static.
+        mesh: Devices that the starts are shared out to; None for one device; static.
+        z: Unconstrained coordinates of the free parameters at each start.
+        x0: First positions and speeds at each start.
+        inputs: What they have in common.
+        max_steps: Most runs of each.
+        tolerance: Share of the cost below which there is nothing more to gain.
+    """
+    each = functools.partial(_minimise_each, structure, solver)
+    return spread(each, mesh)((z, x0), inputs, max_steps, tolerance)
+
+
+def _minimise_each(
+    structure: Mechanism,
+    solver: Solver,
+    starts: tuple[Array, Array],
+    inputs: SharedInputs,
+    max_steps: int,
+    tolerance: float,
+) -> StartResults:
+    transform = Transform.of(structure.parameter_specifications)
+
+    def values(z: Array) -> Array:
+        whole = jnp.zeros_like(inputs.values).at[inputs.free].set(z)
+        return inputs.values.at[inputs.free].set(transform.constrain(whole)[inputs.free])
+
+    def linearise(point: tuple[Array, Array]) -> JointEquations:
+        z, x0 = point
+        p, slopes = jax.jvp(values, (z,), (jnp.ones_like(z),))
+        ways = directions(structure, slopes, inputs.free, x0.shape[1])
+        gates = jnp.ones(len(structure.effects), p.dtype)
+
+        def run(r: Any) -> NormalEquations:
+            numbers = RunParameters(p, gates, whole_state(structure, r[0]), None)
+            return normal_equations(structure, solver, numbers, ways, RecordingSamples(*r[1]), inputs.scale)
+
+        return JointEquations(jax.lax.map(run, (x0, tuple(inputs.data))))
+
+    def one(start: tuple[Array, Array]) -> StartResults:
+        (z, x0), equations, progress = minimise_compiled(
+            linearise,
+            start,
+            Rules(enough_share=tolerance),
+            limit=jnp.full_like(start[0], LARGEST_STEP),
+            max_steps=max_steps,
+        )
+        return StartResults(values(z), x0, equations.cost, progress.evaluations, z)
+
+    return jax.lax.map(one, starts)
+
+
+STARTS_PER_CALL = 8
 """Starts of a device in one compiled call; progress is told between calls."""
-SAME = 1e-3
-"""Costs that differ by less than this share belong to one minimum."""
+SAME_MINIMUM_SHARE = 1e-3
+"""Costs that differ by less than this share belong to one local minimum."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,11 +197,11 @@ class ManyStarts:
     """Where many starts ended.
 
     Attributes:
-        model: With the numbers of the least cost.
+        model: With the parameters of the least cost.
         cost: Half the sum of squared errors there, in units of the sensor's noise.
-        costs: Of all that went to the end, the least first (K,).
-        values: Parameter values of these (K, P).
-        steps: Runs that each of them took on the whole recordings (K,).
+        costs: Of all that went to the end, the least first.
+        values: Parameter values of these.
+        steps: Runs that each of them took on the whole recordings.
         starts: How many there were.
     """
 
@@ -45,13 +209,13 @@ class ManyStarts:
     cost: float
     costs: Float[np.ndarray, " K"]
     values: Float[np.ndarray, "K P"]
-    steps: np.ndarray
+    steps: Int[np.ndarray, " K"]
     starts: int
 
     @property
     def share(self) -> float:
         """Share of those that went to the end that ended at the least cost."""
-        return float(np.mean(self.costs <= self.cost * (1 + SAME)))
+        return float(np.mean(self.costs <= self.cost * (1 + SAME_MINIMUM_SHARE)))
 
     def __str__(self) -> str:
         lines = [
@@ -84,22 +248,22 @@ def many_starts(
 
         minimise  sum_k |(y_k - y_hat_k) / s|^2   over free parameters and first states, y_hat a free run
 
-    All starts are fitted to the beginning of the recordings, which is cheap and has fewer dips, and only
-    the best of them to the whole. A step moves no bounded parameter by more than a factor of e. Recordings
-    are fitted jointly: parameters are common, first states each recording's own.
+    All starts are fitted to the first seconds of the recordings, which is cheap and has fewer local minima,
+    and only the best of them to the whole. A step changes no bounded parameter by more than a factor of e.
+    Recordings are fitted jointly: parameters are common, first states each recording's own.
 
-    It gives numbers, not intervals: hand the `model` to `fit` for those. Not for a model that is known to
-    miss something large: a long free run then has its least cost at wrong numbers, and `fit` with
+    It gives estimates, not intervals: hand the `model` to `fit` for those. Not for a model that is known to
+    miss something large: a long free run then has its least cost at wrong parameters, and `fit` with
     `process_noise` does better. Memory is that of the recordings, whatever the starts.
 
     Args:
-        mechanism: What to fit; its numbers are the first start and the middle of the others, its trusted
+        mechanism: What to fit; its values are the first start and the middle of the others, its trusted
             parameters are held.
         recordings: One or several.
         starts: How many.
-        spread: Each parameter begins within this share of its size, above or below, between 0 and 1; one
+        spread: Each parameter starts within this share of its size, above or below, between 0 and 1; one
             that may be negative within this share of its typical size.
-        short_seconds: Beginning of each recording that all starts are fitted to [s]; None for all of it.
+        short_seconds: First part of each recording that all starts are fitted to [s]; None for all of it.
         keep: How many of the best go on to the whole.
         max_steps: Most runs of one start in each stage.
         seed: Of the starts.
@@ -111,7 +275,7 @@ def many_starts(
         The best, and where the others ended.
 
     Raises:
-        InputError: Nothing to fit, numbers out of their range, a channel that moves against the model, or
+        InputError: Nothing to fit, arguments out of their range, a channel that moves against the model, or
             no start with a finite error.
     """
     model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
@@ -139,18 +303,18 @@ def many_starts(
     noise = sensor_noise(listed, model)
     say = progress or (lambda _: None)
     stage = functools.partial(
-        _stage, model=model, free=free, noise=noise, most=max_steps, mesh=mesh_of(devices), say=say
+        _stage, model=model, free=free, noise=noise, max_steps=max_steps, mesh=mesh_of(devices), say=say
     )
-    short = _beginnings(listed, short_seconds)
+    short = _first_parts(listed, short_seconds)
     if short is not None:
-        found = stage(z, x0, short, ROUGHLY, f"{starts} starts, beginnings")
+        found = stage(z, x0, short, RANKING_SHARE, f"{starts} starts, first seconds")
         best = np.argsort(found.cost)[:keep]
         z, x0 = np.asarray(found.z[best]), np.asarray(found.x0[best])
-    found = stage(z, x0, listed, ENOUGH, f"{len(z)} starts, whole recordings")
+    found = stage(z, x0, listed, CONVERGED_SHARE, f"{len(z)} starts, whole recordings")
     order = np.argsort(found.cost)
     if not np.isfinite(found.cost[order[0]]):
         raise InputError(
-            "The model runs away from every start, so that none has an error; give numbers that are nearer."
+            "The model diverges from every start, so that none has an error; give values that are nearer."
         )
     fitted = dataclasses.replace(model, mechanism=m.with_values(found.values[order[0]]))
     cost = float(found.cost[order[0]])
@@ -169,8 +333,8 @@ def _box(m: Mechanism, free: np.ndarray, starts: int, spread: float, seed: int) 
     return np.clip(m.values + away * size, low, high)
 
 
-def _beginnings(recordings: list[Recording], seconds: float | None) -> list[Recording] | None:
-    """Their beginnings; None where these are no shorter to speak of."""
+def _first_parts(recordings: list[Recording], seconds: float | None) -> list[Recording] | None:
+    """Their first seconds; None where these are hardly shorter than the whole."""
     if seconds is None:
         return None
     lengths = [max(round(seconds / r.Ts), 2 * r.n_init) for r in recordings]
@@ -183,39 +347,41 @@ def _stage(
     z: np.ndarray,
     x0: np.ndarray,
     recordings: list[Recording],
-    enough: float,
+    tolerance: float,
     title: str,
     *,
     model: Model,
     free: np.ndarray,
     noise: np.ndarray,
-    most: int,
+    max_steps: int,
     mesh: Mesh | None,
     say: Callable[[str], None],
-) -> Reached:
+) -> StartResults:
     """All starts on some recordings; what is not finite costs infinitely much."""
     parts, mesh = [], mesh if len(z) > 1 else None
     # As many for each device, so that none waits for another: some take sixty runs where others take three.
     size = mesh.size if mesh else 1
-    together = size * min(TOGETHER, -(-len(z) // size))
+    together = size * min(STARTS_PER_CALL, -(-len(z) // size))
     with double_precision():
         data = stack(recordings, model)
         arrays = type(data)(*(jnp.asarray(part) for part in data))
-        problem = Problem(jnp.asarray(model.mechanism.values), jnp.asarray(free), arrays, jnp.asarray(noise))
+        inputs = SharedInputs(
+            jnp.asarray(model.mechanism.values), jnp.asarray(free), arrays, jnp.asarray(noise)
+        )
         for at in range(0, len(z), together):
             pick = np.minimum(np.arange(at, at + together), len(z) - 1)
-            found = descend(
+            found = minimise_starts(
                 model.mechanism.structure,
                 model.solver,
                 mesh,
                 jnp.asarray(z[pick]),
                 jnp.asarray(x0[pick]),
-                problem,
-                most,
-                enough,
+                inputs,
+                max_steps,
+                tolerance,
             )
             real = min(together, len(z) - at)
             parts.append([np.asarray(part)[:real] for part in found])
-            done = Reached(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+            done = StartResults(*(np.concatenate(column) for column in zip(*parts, strict=True)))
             say(f"{title}: {len(done.cost)} done, least cost {np.nanmin(done.cost):.1f}")
     return done._replace(cost=np.where(np.isfinite(done.cost), done.cost, np.inf))

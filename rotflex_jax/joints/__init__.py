@@ -1,7 +1,6 @@
 """Ready-made mechanisms: joints of the paper and the maker, a single inertia, public machines."""
 
-from rotflex_jax.joints.emps import emps
-from rotflex_jax.joints.rotary_arm import rotary_arm
+from rotflex_jax.joints.public_machines import emps, rotary_arm, silverbox, two_dof_link
 from rotflex_jax.joints.rotary_flexible import (
     arm_inertia,
     flexible_joint,
@@ -10,7 +9,6 @@ from rotflex_jax.joints.rotary_flexible import (
     quanser_2002,
     quanser_2010,
 )
-from rotflex_jax.joints.silverbox import silverbox
 from rotflex_jax.joints.single_inertia import single_inertia
 from rotflex_jax.joints.springs import SPRINGS, SpringType, spring_settings, spring_stiffness
 
@@ -23,6 +21,7 @@ __all__ = [
     "emps",
     "silverbox",
     "rotary_arm",
+    "two_dof_link",
     "arm_inertia",
     "hub_inertia",
     "spring_stiffness",

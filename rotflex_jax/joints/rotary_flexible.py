@@ -35,7 +35,7 @@ def flexible_joint(
         hub_inertia theta'' + arm_inertia (theta'' + alpha'') = motor - hub_damping theta'
         arm_inertia (theta'' + alpha'') = -stiffness alpha - joint_damping alpha'
 
-    Angles and voltage alone tell torques only up to a common factor, so the arm's inertia is
+    Angles and voltage determine torques only up to a common factor, so the arm's inertia is
     trusted, and of the motor everything but its torque constant. Free are hub inertia, stiffness,
     torque constant and both dampers.
 

@@ -1,9 +1,9 @@
 """Volterra kernels of a physical model, by differentiating its simulator.
 
-A kernel identified from data is a table of numbers; the same kernel of a physical model says where they
-come from. `local_kernels` are the Taylor kernels about a constant voltage, for laws that are smooth
-there. `average_kernels` are what a least-squares fit finds under a Gaussian input, for any law.
-`effect_kernels` says which effect changes which kernel. `identified_kernels` are those of a fit.
+Kernels of a physical model explain those identified from data. `local_kernels` are the Taylor kernels about
+a constant voltage, for effects that are smooth there. `average_kernels` are those that least squares finds
+under a Gaussian input, for any effect. `effect_kernels` are the contributions of the effects to the kernels,
+`identified_kernels` the kernels of a fit.
 """
 
 from rotflex_jax.kernels.average import average_kernels
@@ -11,7 +11,7 @@ from rotflex_jax.kernels.effects import EffectKernels, EffectShare, effect_kerne
 from rotflex_jax.kernels.identified import identified_kernels
 from rotflex_jax.kernels.local import local_kernels
 from rotflex_jax.kernels.result import Agreement, Kernels
-from rotflex_jax.kernels.subject import Modelled
+from rotflex_jax.kernels.sensitivities import Modelled
 
 __all__ = [
     "Agreement",

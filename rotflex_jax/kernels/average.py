@@ -1,23 +1,96 @@
-"""Kernels that a least-squares fit finds under a Gaussian input, from the slopes along a trajectory."""
+"""Kernels that least squares finds under a Gaussian input, from the output derivatives along a trajectory."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import scipy
+from jaxtyping import Float, Real
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels
-from rotflex_jax.kernels.sensitivities import slopes
-from rotflex_jax.kernels.stretches import Stretches
-from rotflex_jax.kernels.subject import Modelled, Subject, lags_of, subject
+from rotflex_jax.kernels.sensitivities import Modelled, OutputModel, lags_of, output_derivatives, output_model
+from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.initial_state import initial_states
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.precision import double_precision
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision
 
-# Excess kurtosis up to which an input passes as Gaussian; that of uniform noise is -1.2, of a sine -1.5.
-GAUSSIAN = 0.5
-FAR = (
+
+class AveragingRun(NamedTuple):
+    """The input of the average and its division into blocks.
+
+    Attributes:
+        u: Voltage [V].
+        Ts: Sampling period [s].
+        x0: First state.
+        memory: Lags M of the kernels.
+        reach: Lags L of the output derivatives.
+        blocks: Number of blocks.
+        width: Samples per block; the last block ends with the recording.
+        mirrored: Whether the voltage of opposite sign takes part.
+        unit: Units of input and output.
+    """
+
+    u: Float[np.ndarray, " N"]
+    Ts: float
+    x0: Float[np.ndarray, " n"]
+    memory: int
+    reach: int
+    blocks: int
+    width: int
+    mirrored: bool
+    unit: tuple[str, str]
+
+    @property
+    def about(self) -> float:
+        """Input level that the kernels are about [V]."""
+        return 0.0 if self.mirrored else float(np.mean(self.u))
+
+    @classmethod
+    def of(
+        cls,
+        s: OutputModel,
+        data: Recording | Real[np.ndarray, " N"],
+        Ts: float | None,
+        memory: int,
+        reach: int | None,
+        blocks: int,
+        mirrored: bool,
+    ) -> "AveragingRun":
+        """The run of checked arguments, with the first state estimated from a recording."""
+        reach = 2 * memory if reach is None else reach
+        x0 = rest_state(s.mechanism.structure, np.float64)
+        channel = s.mechanism.channels[s.output]
+        unit, skip = ("V", s.unit), reach
+        if isinstance(data, Recording):
+            m, Ts, u = data.n_init, data.Ts, data.u.astype(float)
+            unit = (data.input_unit, dict(zip(data.channels, data.units, strict=True)).get(channel, s.unit))
+            skip = max(reach, m)
+            if set(s.mechanism.channels) <= set(data.channels):
+                y = np.stack([data.channel(c) for c in s.mechanism.channels], axis=1).astype(float)
+                start = initial_states(s.mechanism, s.solver, s.gates, u[None, :m], y[None, :m], Ts)[0]
+                x0[: len(start)] = start
+        else:
+            u = np.asarray(data, float)
+        if Ts is None or not (np.isfinite(Ts) and Ts > 0) or u.ndim != 1 or not np.all(np.isfinite(u)):
+            raise InputError(
+                f"A voltage of shape {u.shape} with Ts = {Ts} was given, but finite values (N,) and a "
+                "positive sampling period are needed; give both, or a recording."
+            )
+        width = (len(u) - skip) // max(blocks, 1)
+        if reach < memory or blocks < 2 or width < memory:
+            raise InputError(
+                f"{len(u)} samples in {blocks} blocks with a memory of {memory} and a reach of {reach} lags "
+                "were given, but the reach must not be below the memory and each of at least two blocks "
+                "needs as many samples as the memory has lags; give a longer recording or fewer blocks."
+            )
+        return cls(u, float(Ts), x0, memory, reach, blocks, width, mirrored, unit)
+
+
+GAUSSIAN_EXCESS_KURTOSIS = 0.5
+"""Magnitude up to which an input counts as Gaussian; uniform noise has -1.2, a sine -1.5."""
+NOT_GAUSSIAN_NOTE = (
     "The input is far from Gaussian: these are mean slopes over its motion, not what least squares finds; "
     "fit the series to the model's simulated output for that."
 )
@@ -25,7 +98,7 @@ FAR = (
 
 def average_kernels(
     model: Mechanism | Modelled,
-    data: Recording | np.ndarray,
+    data: Recording | Real[np.ndarray, " N"],
     channel: str,
     memory: int,
     *,
@@ -33,31 +106,31 @@ def average_kernels(
     reach: int | None = None,
     blocks: int = 20,
     mirrored: bool = False,
-    autocovariance: np.ndarray | None = None,
+    autocovariance: Real[np.ndarray, " _"] | None = None,
 ) -> Kernels:
     """The second-order series that fits the model best under a Gaussian input.
 
         h1 = P E[s],   h2 = 1/2 P cov(s, phi) R^-1,   s[k] = dy[t] / du[t-k]
         phi = (u[t], ..., u[t-M+1]),   R = cov(phi),   P = R^-1 cov(phi, u[t], ..., u[t-L+1])
 
-    By Stein's lemma these are the coefficients of least squares, and first derivatives are enough:
+    By Stein's lemma these are the coefficients of least squares, and first derivatives are sufficient:
     the quadratic kernel is the covariance of the linear slope with the input (white input:
-    `h1[k] = E s[k]`, and `h2[k, j]` is `E[s[k] u[t-j]] / 2 sigma^2`). So it exists for laws with kinks
-    too, such as dry friction, where the Taylor kernels at rest say nothing.
+    `h1[k] = E s[k]`, and `h2[k, j]` is `E[s[k] u[t-j]] / 2 sigma^2`). It therefore exists for effects that
+    are not differentiable, such as dry friction, whose Taylor kernels at rest are zero.
 
     Not for an input far from Gaussian (steps, a controller's voltage): the slopes are still averages over
-    that motion, but least squares then weighs the motions in another way. Fit the series to the
-    model's simulated output in that case, beside the one fitted to the measurement.
+    that motion, but least squares weights the motions differently. Fit the series to the model's
+    simulated output in that case, beside the one fitted to the measurement.
 
     Args:
         model: Mechanism, or a model with its own integration rule and gates.
-        data: Recording, whose voltage and first state are taken, or the voltage (N,) [V] from rest.
+        data: Recording, for its voltage and first state, or the voltage [V] from rest.
         channel: Output.
         memory: Number of lags M, from 0 to M - 1.
         Ts: Sampling period [s], where `data` is a voltage.
-        reach: Number of lags L >= M over which slopes are formed; they should die out before, unless the
+        reach: Number of lags L >= M of the output derivatives, which should decay within them unless the
             input is white. Twice the memory if None.
-        blocks: Stretches of the recording that standard errors come from.
+        blocks: Blocks of the recording, from whose scatter the standard errors follow.
         mirrored: Average over the voltage and the same with opposite sign, which are equally likely where
             the mean is zero. An odd mechanism then has no quadratic kernel to the last digit.
         autocovariance: Of the input at lags 0 to L - 1 [V^2], where it is known; else the sample's, as
@@ -67,27 +140,29 @@ def average_kernels(
         Kernels about the mean voltage (zero where mirrored), with standard errors.
 
     Raises:
-        InputError: An unknown channel, too few samples, or an input that does not tell its lags apart.
+        InputError: An unknown channel, too few samples, or an input with an ill-conditioned covariance.
 
     Source: Stein, Ann. Stat. 9, 1981, lemma 2; Price, IRE Trans. Inf. Theory 4, 1958; Schetzen, The
     Volterra and Wiener Theories of Nonlinear Systems, 1980.
     """
-    s, memory = subject(model, channel), lags_of(memory)
-    run = Stretches.of(s, data, Ts, memory, reach, blocks, mirrored)
-    return kernels_of(run, parts(s, run, autocovariance), channel)
+    s, memory = output_model(model, channel), lags_of(memory)
+    run = AveragingRun.of(s, data, Ts, memory, reach, blocks, mirrored)
+    return kernels_of(run, block_kernels(s, run, autocovariance), channel)
 
 
-class Parts(NamedTuple):
-    """Per stretch: `h0` (B,), `h1` (B, M), `h2` (B, M, M); their means are the kernels. And `R` (M, M)."""
+class BlockKernels(NamedTuple):
+    """Kernels of each block, whose means are the kernels, and the covariance R of the input."""
 
-    h0: np.ndarray
-    h1: np.ndarray
-    h2: np.ndarray
-    R: np.ndarray
+    h0: Float[np.ndarray, " B"]
+    h1: Float[np.ndarray, "B M"]
+    h2: Float[np.ndarray, "B M M"]
+    R: Float[np.ndarray, "M M"]
 
 
-def parts(s: Subject, run: Stretches, autocovariance: np.ndarray | None) -> Parts:
-    """Kernels of every stretch under the input of the whole."""
+def block_kernels(
+    s: OutputModel, run: AveragingRun, autocovariance: Real[np.ndarray, " _"] | None
+) -> BlockKernels:
+    """Kernels of every block under the covariance of the whole input."""
     M, L, N = run.memory, run.reach, run.blocks * run.width
     lagged = np.lib.stride_tricks.sliding_window_view(run.u - run.about, L)[:, ::-1][-N:]  # (N, L)
     if autocovariance is None:
@@ -104,22 +179,22 @@ def parts(s: Subject, run: Stretches, autocovariance: np.ndarray | None) -> Part
     if not np.linalg.cond(R) < 1e12:
         raise InputError(
             f"The voltage hardly changes over {M} lags of {run.Ts:g} s (condition {np.linalg.cond(R):.1g}), "
-            "but kernels need an input that tells the lags apart; sample more slowly or excite more widely."
+            "but kernels need an input that distinguishes the lags; sample more slowly or excite more widely."
         )
     P = np.linalg.solve(R, whole[:M])
     found = [_blocks(s, run, run.u, lagged, P, R)]
     if run.mirrored:
         found.append(_blocks(s, run, -run.u, -lagged, P, R))
     h0, h1, h2 = (np.mean([f[k] for f in found], axis=0) for k in range(3))
-    return Parts(h0, h1, h2, R)
+    return BlockKernels(h0, h1, h2, R)
 
 
 def _blocks(
-    s: Subject, run: Stretches, u: np.ndarray, lagged: np.ndarray, P: np.ndarray, R: np.ndarray
+    s: OutputModel, run: AveragingRun, u: np.ndarray, lagged: np.ndarray, P: np.ndarray, R: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     B, M, N = run.blocks, run.memory, run.blocks * run.width
     with double_precision():
-        y, slope = slopes(
+        y, slope = output_derivatives(
             s.mechanism.structure,
             s.solver,
             s.output,
@@ -138,7 +213,7 @@ def _blocks(
         )
     cut = slope.reshape(run.reach, B, run.width)
     g = np.mean(cut, axis=2).T  # (B, L)
-    # The slope's mean is taken out: it would only multiply the mean of the input, which is zero.
+    # The mean slope is subtracted: it would only multiply the mean of the input, which is zero.
     varying = cut - np.mean(slope, axis=1)[:, None, None]
     phi = (lagged[:, :M] - np.mean(lagged[:, :M], axis=0)).reshape(B, run.width, M)
     C = np.einsum("lbt,btm->blm", varying, phi, optimize=True) / run.width
@@ -148,8 +223,8 @@ def _blocks(
     return np.mean(y.reshape(B, run.width), axis=1) - np.sum(h2 * R, axis=(1, 2)), h1, h2
 
 
-def kernels_of(run: Stretches, found: Parts, channel: str) -> Kernels:
-    """Means over the stretches, standard errors from their scatter."""
+def kernels_of(run: AveragingRun, found: BlockKernels, channel: str) -> Kernels:
+    """Means over the blocks, standard errors from their scatter."""
     mean, root = lambda a: np.mean(a, axis=0), np.sqrt(run.blocks)
     std = lambda a: np.std(a, axis=0, ddof=1) / root  # noqa: E731
     u = run.u - run.about
@@ -165,7 +240,7 @@ def kernels_of(run: Stretches, found: Parts, channel: str) -> Kernels:
         kind="average",
         input=f"{len(u)} samples, {rms:.3g} {run.unit[0]} rms, excess kurtosis {excess:.2g}"
         + (", and mirrored" if run.mirrored else ""),
-        note="" if abs(excess) < GAUSSIAN else FAR,
+        note="" if abs(excess) < GAUSSIAN_EXCESS_KURTOSIS else NOT_GAUSSIAN_NOTE,
         covariance=found.R,
         h0_std=float(std(found.h0)),
         h1_std=std(found.h1),

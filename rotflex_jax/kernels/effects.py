@@ -1,32 +1,32 @@
-"""Which effect a kernel encodes: kernels with all effects, less those with one of them switched off."""
+"""Contribution of each effect to the kernels: those with all effects less those with one switched off."""
 
 import dataclasses
 from typing import Any
 
 import numpy as np
+from jaxtyping import Real
 
-from rotflex_jax.effects.kinds import Effect, Linear
-from rotflex_jax.kernels.average import Parts, kernels_of, parts
+from rotflex_jax.effects.base import Effect
+from rotflex_jax.kernels.average import AveragingRun, BlockKernels, block_kernels, kernels_of
 from rotflex_jax.kernels.result import Kernels, linear_size, quadratic_size, root_mean_square
-from rotflex_jax.kernels.stretches import Stretches
-from rotflex_jax.kernels.subject import Modelled, lags_of, subject
+from rotflex_jax.kernels.sensitivities import Modelled, lags_of, output_model
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.recording import Recording
 
-# A change below so many standard errors (rms over the kernel) is called nothing; chance gives about one.
-NOTICED = 2.0
-# Changes and errors below this share of the linear kernel are rounding.
-ROUNDING = 1e-9
+DETECTED_STANDARD_ERRORS = 2.0
+"""A smaller change (rms over the kernel) is reported as nothing; chance gives about one."""
+ROUNDING_SHARE = 1e-9
+"""Changes and errors below this share of the linear kernel are rounding."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EffectShare:
-    """What one effect does to the kernels.
+    """Contribution of one effect to the kernels.
 
     Attributes:
-        effect: The effect, with its numbers.
+        effect: The effect, with its parameter values.
         change: Kernels with it less kernels without it; standard errors of the difference.
-        linear: Size of the change of `h1` as a share of the linear response, freed of its expected noise.
+        linear: Size of the change of `h1` as a share of the linear response, less its expected noise.
         quadratic: Size of the change of `h2` as a share of the linear response, likewise.
         z: Root mean square of both changes in standard errors; chance alone gives about one. Zero where
             nothing changed at all, infinite where the change is the same everywhere, as a linear effect's.
@@ -91,7 +91,7 @@ class EffectKernels:
 
 def effect_kernels(
     model: Mechanism | Modelled,
-    data: Recording | np.ndarray,
+    data: Recording | Real[np.ndarray, " N"],
     channel: str,
     memory: int,
     *,
@@ -99,22 +99,22 @@ def effect_kernels(
     reach: int | None = None,
     blocks: int = 20,
     mirrored: bool = False,
-    autocovariance: np.ndarray | None = None,
+    autocovariance: Real[np.ndarray, " _"] | None = None,
 ) -> EffectKernels:
     """Average kernels of a model, and their change when one effect at a time is switched off.
 
-    Effects that every joint has (inertia, spring, motor) stay, and so do those whose amplitudes are
-    zero or whose gate is. Changes need not add up: a dead zone matters more where friction is.
+    Effects that every joint has (inertia, spring, motor) are not switched off, nor those that are inactive
+    already. Changes need not add up: a dead zone changes more where friction acts too.
 
     Args:
         model: As in `average_kernels`, and so is what follows.
-        data: Recording or voltage (N,) [V]; the same motion of the voltage is used throughout, so most of
-            the noise cancels in the differences.
+        data: Recording or voltage [V]; the same input is used throughout, so most of the noise cancels in
+            the differences.
         channel: Output.
         memory: Number of lags.
         Ts: Sampling period [s], where `data` is a voltage.
-        reach: Lags over which slopes are formed.
-        blocks: Stretches that standard errors come from.
+        reach: Lags of the output derivatives.
+        blocks: Blocks that standard errors come from.
         mirrored: Average over the voltage and the same with opposite sign.
         autocovariance: Of the input, where known [V^2].
 
@@ -124,9 +124,9 @@ def effect_kernels(
     Raises:
         InputError: As `average_kernels`.
     """
-    s, memory = subject(model, channel), lags_of(memory)
-    run = Stretches.of(s, data, Ts, memory, reach, blocks, mirrored)
-    all_on = parts(s, run, autocovariance)
+    s, memory = output_model(model, channel), lags_of(memory)
+    run = AveragingRun.of(s, data, Ts, memory, reach, blocks, mirrored)
+    all_on = block_kernels(s, run, autocovariance)
     whole = kernels_of(run, all_on, channel)
     shares = []
     for i, effect in enumerate(s.mechanism.effects):
@@ -134,26 +134,26 @@ def effect_kernels(
             continue
         gates = s.gates.copy()
         gates[i] = 0.0
-        without = parts(s._replace(gates=gates), run, autocovariance)
+        without = block_kernels(s._replace(gates=gates), run, autocovariance)
         change = (a - b for a, b in zip(all_on[:3], without[:3], strict=True))
-        shares.append(_share(effect, run, Parts(*change, R=all_on.R), whole))
+        shares.append(_share(effect, run, BlockKernels(*change, R=all_on.R), whole))
     return EffectKernels(whole, tuple(shares))
 
 
 def _switchable(effect: Effect) -> bool:
-    if isinstance(effect, Linear) and not effect.searched:
+    if effect.is_linear and not effect.searched:
         return False
     sizes = [float(effect.values[name]) for name in effect.amplitudes]
     return not sizes or any(sizes)
 
 
-def _share(effect: Effect, run: Stretches, difference: Parts, whole: Kernels) -> EffectShare:
+def _share(effect: Effect, run: AveragingRun, difference: BlockKernels, whole: Kernels) -> EffectShare:
     change = kernels_of(run, difference, whole.channel)
     R, reference = whole.spread, whole.sizes[0] or 1.0
     first, second = change.errors
-    linear = _beyond_chance(difference.h1, lambda h: linear_size(h, R)) / reference
-    quadratic = _beyond_chance(difference.h2, lambda h: quadratic_size(h, R)) / reference
-    z = (_surprise(change.h1, first, whole.h1), _surprise(change.h2, second, whole.h1))
+    linear = _size_without_noise(difference.h1, lambda h: linear_size(h, R)) / reference
+    quadratic = _size_without_noise(difference.h2, lambda h: quadratic_size(h, R)) / reference
+    z = (_standardised_change(change.h1, first, whole.h1), _standardised_change(change.h2, second, whole.h1))
     return EffectShare(
         effect=effect,
         change=change,
@@ -163,27 +163,27 @@ def _share(effect: Effect, run: Stretches, difference: Parts, whole: Kernels) ->
     )
 
 
-def _surprise(change: np.ndarray, std: np.ndarray, reference: np.ndarray) -> float:
-    """Root mean square of a change in standard errors, with rounding told from chance."""
-    rounding = ROUNDING * (np.max(np.abs(reference)) or 1.0)
+def _standardised_change(change: np.ndarray, std: np.ndarray, reference: np.ndarray) -> float:
+    """Root mean square of a change in standard errors; zero or infinite where only rounding scatters."""
+    rounding = ROUNDING_SHARE * (np.max(np.abs(reference)) or 1.0)
     if np.max(np.abs(change)) < rounding:
         return 0.0
     seen = std > 1e-6 * np.max(std)
     return root_mean_square(change[seen] / std[seen]) if np.max(std) > rounding else np.inf
 
 
-def _beyond_chance(stretches: np.ndarray, size: Any) -> float:
-    """Size of the mean less what the scatter of the stretches adds to it, both squared."""
-    mean = np.mean(stretches, axis=0)
-    scatter = np.mean([size(part - mean) ** 2 for part in stretches]) / (len(stretches) - 1)
+def _size_without_noise(blocks: np.ndarray, size: Any) -> float:
+    """Size of the mean less what the scatter of the blocks adds to it, both squared."""
+    mean = np.mean(blocks, axis=0)
+    scatter = np.mean([size(block - mean) ** 2 for block in blocks]) / (len(blocks) - 1)
     return float(np.sqrt(max(size(mean) ** 2 - scatter, 0.0)))
 
 
 def _words(share: float, z: float, unit: str = "") -> str:
-    """A share with its change in standard errors; chance alone is called nothing."""
+    """A share with its change in standard errors; chance alone is reported as nothing."""
     if z == 0:
         return "exactly nothing"
-    if z < NOTICED:
+    if z < DETECTED_STANDARD_ERRORS:
         return f"nothing ({z:.1f}{unit})"
     if np.isinf(z):
         return f"{100 * share:.2g} % (exact)"

@@ -4,32 +4,34 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Real
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels
-from rotflex_jax.kernels.subject import lags_of
+from rotflex_jax.kernels.sensitivities import lags_of
 from rotflex_jax.recording import Recording
 
 
 def identified_kernels(
-    identified: Any,  # a SeriesFit or a Series, which stand above this layer
+    identified: Any,  # a SeriesFit or a Series, of the layers above
     memory: int,
-    data: Recording | Sequence[Recording] | np.ndarray | None = None,
+    data: Recording | Sequence[Recording] | Real[np.ndarray, " N"] | None = None,
     *,
     about: float = 0.0,
 ) -> Kernels:
     """The kernels that the weights of a fitted Volterra series stand for.
 
-    A cube leans on a line: under a Gaussian input the best line of `h3` is `3 sum_jl h3[k, j, l] R[j, l]`,
-    and it is counted in `h1`, so that kernels of bases with and without a cubic degree mean the same.
+    Under a Gaussian input the best linear approximation of a cubic kernel is
+    `3 sum_jl h3[k, j, l] R[j, l]`; it is added to `h1`, so that kernels of bases with and without a cubic
+    degree are comparable.
 
     Args:
         identified: A fit of a Volterra basis (`least_squares`), whose covariance gives standard errors,
             or the frozen series alone (an adaptive filter's), which has none.
-        memory: Lags to give; the kernels of an orthonormal basis have no end of their own.
+        memory: Number of lags; the kernels of an orthonormal basis have infinite length.
         data: What the series was fitted to, or its input (N,) [V]: sizes are measured with the covariance
             of this input. Needed for a cubic degree.
-        about: Level that was taken from the input before the fit [V].
+        about: Level that was subtracted from the input before the fit [V].
 
     Raises:
         InputError: The basis has a degree above three, or a cubic one and there is no input.
@@ -47,13 +49,13 @@ def identified_kernels(
     spread, words = _input(data, memory, about, series.input_unit)
 
     def orders(w: np.ndarray) -> list[np.ndarray]:
-        """Constant, line and square of weights, or of a direction of them."""
+        """Kernels of degree 0 to 2 of weights, or of a direction of them."""
         found = {d: np.asarray(h, float) for d, h in series.basis.kernels(w, memory).items()}
         highest = max(found)
         if highest > 3 or (highest == 3 and spread is None):
             raise InputError(
                 f"A basis of degree {highest} was given{' without data' if highest == 3 else ''}, but "
-                "kernels are compared up to degree 2, a cube by its best line under the input; fit degrees "
+                "kernels are compared up to degree 2, a cube by its linear part under the input; fit degrees "
                 "up to 3 and give the recordings of the fit."
             )
         h = [found.get(d, np.zeros((memory,) * d)) for d in range(3)]
@@ -64,9 +66,9 @@ def identified_kernels(
     h0, h1, h2 = orders(np.asarray(series.weights, float))
     std: list[Any] = [0.0, None, None]
     if covariance is not None:
-        # Regressors that a selection left out have no covariance: their weights are zero for certain.
-        sizes, ways = np.linalg.eigh(np.nan_to_num(np.asarray(covariance, float)))
-        columns = [orders(way) for way in (ways * np.sqrt(np.maximum(sizes, 0.0))).T]
+        # Regressors that a selection left out have no covariance: their weights are zero exactly.
+        sizes, directions = np.linalg.eigh(np.nan_to_num(np.asarray(covariance, float)))
+        columns = [orders(d) for d in (directions * np.sqrt(np.maximum(sizes, 0.0))).T]
         std = [np.sqrt(sum(c[d] ** 2 for c in columns)) for d in range(3)]
     return Kernels(
         channel=series.channel,

@@ -8,17 +8,16 @@ import numpy as np
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels
-from rotflex_jax.kernels.subject import Modelled, lags_of, subject
-from rotflex_jax.mechanism.assembly import driven_voltage, rest_state
+from rotflex_jax.kernels.sensitivities import Modelled, lags_of, output_model
+from rotflex_jax.mechanism.assembly import motor_voltage, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.programs import kept
-from rotflex_jax.mechanism.propagate import states
-from rotflex_jax.mechanism.sensors import read_outputs
-from rotflex_jax.mechanism.simulate import FreeStep, Solver, free_run
-from rotflex_jax.precision import double_precision
+from rotflex_jax.mechanism.scan import states
+from rotflex_jax.mechanism.simulate import FreeStep, Solver, free_run, read_outputs
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import double_precision
 
-# Directions that are differentiated at once: enough for the vector units, few enough for the cache.
-BATCH = 64
+DIRECTIONS_PER_BATCH = 64
+"""Directions that are differentiated at once: enough for the vector units, few enough for the cache."""
 
 
 def local_kernels(
@@ -35,10 +34,10 @@ def local_kernels(
 
         h1[k] = dy[t] / du[t-k],   h2[k, j] = 1/2 d2y[t] / du[t-k] du[t-j],   u near a constant
 
-    The second-order series of a smooth mechanism is right to third order in the input's deviation. Not
-    for dry friction, dead zones and play at rest: a joint that sticks has zero slope there, however
-    much it moves under a real input, and a joint that slides at a constant voltage has the slope of
-    the joint without friction. `average_kernels` are what an identification finds then.
+    The second-order series of a smooth mechanism has an error of third order in the input's deviation. Not
+    for dry friction, dead zones and play at rest: a joint that sticks has zero slope there, and a joint that
+    slides at a constant voltage has the slope of the joint without friction. An identification finds
+    `average_kernels` there.
 
     Args:
         model: Mechanism, or a model with its own integration rule and gates.
@@ -46,9 +45,9 @@ def local_kernels(
         channel: Output.
         memory: Number of lags M, from 0 to M - 1.
         voltage: Constant voltage that the series is about [V].
-        settle: How long that voltage acts, from rest, before the kernels are taken [s]; five memories
-            if None. What still moves after that (the angle of a turning hub) is part of `h0`.
-        cubic: Also the diagonal of the cubic kernel.
+        settle: How long that voltage acts, from rest, before the kernels are formed [s]; five memories
+            if None. A motion that continues after that (the angle of a turning hub) is part of `h0`.
+        cubic: Whether to form the diagonal of the cubic kernel too.
 
     Returns:
         Exact kernels of the simulated model, without standard errors.
@@ -63,7 +62,7 @@ def local_kernels(
     >>> [round(float(h), 4) + 0.0 for h in kernels.h1]
     [0.0, -0.0491, -0.0188, 0.0297]
     """
-    s, memory = subject(model, channel), lags_of(memory)
+    s, memory = output_model(model, channel), lags_of(memory)
     settle = 5 * memory * Ts if settle is None else settle
     if not (np.isfinite(Ts) and Ts > 0 and np.isfinite(settle) and settle >= 0):
         raise InputError(
@@ -98,7 +97,7 @@ def local_kernels(
     )
 
 
-@kept(static=5)
+@persistent_jit(static=5)
 def _derivatives(
     structure: Mechanism,
     solver: Solver,
@@ -117,24 +116,24 @@ def _derivatives(
     c = solver.prepare(structure, values, gates, Ts)
 
     def last(recent: jax.Array) -> jax.Array:
-        """The output at the end, of the input from the latest sample backwards."""
+        """The output at the end as a function of the input, latest sample first."""
         u = jnp.concatenate([before, recent[::-1]])
-        # Effects of the actuator may remember: they see what came before, too.
-        v = driven_voltage(mechanism, gates, u, Ts)[len(before) :]
+        # Actuation may have a memory, so it gets the earlier samples too.
+        v = motor_voltage(mechanism, gates, u, Ts)[len(before) :]
         X = states(FreeStep(structure, solver), x0, v, c)
         return read_outputs(mechanism, gates, X[-1])[output]
 
-    here, ways = jnp.full(memory, before[-1]), jnp.eye(memory)
-    batch = min(memory, BATCH)
-    along = lambda f, way: lambda u: jax.jvp(f, (u,), (way,))[1]  # noqa: E731
-    h1 = jax.lax.map(lambda e: along(last, e)(here), ways, batch_size=batch)
+    here, units = jnp.full(memory, before[-1]), jnp.eye(memory)
+    batch = min(memory, DIRECTIONS_PER_BATCH)
+    derivative = lambda f, e: lambda u: jax.jvp(f, (u,), (e,))[1]  # noqa: E731
+    h1 = jax.lax.map(lambda e: derivative(last, e)(here), units, batch_size=batch)
 
     def row(e: jax.Array) -> jax.Array:
-        return jax.vmap(lambda d: along(along(last, e), d)(here))(ways)
+        return jax.vmap(lambda d: derivative(derivative(last, e), d)(here))(units)
 
-    h2 = jax.lax.map(row, ways, batch_size=max(1, BATCH // memory)) / 2
+    h2 = jax.lax.map(row, units, batch_size=max(1, DIRECTIONS_PER_BATCH // memory)) / 2
     h2 = (h2 + h2.T) / 2
     if not cubic:
         return last(here), h1, h2, None
-    third = lambda e: along(along(along(last, e), e), e)(here) / 6  # noqa: E731
-    return last(here), h1, h2, jax.lax.map(third, ways, batch_size=batch)
+    third = lambda e: derivative(derivative(derivative(last, e), e), e)(here) / 6  # noqa: E731
+    return last(here), h1, h2, jax.lax.map(third, units, batch_size=batch)

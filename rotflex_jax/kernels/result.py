@@ -1,9 +1,10 @@
 """Kernels of order zero to two of one output, and how well two sets of them agree."""
 
 import dataclasses
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Real
 
 from rotflex_jax.errors import InputError
 
@@ -18,18 +19,18 @@ class Kernels:
         channel: Output.
         Ts: Sampling period [s]; kernels are per sample of the held input.
         h0: Output at the level `about` (local), or the constant of the series (average) [output_unit].
-        h1: Linear kernel (M,), index = lag in samples [output_unit / input_unit].
-        h2: Quadratic kernel (M, M), symmetric [output_unit / input_unit^2].
+        h1: Linear kernel, index = lag in samples [output_unit / input_unit].
+        h2: Quadratic kernel, symmetric [output_unit / input_unit^2].
         about: Input level that the series is about [input_unit].
         kind: "local", "average" or "identified".
         input: Where the kernels hold, in words.
-        note: What to bear in mind, empty where nothing.
-        covariance: Covariance (M, M) of the input at the lags [input_unit^2]; None counts as white of
-            unit variance wherever sizes are compared.
+        note: A restriction on their use, empty where there is none.
+        covariance: Covariance of the input at the lags [input_unit^2]; None counts as white noise of unit
+            variance where sizes are compared.
         h0_std: Standard error of `h0`; zero where the derivative is exact.
         h1_std: Standard errors of `h1`.
         h2_std: Standard errors of `h2`.
-        h3_diagonal: `h3[k, k, k]` (M,) of the cubic kernel [output_unit / input_unit^3], where asked for.
+        h3_diagonal: `h3[k, k, k]` of the cubic kernel [output_unit / input_unit^3], where asked for.
         input_unit: Unit of the input.
         output_unit: Unit of the output.
     """
@@ -37,17 +38,17 @@ class Kernels:
     channel: str
     Ts: float
     h0: float
-    h1: np.ndarray
-    h2: np.ndarray
+    h1: Real[np.ndarray, " M"]
+    h2: Real[np.ndarray, "M M"]
     about: float = 0.0
     kind: str = "local"
     input: str = ""
     note: str = ""
-    covariance: np.ndarray | None = None
+    covariance: Real[np.ndarray, "M M"] | None = None
     h0_std: float = 0.0
-    h1_std: np.ndarray | None = None
-    h2_std: np.ndarray | None = None
-    h3_diagonal: np.ndarray | None = None
+    h1_std: Real[np.ndarray, " M"] | None = None
+    h2_std: Real[np.ndarray, "M M"] | None = None
+    h3_diagonal: Real[np.ndarray, " M"] | None = None
     input_unit: str = "V"
     output_unit: str = "rad"
 
@@ -57,17 +58,17 @@ class Kernels:
         return len(self.h1)
 
     @property
-    def lags(self) -> np.ndarray:
-        """Lags (M,) [s]."""
+    def lags(self) -> Float[np.ndarray, " M"]:
+        """Lags [s]."""
         return self.Ts * np.arange(self.memory)
 
     @property
-    def spread(self) -> np.ndarray:
-        """Covariance of the input that sizes are measured with; unit and white where none is known."""
+    def spread(self) -> Real[np.ndarray, "M M"]:
+        """Covariance of the input for sizes; the unit matrix where none is known."""
         return np.eye(self.memory) if self.covariance is None else self.covariance
 
     @property
-    def errors(self) -> tuple[np.ndarray, np.ndarray]:
+    def errors(self) -> tuple[Real[np.ndarray, " M"], Real[np.ndarray, "M M"]]:
         """Standard errors of `h1` and `h2`, zero where the kernels are exact."""
         M = self.memory
         first = np.zeros(M) if self.h1_std is None else self.h1_std
@@ -75,7 +76,7 @@ class Kernels:
 
     @property
     def sizes(self) -> tuple[float, float]:
-        """Root mean square [output_unit] that each degree gives under a Gaussian input of this covariance."""
+        """Root mean square [output_unit] of the output of each degree under a Gaussian input."""
         return linear_size(self.h1, self.spread), quadratic_size(self.h2, self.spread)
 
     def units(self, degree: int) -> str:
@@ -83,8 +84,8 @@ class Kernels:
         power = {0: "", 1: f"/{self.input_unit}", 2: f"/{self.input_unit}²", 3: f"/{self.input_unit}³"}
         return self.output_unit + power[degree]
 
-    def moved(self, about: float) -> Self:
-        """The same series written about another input level; standard errors move by first order.
+    def moved(self, about: float) -> "Kernels":
+        """The same series about another input level; standard errors to first order.
 
         Args:
             about: New level [input_unit].
@@ -99,11 +100,11 @@ class Kernels:
             h1_std=np.hypot(first, 2 * step * np.sqrt(np.sum(second**2, axis=1))),
         )
 
-    def response(self, u: np.ndarray) -> np.ndarray:
-        """Output (N,) of the series; before the first sample the input is taken to be `about`.
+    def response(self, u: Real[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+        """Output of the series; before the first sample the input is taken to be `about`.
 
         Args:
-            u: Input (N,) [input_unit].
+            u: Input [input_unit].
         """
         v = np.concatenate([np.zeros(self.memory - 1), np.asarray(u, float) - self.about])
         phi = np.lib.stride_tricks.sliding_window_view(v, self.memory)[:, ::-1]
@@ -113,15 +114,15 @@ class Kernels:
         """Difference from other kernels in units of their standard errors.
 
         Args:
-            other: Of the same channel, sampling period and memory; moved to this input level.
+            other: Of the same channel, sampling period and memory; converted to this input level.
 
         Raises:
-            InputError: The two speak of different things.
+            InputError: Channel, sampling period or memory differ.
         """
         mine, theirs = (self.channel, self.memory), (other.channel, other.memory)
         if mine != theirs or abs(self.Ts - other.Ts) > 1e-9 * self.Ts:
             raise InputError(
-                f"Kernels of {self.channel!r} with {self.memory} lags of {self.Ts:g} s were set against "
+                f"Kernels of {self.channel!r} with {self.memory} lags of {self.Ts:g} s were compared with "
                 f"those of {other.channel!r} with {other.memory} lags of {other.Ts:g} s; form both for "
                 "the same channel, sampling period and memory."
             )
@@ -162,18 +163,18 @@ class Agreement:
     second: Kernels
 
     @property
-    def z1(self) -> np.ndarray:
-        """Difference of `h1` over its standard error (M,); NaN where neither has one."""
+    def z1(self) -> Float[np.ndarray, " M"]:
+        """Difference of `h1` over its standard error; NaN where neither has one."""
         return _over(self.first.h1 - self.second.h1, self.first.errors[0], self.second.errors[0])
 
     @property
-    def z2(self) -> np.ndarray:
-        """Difference of `h2` over its standard error (M, M); NaN where neither has one."""
+    def z2(self) -> Float[np.ndarray, "M M"]:
+        """Difference of `h2` over its standard error; NaN where neither has one."""
         return _over(self.first.h2 - self.second.h2, self.first.errors[1], self.second.errors[1])
 
     @property
     def rms(self) -> tuple[float, float]:
-        """Root mean square of `z1` and `z2`: about one where only chance tells the two apart."""
+        """Root mean square of `z1` and `z2`: about one where the two differ by chance only."""
         upper = self.z2[np.triu_indices(len(self.z2))]
         return root_mean_square(self.z1), root_mean_square(upper)
 
@@ -194,19 +195,19 @@ class Agreement:
         )
 
 
-def linear_size(h1: np.ndarray, covariance: np.ndarray) -> float:
+def linear_size(h1: Real[np.ndarray, " M"], covariance: Real[np.ndarray, "M M"]) -> float:
     """Root mean square of the linear part, `sqrt(h1' R h1)`."""
     return float(np.sqrt(max(h1 @ covariance @ h1, 0.0)))
 
 
-def quadratic_size(h2: np.ndarray, covariance: np.ndarray) -> float:
+def quadratic_size(h2: Real[np.ndarray, "M M"], covariance: Real[np.ndarray, "M M"]) -> float:
     """Standard deviation of the quadratic part under a Gaussian input, `sqrt(2 tr(h2 R h2 R))`."""
     product = h2 @ covariance
     return float(np.sqrt(max(2 * np.sum(product * product.T), 0.0)))
 
 
-def root_mean_square(z: np.ndarray) -> float:
-    """Of the finite entries; zero where there are none."""
+def root_mean_square(z: Float[np.ndarray, "..."]) -> float:
+    """Root mean square of the finite entries; zero where there are none."""
     finite = z[np.isfinite(z)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
 

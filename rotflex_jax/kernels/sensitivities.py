@@ -1,113 +1,190 @@
-"""How an output answers each of the last input samples, at every sample of a trajectory.
+"""Derivatives of a model's output with respect to each of its last input samples.
 
-A trajectory `x[t+1] = F(x[t], v[t])` has the slopes `A[t] = dF/dx`, `B[t] = dF/dv`, which follow from the
-states alone and are formed for all samples at once. The answer to the voltage k samples ago is then
-`A[t-1] ... A[t-k+1] B[t-k]`, a recursion over the lag in which all samples go side by side.
+A trajectory `x[t+1] = F(x[t], v[t])` has the Jacobians `A[t] = dF/dx`, `B[t] = dF/dv`, which follow from the
+states alone and are formed for all samples at once. The response to the voltage k samples ago is
+`A[t-1] ... A[t-k+1] B[t-k]`, a recursion over the lag that treats all samples side by side.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Real
 
-from rotflex_jax.effects.kinds import Actuation
-from rotflex_jax.mechanism.assembly import driven_voltage, effects_of
+from rotflex_jax.effects.base import Actuation
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.programs import kept
-from rotflex_jax.mechanism.propagate import chunks, joined, states
-from rotflex_jax.mechanism.sensors import read_outputs
-from rotflex_jax.mechanism.simulate import FreeStep, Solver
+from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
+from rotflex_jax.mechanism.simulate import FreeStep, Solver, read_outputs
+from rotflex_jax.mechanism.step import Exponential
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 
 
-@kept(static=4)
-def slopes(
+@runtime_checkable
+class Modelled(Protocol):
+    """A model: mechanism, integration rule, one gate per effect or None for all on."""
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The physics."""
+        ...
+
+    @property
+    def solver(self) -> Solver:
+        """Integration rule."""
+        ...
+
+    @property
+    def gates(self) -> tuple[float, ...] | None:
+        """Factor of each effect."""
+        ...
+
+
+class OutputModel(NamedTuple):
+    """One output of a mechanism with its solver and gates.
+
+    Attributes:
+        mechanism: The physics.
+        solver: Integration rule.
+        gates: One factor per effect.
+        output: Index of the output.
+    """
+
+    mechanism: Mechanism
+    solver: Solver
+    gates: Float[np.ndarray, " E"]
+    output: int
+
+    @property
+    def unit(self) -> str:
+        """Unit of the output."""
+        return self.mechanism.quantities[self.output].unit(self.mechanism.units)
+
+
+def output_model(model: Mechanism | Modelled, channel: str) -> OutputModel:
+    """One output of a model; a bare mechanism is integrated by one exponential step per sample.
+
+    Raises:
+        InputError: The mechanism has no such output.
+    """
+    if isinstance(model, Mechanism):
+        mechanism, solver, given = model, Exponential(), None
+    else:
+        mechanism, solver, given = model.mechanism, model.solver, model.gates
+    if channel not in mechanism.channels:
+        raise InputError(
+            f"Kernels of {channel!r} were requested, but the mechanism has the outputs "
+            f"{', '.join(mechanism.channels)}; choose one of these."
+        )
+    if getattr(solver, "between", "held") != "held":
+        raise InputError(
+            "Kernels were requested of a model whose voltage is smooth between its samples, but then each "
+            'sample acts before its time; use a solver with between="held".'
+        )
+    gates = np.ones(len(mechanism.effects)) if given is None else np.array(given, float)
+    return OutputModel(mechanism, solver, gates, mechanism.channels.index(channel))
+
+
+def lags_of(memory: int) -> int:
+    """The number of lags as an integer.
+
+    Raises:
+        InputError: Not a whole number of at least one lag.
+    """
+    if memory != int(memory) or memory < 1:
+        raise InputError(
+            f"Argument `memory` was given {memory!r}, but it needs a whole number of lags; give 1 or more."
+        )
+    return int(memory)
+
+
+@persistent_jit(static=4)
+def output_derivatives(
     structure: Mechanism,
     solver: Solver,
     output: int,
     reach: int,
-    values: jax.Array,
-    gates: jax.Array,
-    x0: jax.Array,
-    u: jax.Array,
-    Ts: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """The output (N,) and its derivatives `dy[t] / du[t-k]` (reach, N); those of t < k mean nothing.
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    x0: Float[Array, " n"],
+    u: Float[Array, " N"],
+    Ts: Float[Array, ""],
+) -> tuple[Float[Array, " N"], Float[Array, "reach N"]]:
+    """The output and its derivatives `dy[t] / du[t-k]`; those with t < k are undefined.
 
     Args:
         structure: `mechanism.structure`; static.
         solver: Integration rule; static.
         output: Index of the output; static.
         reach: Number of lags, from 0; static.
-        values: Parameter values (P,).
+        values: Parameter values.
         gates: One factor per effect.
-        x0: First state (n,).
-        u: Voltage (N,) [V].
+        x0: First state.
+        u: Voltage [V].
         Ts: Sampling period [s].
     """
     mechanism = structure.with_values(values)
     c = solver.prepare(structure, values, gates, Ts)
-    v = driven_voltage(mechanism, gates, u, Ts)
+    v = motor_voltage(mechanism, gates, u, Ts)
     step = FreeStep(structure, solver)
     X = states(step, x0, v, c)
     read = lambda x: read_outputs(mechanism, gates, x)[output]  # noqa: E731
 
-    def local(here: Any) -> tuple[jax.Array, ...]:
-        """The output, slopes of the next state along states and voltage, and slopes of the output."""
+    def local(here: Any) -> tuple[Array, ...]:
+        """The output, derivatives of the next state by states and voltage, and derivatives of the output."""
         x, w = here
         size = len(x0) + 1
-        ways = jnp.broadcast_to(jnp.eye(size, dtype=x.dtype)[:, :, None], (size, size, len(w)))
-        slope = lambda way: jax.jvp(lambda q, r: step(q, r, c), (x, w), (way[:-1], way[-1]))[1]  # noqa: E731
-        reading = lambda way: jax.jvp(read, (x,), (way[:-1],))[1]  # noqa: E731
-        return read(x), jax.vmap(slope)(ways), jax.vmap(reading)(ways[:-1])
+        units = jnp.broadcast_to(jnp.eye(size, dtype=x.dtype)[:, :, None], (size, size, len(w)))
+        column = lambda e: jax.jvp(lambda q, r: step(q, r, c), (x, w), (e[:-1], e[-1]))[1]  # noqa: E731
+        reading = lambda e: jax.jvp(read, (x,), (e[:-1],))[1]  # noqa: E731
+        return read(x), jax.vmap(column)(units), jax.vmap(reading)(units[:-1])
 
-    pieces = jax.lax.map(local, chunks((X, v)))
-    y, AB, row = (jnp.moveaxis(joined(piece, len(u)), 0, -1) for piece in pieces)
+    pieces = jax.lax.map(local, split_into_chunks((X, v)))
+    y, AB, row = (jnp.moveaxis(join_chunks(piece, len(u)), 0, -1) for piece in pieces)
     A, B = AB[:-1], AB[-1]
 
-    def back(dx: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
-        """From the state's answer to the voltage k samples ago to that k + 1 samples ago."""
+    def next_lag(dx: Array, _: None) -> tuple[Array, Array]:
+        """From the state's response to the voltage k samples ago to that k + 1 samples ago."""
         return jnp.roll(jnp.sum(A * dx[:, None], axis=0), 1, axis=1), jnp.sum(row * dx, axis=0)
 
-    # The voltage of a sample acts on the next state at the earliest.
-    later = jax.lax.scan(back, jnp.roll(B, 1, axis=1), None, length=reach)[1]
-    answers = jnp.concatenate([jnp.zeros_like(later[:1]), later[: reach - 1]])
+    # The voltage of a sample acts on the next state first.
+    later = jax.lax.scan(next_lag, jnp.roll(B, 1, axis=1), None, length=reach)[1]
+    responses = jnp.concatenate([jnp.zeros_like(later[:1]), later[: reach - 1]])
     if effects_of(mechanism, Actuation):
-        answers = _commanded(mechanism, gates, u, Ts, answers)
-    return y, answers
+        responses = _by_command(mechanism, gates, u, Ts, responses)
+    return y, responses
 
 
-def _commanded(
-    mechanism: Mechanism, gates: jax.Array, u: jax.Array, Ts: jax.Array, answers: jax.Array
-) -> jax.Array:
-    """Answers to the commanded voltage from answers to the driven one.
+def _by_command(mechanism: Mechanism, gates: Array, u: Array, Ts: Array, responses: Array) -> Array:
+    """Responses to the commanded voltage from those to the motor's voltage.
 
     dy[t] / du[t-k] = sum_m dy[t] / dv[t-k+m]  dv[t-k+m] / du[t-k]
     """
-    drive = lambda w: driven_voltage(mechanism, gates, w, Ts)  # noqa: E731
-    slope = lambda way: jax.jvp(drive, (u,), (way,))[1]  # noqa: E731
-    at = jnp.arange(len(u))[None, :] - jnp.arange(len(answers))[:, None]
+    drive = lambda w: motor_voltage(mechanism, gates, w, Ts)  # noqa: E731
+    slope = lambda e: jax.jvp(drive, (u,), (e,))[1]  # noqa: E731
+    at = jnp.arange(len(u))[None, :] - jnp.arange(len(responses))[:, None]
     own, probe = slope(jnp.ones_like(u)), jax.random.normal(jax.random.key(0), u.shape, u.dtype)
-    # An actuator without memory answers each sample by its own, whatever the samples are.
+    # The output of an actuator without memory depends on the sample of the same time only.
     at_once = jnp.allclose(slope(probe), own * probe, rtol=1e-9, atol=1e-12)
-    return jax.lax.cond(at_once, lambda: answers * own[at], lambda: _remembered(slope, u, at, answers))
+    return jax.lax.cond(at_once, lambda: responses * own[at], lambda: _convolved(slope, u, at, responses))
 
 
-def _remembered(
-    slope: Callable[[jax.Array], jax.Array], u: jax.Array, at: jax.Array, answers: jax.Array
-) -> jax.Array:
-    """The sum of `_commanded` over all m below `reach`.
+def _convolved(slope: Callable[[Array], Array], u: Array, at: Array, responses: Array) -> Array:
+    """The sum of `_by_command` over all m below `reach`.
 
-    The slopes of the actuator come from combs, whose teeth are so far apart (`reach`) that their
-    answers do not overlap: the one at a sample belongs to the latest tooth.
+    The derivatives of the actuator come from impulse trains of the period `reach`, so that the responses to
+    single impulses do not overlap: a sample belongs to the latest impulse.
     """
-    reach, time = len(answers), jnp.arange(len(u))
-    combs = jax.lax.map(lambda p: slope((time % reach == p).astype(u.dtype)), jnp.arange(reach))
+    reach, time = len(responses), jnp.arange(len(u))
+    trains = jax.lax.map(lambda p: slope((time % reach == p).astype(u.dtype)), jnp.arange(reach))
     lag = jnp.arange(reach)[:, None]
 
-    def add(m: jax.Array, total: jax.Array) -> jax.Array:
-        """What reaches the motor m samples after its command."""
-        moved = jnp.roll(answers * combs[(at - m) % reach, at], m, axis=0)
+    def add(m: Array, total: Array) -> Array:
+        """Adds the part that reaches the motor m samples after its command."""
+        moved = jnp.roll(responses * trains[(at - m) % reach, at], m, axis=0)
         return total + jnp.where(lag >= m, moved, 0.0)
 
-    return jax.lax.fori_loop(0, reach, add, jnp.zeros_like(answers))
+    return jax.lax.fori_loop(0, reach, add, jnp.zeros_like(responses))

@@ -1,7 +1,6 @@
-"""The torque that a model does not know of: a photograph of the missing force, with its band."""
+"""The torque that a model lacks, estimated over time from recordings, with its band."""
 
-from rotflex_jax.latent.curve import Curve
-from rotflex_jax.latent.result import LatentTorque
+from rotflex_jax.latent.result import LatentTorque, TorqueCurve
 from rotflex_jax.latent.torque import latent_torque
 
-__all__ = ["Curve", "LatentTorque", "latent_torque"]
+__all__ = ["LatentTorque", "TorqueCurve", "latent_torque"]

@@ -1,72 +1,161 @@
-"""What the latent torque is to a user: torques with bands, curves, spectra, and what may be given back."""
+"""The latent torque as a result: torques with bands, binned curves, spectra."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import scipy
+from jaxtyping import Float, Int
 
-from rotflex_jax.effects.kinds import Linear
+from rotflex_jax.effects.base import Linear
 from rotflex_jax.errors import InputError
-from rotflex_jax.latent.curve import Curve, binned
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.model import Model
+from rotflex_jax.mechanism.assembly import effects_of
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.text.colours import FINAL, MUTED
+from rotflex_jax.text.markup import card, picture, table
+from rotflex_jax.text.numbers import plain_number
+from rotflex_jax.text.svg import Panel, signals
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Against = Literal["speed", "position", "deflection", "voltage", "time"]
-BINS = 40
+
+# Bins with fewer samples are left out.
+MIN_SAMPLES_PER_BIN = 8
+# Number of stays in a bin that the variance over all bins counts as.
+PRIOR_STAYS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class TorqueCurve:
+    """Mean of a torque in bins of another signal.
+
+    Attributes:
+        at: Mean of the abscissa in each bin.
+        mean: Mean torque [N m].
+        low: Lower end of the 95 % band of that mean [N m].
+        high: Upper end [N m].
+        spread: Standard deviation of single samples about the mean [N m].
+        count: Samples in each bin.
+        visits: Separate stays in each bin.
+        against: Name of the abscissa.
+        unit: Of the abscissa.
+        port: Where the torque acts.
+    """
+
+    at: Float[np.ndarray, " B"]
+    mean: Float[np.ndarray, " B"]
+    low: Float[np.ndarray, " B"]
+    high: Float[np.ndarray, " B"]
+    spread: Float[np.ndarray, " B"]
+    count: Int[np.ndarray, " B"]
+    visits: Int[np.ndarray, " B"]
+    against: str
+    unit: str
+    port: str
+
+
+def binned_mean(
+    x: Float[np.ndarray, " N"],
+    torque: Float[np.ndarray, " N"],
+    std: Float[np.ndarray, " N"],
+    bins: int,
+    segment: Int[np.ndarray, " N"],
+) -> dict[str, Float[np.ndarray, " B"] | Int[np.ndarray, " B"]]:
+    """Fields of a curve.
+
+    Neighbouring samples are correlated, so a stay in a bin, from entering to leaving it, counts as one
+    observation. Bins are equally wide between the 1 % and 99 % quantiles; the outermost take in the rest.
+
+    Args:
+        x: Abscissa.
+        torque: [N m].
+        std: Its standard deviation [N m].
+        bins: Number of bins.
+        segment: Number of the recording of each sample.
+    """
+    low, high = np.quantile(x, (0.01, 0.99))
+    edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)
+    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, bins - 1)
+    enters = np.r_[True, (which[1:] != which[:-1]) | (segment[1:] != segment[:-1])]
+    stay = np.cumsum(enters) - 1
+    length, bin_of = np.bincount(stay).astype(float), which[enters]
+    count = np.bincount(bin_of, length, bins)
+    visits = np.bincount(bin_of, minlength=bins)
+    kept = count >= MIN_SAMPLES_PER_BIN
+    each = np.maximum(count, 1.0)
+    mean, own, at = (np.bincount(which, w, bins) / each for w in (torque, std**2, x))
+    scatter = np.bincount(which, (torque - mean[which]) ** 2, bins) / each
+    # Variance of the means of stays about that of their bin; with few stays, towards that of all bins.
+    squares = length * (np.bincount(stay, torque) / length - mean[bin_of]) ** 2
+    pooled = squares.sum() / max(count[visits > 1].sum(), 1.0)
+    between = visits * np.bincount(bin_of, squares, bins) / each + PRIOR_STAYS * pooled
+    between = between / np.maximum(visits - 1 + PRIOR_STAYS, 1)
+    error = np.sqrt(between * np.bincount(bin_of, length**2, bins) / each**2 + own / np.maximum(visits, 1))
+    return {
+        "at": at[kept],
+        "mean": mean[kept],
+        "low": (mean - 1.96 * error)[kept],
+        "high": (mean + 1.96 * error)[kept],
+        "spread": np.sqrt(scatter[kept]),
+        "count": count[kept].astype(int),
+        "visits": visits[kept],
+    }
+
+
+Abscissa = Literal["speed", "position", "deflection", "voltage", "time"]
+CURVE_BINS = 40
 
 
 @dataclasses.dataclass(frozen=True)
 class LatentTorque:
-    """Torques that a model does not know of, along its recordings, one after the other.
+    """Torques that a model lacks, along its recordings, one after the other.
 
     Attributes:
-        ports: Where the torques act (P).
-        torque: Mean given all samples [N m] (N, P).
-        std: Deviation about it [N m] (N, P).
-        time: [s] (N,).
-        position: Of each port [rad] (N, P).
-        speed: Of each port [rad/s] (N, P).
-        voltage: [V] (N,).
-        recording: Number of the recording of each sample (N,).
+        ports: Where the torques act, D of them.
+        torque: Mean given all samples [N m].
+        std: Standard deviation about it [N m].
+        time: [s].
+        position: Of each port [rad].
+        speed: Of each port [rad/s].
+        voltage: [V].
+        recording: Number of the recording of each sample.
         Ts: Sampling period of each recording [s].
         intensity: Port -> intensity of the torque, a random walk [(N m)^2/s].
         gain_nats: Port -> log-likelihood that its torque gains over none [nat].
         scale: Torque that the motor gives at the root mean square voltage [N m].
         linear: Torques of the model's own dampers and springs at these ports, `port.effect` ->
-            torque [N m] (N,); what `given_back` can add.
+            torque [N m]; what `given_back` can add.
         motion: Unit of positions.
         effort: Unit of torques.
         added: Which of them are in `torque`.
     """
 
     ports: tuple[str, ...]
-    torque: np.ndarray
-    std: np.ndarray
-    time: np.ndarray
-    position: np.ndarray
-    speed: np.ndarray
-    voltage: np.ndarray
-    recording: np.ndarray
+    torque: Float[np.ndarray, "N D"]
+    std: Float[np.ndarray, "N D"]
+    time: Float[np.ndarray, " N"]
+    position: Float[np.ndarray, "N D"]
+    speed: Float[np.ndarray, "N D"]
+    voltage: Float[np.ndarray, " N"]
+    recording: Int[np.ndarray, " N"]
     Ts: tuple[float, ...]
     intensity: dict[str, float]
     gain_nats: dict[str, float]
     scale: float
-    linear: dict[str, np.ndarray]
+    linear: dict[str, Float[np.ndarray, " N"]]
     motion: str = "rad"
     effort: str = "N m"
     added: tuple[str, ...] = ()
 
-    def given_back(self, *names: str, beyond: Self | None = None) -> Self:
+    def given_back(self, *names: str, beyond: "LatentTorque | None" = None) -> "LatentTorque":
         """The torque together with that of some of the model's own dampers and springs.
 
-        A fitted damper holds what is true of it and what it took over from the missing effect; only
-        their sum with the torque is what the machine feels.
+        A fitted damper has its true part and a part that it took over from the missing effect; only
+        their sum with the torque acts on the machine.
 
         Args:
             names: `port.effect`, for instance "hub.viscous"; all dampers if none is named.
@@ -88,23 +177,23 @@ class LatentTorque:
         added = tuple(dict.fromkeys((*self.added, *chosen)))
         return dataclasses.replace(self, torque=torque, added=added)
 
-    def curve(self, port: str, against: Against = "speed", bins: int = BINS) -> Curve:
+    def curve(self, port: str, against: Abscissa = "speed", bins: int = CURVE_BINS) -> TorqueCurve:
         """Mean of the torque at a port in bins, with a 95 % band.
 
-        The band is that of the mean, each stay in a bin counting once; it says nothing of what the
-        model's own terms took over.
+        The band is that of the mean, each stay in a bin counting once; what the model's own terms took
+        over is not in it.
 
         Args:
             port: Which torque.
             against: Speed or position of the port, deflection of the joint's spring, voltage or time.
-            bins: How many.
+            bins: Number of bins.
         """
         i, (x, name, unit) = self._index(port), self.axis(port, against)
-        fields = binned(x, self.torque[:, i], self.std[:, i], bins, self.recording)
-        return Curve(**fields, against=name, unit=unit, port=port)
+        fields = binned_mean(x, self.torque[:, i], self.std[:, i], bins, self.recording)
+        return TorqueCurve(**fields, against=name, unit=unit, port=port)
 
-    def axis(self, port: str, against: Against) -> tuple[np.ndarray, str, str]:
-        """What a torque is drawn against (N,), its name and unit."""
+    def axis(self, port: str, against: Abscissa) -> tuple[Float[np.ndarray, " N"], str, str]:
+        """The abscissa of a curve, its name and unit."""
         i = self._index(port)
         if against == "deflection":
             springs = [n.partition(".")[0] for n in self.linear if n.endswith(".spring")]
@@ -136,20 +225,20 @@ class LatentTorque:
         """Root mean square of a torque [N m]."""
         return float(np.sqrt(np.mean(self.torque[:, self._index(port)] ** 2)))
 
-    def spectrum(self, port: str) -> tuple[np.ndarray, np.ndarray]:
+    def spectrum(self, port: str) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, " F"]]:
         """Frequencies [Hz] and amplitude density [N m/sqrt(Hz)] of a torque, over the longest recording."""
         number = int(np.argmax(np.bincount(self.recording)))
         own = self.torque[self.recording == number, self._index(port)]
         f, density = scipy.signal.welch(own, 1 / self.Ts[number], nperseg=min(4096, max(16, len(own) // 5)))
         return f[1:], np.sqrt(density[1:])
 
-    def plot(self, after: Self | None = None) -> "Figure":
+    def plot(self, after: "LatentTorque | None" = None) -> "Figure":
         """The torques over speed, without and with the dampers given back, and over position.
 
         Args:
             after: The torques that a better model leaves on the same recordings, drawn beside.
         """
-        from rotflex_jax.report.latent import latent_maps  # the layer above, on request
+        from rotflex_jax.latent.figure import latent_maps  # the layer above, on request
 
         return latent_maps(self, after)
 
@@ -162,9 +251,21 @@ class LatentTorque:
         return self.ports.index(port)
 
     def _repr_html_(self) -> str:
-        from rotflex_jax.display.cards import latent_card  # the layer above, when a notebook asks
-
-        return latent_card(self)
+        """Size and evidence of the torque at each port, and its mean over the speed of the port."""
+        rows = [(p, plain_number(self.size(p)), plain_number(self.gain_nats[p])) for p in self.ports]
+        drawn = []
+        for port in self.ports:
+            curve = self.curve(port)
+            if len(curve.at) > 1:
+                lines = [(curve.mean, FINAL, ""), (curve.low, MUTED, "3 3"), (curve.high, MUTED, "3 3")]
+                panel, label = Panel(f"{port} [{self.effort}]", lines), f"{curve.against} [{curve.unit}]"
+                svg = signals(curve.at, [panel], label, height=90)
+                drawn.append(picture(svg, f"Mean torque at the {port} over its speed, with its band."))
+        return card(
+            "Latent torque: what the model would have to be given to follow the measurement",
+            table(("port", f"rms [{self.effort}]", "gain [nat]"), rows),
+            *drawn,
+        )
 
     def __str__(self) -> str:
         lines = ["Latent torque, root mean square and log-likelihood it gains"]
@@ -172,46 +273,46 @@ class LatentTorque:
         return "\n".join(lines)
 
 
-def assembled(
+def latent_torque_result(
     model: Model,
     recordings: Sequence[Recording],
     ports: tuple[str, ...],
-    states: tuple[np.ndarray, np.ndarray],
-    level: np.ndarray,
-    nats: np.ndarray,
+    states: tuple[Float[np.ndarray, "R N m"], Float[np.ndarray, "R N m"]],
+    intensity: Float[np.ndarray, " D"],
+    nats: Float[np.ndarray, " D"],
     scale: float,
 ) -> LatentTorque:
-    """A result from smoothed states (R, N, m), their deviations, intensities and gains per port."""
+    """A result from smoothed states and their standard deviations, intensities and gains per port."""
     S, std = (np.concatenate([s[: r.N] for s, r in zip(a, recordings, strict=True)]) for a in states)
-    m, n, P = model.mechanism, len(model.mechanism.coordinates), len(ports)
+    m, n, D = model.mechanism, len(model.mechanism.coordinates), len(ports)
     vectors = np.array([m.port_vectors[p] for p in ports]).T
     position, speed = S[:, :n] @ vectors, S[:, n : 2 * n] @ vectors
     return LatentTorque(
         ports=ports,
-        torque=S[:, -P:],
-        std=std[:, -P:],
+        torque=S[:, -D:],
+        std=std[:, -D:],
         time=np.concatenate([r.t for r in recordings]),
         position=position,
         speed=speed,
         voltage=np.concatenate([r.u for r in recordings]).astype(float),
         recording=np.repeat(np.arange(len(recordings)), [r.N for r in recordings]),
         Ts=tuple(float(r.Ts) for r in recordings),
-        intensity=dict(zip(ports, level.tolist(), strict=True)),
+        intensity=dict(zip(ports, intensity.tolist(), strict=True)),
         gain_nats=dict(zip(ports, nats.tolist(), strict=True)),
         scale=scale,
-        linear=_linear(m, ports, position, speed),
+        linear=_linear_torques(m, ports, position, speed),
         motion=m.units.motion,
         effort=m.units.effort,
     )
 
 
-def _linear(
+def _linear_torques(
     m: Mechanism, ports: tuple[str, ...], position: np.ndarray, speed: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Torques of dampers and springs at the ports."""
     found = {}
-    for e in m.effects:
-        if not isinstance(e, Linear) or e.motor or e.order or e.at not in ports:
+    for _, e in effects_of(m, Linear):
+        if e.motor or e.order or e.at not in ports:
             continue
         stamp, i = e.stamp(), ports.index(e.at)
         if float(stamp.damping) or float(stamp.stiffness):

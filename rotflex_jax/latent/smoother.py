@@ -1,50 +1,56 @@
-"""Kalman filter and fixed-interval smoother of a linear time-varying model.
+"""Kalman filter and fixed-interval smoother, and the process-noise intensity of largest likelihood.
 
     s[k+1] = A[k] s[k] + c[k] + w,   y[k] = H[k] s[k] + g[k] + v
 
-The channels of a sample are taken one after the other, so nothing is inverted; covariances move in
-Joseph's form. The backward pass is that of Bryson and Frazier: it equals the one of Rauch, Tung and Striebel
-where that exists, and also serves where the process noise is singular, as it is here.
+The channels of a sample are processed one after the other, so that no matrix is inverted; covariances are
+updated in Joseph's form. The backward pass is that of Bryson and Frazier: it equals the one of Rauch, Tung
+and Striebel where that exists, and also holds where the process noise is singular, as it is here.
 
 Source: G. J. Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapters 2 and 10.
 """
 
+import dataclasses
+import itertools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import export
+from jaxtyping import Array, Float
 
 
-class Linear(NamedTuple):
-    """A linear model along one recording.
+class LinearTimeVaryingModel(NamedTuple):
+    """A linear model along one recording, along several, or at one sample.
 
     Attributes:
-        A: Transitions (N, m, m).
-        c: Their constant parts (N, m).
-        H: Slopes of the outputs (N, C, m).
-        y: Measured outputs less their constant parts (N, C).
-        seen: One where a sample counts (N,).
+        A: Transitions.
+        c: Their constant parts.
+        H: Output rows.
+        y: Measured outputs less their constant parts.
+        seen: One where a sample counts.
     """
 
-    A: Any
-    c: Any
-    H: Any
-    y: Any
-    seen: Any
+    A: Float[Array, "*batch m m"]
+    c: Float[Array, "*batch m"]
+    H: Float[Array, "*batch C m"]
+    y: Float[Array, "*batch C"]
+    seen: Float[Array, "*batch"]
 
 
-export.register_namedtuple_serialization(Linear, serialized_name=f"{__name__}.Linear")
+export.register_namedtuple_serialization(
+    LinearTimeVaryingModel, serialized_name=f"{__name__}.LinearTimeVaryingModel"
+)
 
 
-class Start(NamedTuple):
-    """First state: mean (m,) and variances (m,)."""
+class InitialDistribution(NamedTuple):
+    """First state of one recording or of several: its mean and its variances."""
 
-    mean: Any
-    variance: Any
+    mean: Float[Array | np.ndarray, "*batch m"]
+    variance: Float[Array | np.ndarray, "*batch m"]
 
 
-class _Update(NamedTuple):
+class _ChannelUpdate(NamedTuple):
     """What the backward pass needs of one channel: gain, innovation, its variance."""
 
     gain: jax.Array
@@ -61,9 +67,9 @@ def _times(A: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.sum(A * x[None], axis=1)
 
 
-def _corrected(
+def _measurement_update(
     m: jax.Array, P: jax.Array, H: jax.Array, y: jax.Array, seen: jax.Array, noise: jax.Array
-) -> tuple[jax.Array, jax.Array, list[_Update]]:
+) -> tuple[jax.Array, jax.Array, list[_ChannelUpdate]]:
     """Mean and covariance after the channels of one sample."""
     updates = []
     for c in range(H.shape[0]):
@@ -75,61 +81,171 @@ def _corrected(
         m = m + K * e
         half = P - K[:, None] * Ph[None]
         P = half - _times(half, h)[:, None] * K[None] + r * K[:, None] * K[None]
-        updates.append(_Update(K, e, S))
+        updates.append(_ChannelUpdate(K, e, S))
     return m, (P + P.T) / 2, updates
 
 
-def _moved(
+def _time_update(
     m: jax.Array, P: jax.Array, A: jax.Array, c: jax.Array, Q: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    moved = _product(_product(A, P), A.T)
-    return _times(A, m) + c, (moved + moved.T) / 2 + jnp.diag(Q)
+    P = _product(_product(A, P), A.T)
+    return _times(A, m) + c, (P + P.T) / 2 + jnp.diag(Q)
 
 
-def log_likelihood(model: Linear, start: Start, noise: jax.Array, Q: jax.Array) -> jax.Array:
+def log_likelihood(
+    model: LinearTimeVaryingModel,
+    start: InitialDistribution,
+    noise: Float[Array, " C"],
+    Q: Float[Array, " m"],
+) -> Float[Array, ""]:
     """Log-likelihood of one recording [nat].
 
     Args:
         model: Along the recording.
         start: First state.
-        noise: Deviation of the sensor noise per channel (C,).
-        Q: Variance that the process noise adds to each state per sample (m,).
+        noise: Standard deviation of the sensor noise per channel.
+        Q: Variance that the process noise adds to each state per sample.
     """
 
-    def step(carry: Any, row: Linear) -> Any:
+    def step(carry: Any, row: LinearTimeVaryingModel) -> Any:
         m, P, total = carry
-        m, P, updates = _corrected(m, P, row.H, row.y, row.seen, noise)
+        m, P, updates = _measurement_update(m, P, row.H, row.y, row.seen, noise)
         density = sum(jnp.log(2 * jnp.pi * u.S) + u.e**2 / u.S for u in updates)
-        return (*_moved(m, P, row.A, row.c, Q), total - 0.5 * row.seen * density), None
+        return (*_time_update(m, P, row.A, row.c, Q), total - 0.5 * row.seen * density), None
 
-    begin = (start.mean, jnp.diag(start.variance), jnp.zeros((), start.mean.dtype))
-    return jax.lax.scan(step, begin, model)[0][2]
+    first = (start.mean, jnp.diag(start.variance), jnp.zeros((), start.mean.dtype))
+    return jax.lax.scan(step, first, model)[0][2]
 
 
-def smoothed(model: Linear, start: Start, noise: jax.Array, Q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean (N, m) and variance (N, m) of the states, given the whole recording; arguments as above."""
+def fixed_interval_smoother(
+    model: LinearTimeVaryingModel,
+    start: InitialDistribution,
+    noise: Float[Array, " C"],
+    Q: Float[Array, " m"],
+) -> tuple[Float[Array, "N m"], Float[Array, "N m"]]:
+    """Mean and variance of the states given the whole recording; arguments as in `log_likelihood`."""
 
-    def forward(carry: Any, row: Linear) -> Any:
+    def forward(carry: Any, row: LinearTimeVaryingModel) -> Any:
         m, P = carry
-        m1, P1, updates = _corrected(m, P, row.H, row.y, row.seen, noise)
-        return _moved(m1, P1, row.A, row.c, Q), (m, P, updates)
+        m1, P1, updates = _measurement_update(m, P, row.H, row.y, row.seen, noise)
+        return _time_update(m1, P1, row.A, row.c, Q), (m, P, updates)
 
-    _, passed = jax.lax.scan(forward, (start.mean, jnp.diag(start.variance)), model)
+    _, filtered = jax.lax.scan(forward, (start.mean, jnp.diag(start.variance)), model)
 
     def backward(carry: Any, row: Any) -> Any:
-        # Slope and curvature of the log-likelihood of what follows, as seen from the state.
-        pull, weight = carry
+        # Gradient and curvature of the negative log-likelihood of all later samples, along the state.
+        gradient, curvature = carry
         at, (m, P, updates) = row
-        pull, weight = _times(at.A.T, pull), _product(_product(at.A.T, weight), at.A)
+        gradient, curvature = _times(at.A.T, gradient), _product(_product(at.A.T, curvature), at.A)
         for c in reversed(range(at.H.shape[0])):
             h, u = at.H[c], updates[c]
-            pull = pull - h * jnp.sum(u.gain * pull) - at.seen * h * u.e / u.S
-            left = weight - h[:, None] * _times(weight.T, u.gain)[None]
-            weight = left - _times(left, u.gain)[:, None] * h[None] + at.seen * h[:, None] * h[None] / u.S
-        weight = (weight + weight.T) / 2
-        variance = jnp.diagonal(P) - jnp.sum(_product(P, weight) * P, axis=1)
-        return (pull, weight), (m - _times(P, pull), jnp.maximum(variance, 0.0))
+            gradient = gradient - h * jnp.sum(u.gain * gradient) - at.seen * h * u.e / u.S
+            half = curvature - h[:, None] * _times(curvature.T, u.gain)[None]
+            added = at.seen * h[:, None] * h[None] / u.S
+            curvature = half - _times(half, u.gain)[:, None] * h[None] + added
+        curvature = (curvature + curvature.T) / 2
+        variance = jnp.diagonal(P) - jnp.sum(_product(P, curvature) * P, axis=1)
+        return (gradient, curvature), (m - _times(P, gradient), jnp.maximum(variance, 0.0))
 
     m = model.A.shape[1]
     zero = (jnp.zeros(m, model.A.dtype), jnp.zeros((m, m), model.A.dtype))
-    return jax.lax.scan(backward, zero, (model, passed), reverse=True)[1]
+    return jax.lax.scan(backward, zero, (model, filtered), reverse=True)[1]
+
+
+# The search ends when a change of the intensities by this factor no longer raises the likelihood.
+LATTICE_TOLERANCE = 1.2
+
+_log_likelihoods = jax.jit(jax.vmap(jax.vmap(log_likelihood, (0, 0, None, 0)), (None, None, None, 0)))
+_smooth_recordings = jax.jit(jax.vmap(fixed_interval_smoother, (0, 0, None, 0)))
+
+
+@dataclasses.dataclass(frozen=True)
+class IntensityEstimator:
+    """Maximum likelihood of the process-noise intensities of unknown torques. Call it in double precision.
+
+    Attributes:
+        noise: Standard deviation of the sensor noise per channel.
+        variance_growth: Variance that one sample adds to a torque of unit intensity, by recording [s].
+        time_constant: Time over which a torque decays [s].
+        smallest: Lower bound of the intensities [(N m)^2/s].
+        largest: Upper bound [(N m)^2/s].
+        states: States of the mechanism, ahead of the torques.
+        torques: Number of unknown torques.
+    """
+
+    noise: Float[np.ndarray, " C"]
+    variance_growth: Float[np.ndarray, " R"]
+    time_constant: float
+    smallest: float
+    largest: float
+    states: int
+    torques: int
+
+    def log_likelihoods(
+        self, model: LinearTimeVaryingModel, start: InitialDistribution, levels: Float[np.ndarray, "L D"]
+    ) -> Float[np.ndarray, " L"]:
+        """Log-likelihoods of several sets of intensities [nat]."""
+        # The torque of the first sample is as uncertain as that of any other; one wide variance serves all.
+        first = self._with_torque_variance(start, levels.max(axis=0))
+        Q = jnp.asarray(self._process_noise(levels))
+        return np.asarray(_log_likelihoods(model, first, jnp.asarray(self.noise), Q)).sum(axis=1)
+
+    def smooth(
+        self, model: LinearTimeVaryingModel, start: InitialDistribution, level: Float[np.ndarray, " D"]
+    ) -> tuple[Float[np.ndarray, "R N m"], Float[np.ndarray, "R N m"]]:
+        """Means and standard deviations of the states, given all samples."""
+        Q, noise = jnp.asarray(self._process_noise(level)), jnp.asarray(self.noise)
+        mean, variance = _smooth_recordings(model, self._with_torque_variance(start, level), noise, Q)
+        return np.asarray(mean), np.sqrt(np.asarray(variance))
+
+    def maximise(
+        self,
+        model: LinearTimeVaryingModel,
+        start: InitialDistribution,
+        level: Float[np.ndarray, " D"],
+        factor: float,
+    ) -> Float[np.ndarray, " D"]:
+        """Intensities of largest likelihood, by a search on a lattice of decreasing step.
+
+        Args:
+            model: Along the recordings.
+            start: First states.
+            level: Intensities to start from.
+            factor: First step of the lattice.
+        """
+        while factor > LATTICE_TOLERANCE:
+            trials = np.clip(level * factor ** self._lattice(), self.smallest, self.largest)
+            best = trials[int(np.argmax(self.log_likelihoods(model, start, trials)))]
+            if np.allclose(best, level):
+                factor = np.sqrt(factor)
+            level = best
+        return level
+
+    def gains(
+        self, model: LinearTimeVaryingModel, start: InitialDistribution, level: Float[np.ndarray, " D"]
+    ) -> Float[np.ndarray, " D"]:
+        """Log-likelihood that each torque gains over none, the others as they are [nat]."""
+        without = np.where(np.eye(self.torques, dtype=bool), self.smallest, level)
+        rows = np.vstack([level, without])
+        # As many as on the lattice, so that nothing is compiled again.
+        fill = np.tile(level, (len(self._lattice()) - len(rows), 1))
+        all_torques, *others = self.log_likelihoods(model, start, np.vstack([rows, fill]))
+        return all_torques - np.array(others[: self.torques])
+
+    def _process_noise(self, level: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch R m"]:
+        """Variance per sample that the process noise adds to every state."""
+        torques = level[..., None, :] * self.variance_growth[:, None]
+        return np.concatenate([np.zeros((*torques.shape[:-1], self.states)), torques], axis=-1)
+
+    def _with_torque_variance(
+        self, start: InitialDistribution, level: Float[np.ndarray, " D"]
+    ) -> InitialDistribution:
+        variance = np.array(start.variance)
+        variance[:, self.states :] = level * self.time_constant / 2
+        return InitialDistribution(jnp.asarray(start.mean), jnp.asarray(variance))
+
+    def _lattice(self) -> np.ndarray:
+        """Neighbours (L, D) in all directions; of many torques, one at a time."""
+        if self.torques > 2:
+            return np.vstack([np.zeros(self.torques), np.eye(self.torques), -np.eye(self.torques)])
+        return np.array(list(itertools.product((-1, 0, 1), repeat=self.torques)))

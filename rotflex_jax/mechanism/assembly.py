@@ -5,37 +5,80 @@ Everything here is formed once per set of parameters, outside the scan, and is d
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Real
 from numpy.typing import DTypeLike
 
-from rotflex_jax.effects.kinds import (
+from rotflex_jax.effects.base import (
     Actuation,
-    DryFriction,
     Effect,
-    Force,
-    Gear,
     Linear,
     Memory,
+    Period,
     Scalar,
     Stamp,
+    StatePart,
 )
-from rotflex_jax.mechanism.exponential import integrals
 from rotflex_jax.mechanism.mechanism import Mechanism
 
-Kind = TypeVar("Kind", bound=Effect)
+
+def matrix_expm1(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """`exp(M) - 1` by scaling, a Taylor polynomial of degree 8, and squaring `X -> 2 X + X X`.
+
+    Squaring the difference from one keeps the digits of a small step that squaring `exp` would round
+    away. A fixed number of halvings (2^-14, accurate up to a norm of a few thousand) needs no branch, so it
+    compiles fast and can be differentiated.
+    """
+    halvings, degree = 14, 8
+    small = M / 2.0**halvings
+    X = small / degree
+    for k in range(degree - 1, 0, -1):
+        X = (small + small @ X) / k
+    return jax.lax.fori_loop(0, halvings, lambda _, X: 2 * X + X @ X, X)
+
+
+def phi_functions(
+    A: Float[Array, "n n"], V: Float[Array, "n m"], h: Float[Array, ""], orders: int
+) -> list[Float[Array, "n _"]]:
+    """`exp(A h)` and `h phi_k(A h) V`, k = 1..orders, from one augmented matrix exponential."""
+    size, m = V.shape
+    total = size + orders * m
+    big = jnp.zeros((total, total), A.dtype).at[:size, :size].set(A * h)
+    big = big.at[:size, size : size + m].set(V * h)
+    for k in range(orders - 1):
+        rows = slice(size + k * m, size + (k + 1) * m)
+        columns = slice(size + (k + 1) * m, size + (k + 2) * m)
+        big = big.at[rows, columns].set(jnp.eye(m, dtype=A.dtype))
+    expo = matrix_expm1(big)
+    return [expo[:size, :size] + jnp.eye(size, dtype=A.dtype)] + [
+        expo[:size, size + k * m : size + (k + 1) * m] for k in range(orders)
+    ]
+
+
+EffectKind = TypeVar("EffectKind", bound=Effect)
+STATE_PARTS: tuple[StatePart, ...] = get_args(StatePart)
+"""Parts of the state that hold states of effects, in their order there."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where things sit, known from the structure alone.
+    """Order of states, torque ports and outputs; it follows from the structure alone.
 
-    The state is `x = [q, dq, linear states, rotor's angle and speed, memory states]`; the first `linear`
-    entries take part in the matrix exponential. `rotor` is where the two of the rotor stand, if a gear has
-    play. Of the ports that carry torques, the first `contacts` have dry friction.
+    The state is `x = [q, dq, linear states, rotor's angle and speed, memory states]`.
+
+    Attributes:
+        n: Number of coordinates.
+        linear: Number of states that take part in the matrix exponential, the first ones.
+        size: Number of states.
+        rotor: Index of the rotor's angle, if a gear has play.
+        torque_ports: Ports at which nonlinear torques act, those with dry friction first.
+        port_matrix: Their vectors.
+        contacts: How many of them have dry friction.
+        output_rows: Each output as a combination of positions and speeds.
     """
 
     n: int
@@ -52,147 +95,182 @@ class Layout:
     def of(cls, structure: Mechanism) -> "Layout":
         """Layout of a structure."""
         n = len(structure.coordinates)
-        rotor = 2 * n + sum(e.order for e in structure.effects if isinstance(e, Linear))
-        linear = rotor + sum(e.order for e in structure.effects if isinstance(e, Gear))
-        memory = sum(isinstance(e, Memory) for e in structure.effects)
-        rough = [e for e in structure.effects if isinstance(e, (Force, Memory, DryFriction))]
-        used = {e.at for e in rough}
-        dry = {e.at for e in rough if isinstance(e, DryFriction)}
+        own = {part: sum(e.order for e in structure.effects if e.state_part == part) for part in STATE_PARTS}
+        rotor = 2 * n + own["linear"]
+        linear = rotor + own["rotor"]
+        used = {e.at for e in structure.effects if e.torque_at_port}
+        dry = {e.at for e in structure.effects if e.dry_contact}
         names = tuple(p for p in structure.port_vectors if p in dry)
         names += tuple(p for p in structure.port_vectors if p in used - dry)
-        rows = []
-        for _, (port, what) in structure.outputs:
-            vector = structure.port_vectors[port]
-            zeros = (0.0,) * n
-            rows.append(vector + zeros if what == "position" else zeros + vector)
+        measured = zip(structure.quantities, (port for _, (port, _) in structure.outputs), strict=True)
         return cls(
             n=n,
             linear=linear,
-            size=linear + memory,
+            size=linear + own["memory"],
             rotor=rotor,
             torque_ports=names,
             port_matrix=tuple(structure.port_vectors[p] for p in names),
             contacts=len(dry),
-            output_rows=tuple(rows),
+            output_rows=tuple(quantity.row(structure.port_vectors[port]) for quantity, port in measured),
         )
 
 
-def effects_of(mechanism: Mechanism, kind: type[Kind]) -> list[tuple[int, Kind]]:
-    """Effects of one kind with their places in `mechanism.effects`."""
+def effects_of(mechanism: Mechanism, kind: type[EffectKind]) -> list[tuple[int, EffectKind]]:
+    """Effects of one kind with their indices in `mechanism.effects`."""
     return [(i, e) for i, e in enumerate(mechanism.effects) if isinstance(e, kind)]
 
 
-class Equations(NamedTuple):
-    """Linear part `x' = A x + B v + sum_ports b_p tau_p` and the inverse mass matrix."""
+def own_states(mechanism: Mechanism) -> dict[int, tuple[int, ...]]:
+    """Index of each effect with states of its own -> indices of these in the state."""
+    rows, start = {}, 2 * len(mechanism.coordinates)
+    for part in STATE_PARTS:
+        for i, e in enumerate(mechanism.effects):
+            if e.state_part == part and e.order:
+                rows[i] = tuple(range(start, start + e.order))
+                start += e.order
+    return rows
 
-    A: jax.Array
-    B: jax.Array
-    ports: jax.Array
-    inverse_mass: jax.Array
+
+class EquationsOfMotion(NamedTuple):
+    """Linear part `x' = A x + B v + sum_p b_p tau_p`.
+
+    Attributes:
+        A: State matrix.
+        B: Column of the voltage.
+        ports: Columns `b_p` of the port torques.
+        inverse_mass: Inverse of the mass matrix of the coordinates.
+    """
+
+    A: Float[Array, "m m"]
+    B: Float[Array, " m"]
+    ports: Float[Array, "m p"]
+    inverse_mass: Float[Array, "n n"]
 
 
-class Acting(NamedTuple):
-    """What a linear effect writes, the direction of its port, and its gate."""
+class PlacedStamp(NamedTuple):
+    """The stamp of a linear effect, the vector of its port, and its gate."""
 
     stamp: Stamp
-    port: np.ndarray
+    port: Real[np.ndarray, " n"]
     gate: Scalar
 
 
-def equations(mechanism: Mechanism, gates: jax.Array) -> Equations:
-    """Equations of motion of the linear effects, each multiplied by its gate; a rotor's states rest.
+def equations(mechanism: Mechanism, gates: Float[Array, " E"]) -> EquationsOfMotion:
+    """Equations of motion of the linear effects, each multiplied by its gate; a rotor's states stay at rest.
 
     Args:
-        mechanism: Numbers may be traced.
+        mechanism: Parameter values may be traced.
         gates: One factor per effect; one where it is on, zero where it is off.
     """
     layout = Layout.of(mechanism.structure)
-    acting = [
-        Acting(e.stamp(), np.array(mechanism.port_vectors[e.at]), gates[i])
+    stamps = [
+        PlacedStamp(e.stamp(), np.array(mechanism.port_vectors[e.at]), gates[i])
         for i, e in effects_of(mechanism, Linear)
     ]
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), layout.n)
-    return assembled(acting, P, layout.linear, gates.dtype)
+    return equations_from_stamps(stamps, P, layout.linear, gates.dtype)
 
 
-def assembled(acting: list[Acting], P: np.ndarray, size: int, dtype: jnp.dtype) -> Equations:
-    """Equations of motion of `size` states; torques act at the ports P (ports, n)."""
+def equations_from_stamps(
+    stamps: list[PlacedStamp], P: Real[np.ndarray, "p n"], size: int, dtype: jnp.dtype
+) -> EquationsOfMotion:
+    """Equations of motion of `size` states for torques at the ports with the vectors P."""
     n = P.shape[1]
     M, D, K = (jnp.zeros((n, n), dtype) for _ in range(3))
     drive = jnp.zeros(n, dtype)
-    extra: list[Acting] = []
-    for stamp, p, gate in acting:
+    with_states: list[PlacedStamp] = []
+    for stamp, p, gate in stamps:
         outer = jnp.asarray(np.outer(p, p), dtype)
         M = M + gate * stamp.inertia * outer
         D = D + gate * stamp.damping * outer
         K = K + gate * stamp.stiffness * outer
         drive = drive + gate * stamp.drive * jnp.asarray(p, dtype)
         if stamp.own:
-            extra.append(Acting(stamp, p, gate))
+            with_states.append(PlacedStamp(stamp, p, gate))
     Minv = jnp.linalg.inv(M)
     A = jnp.zeros((size, size), dtype).at[:n, n : 2 * n].set(jnp.eye(n, dtype=dtype))
     A = A.at[n : 2 * n, :n].set(-Minv @ K).at[n : 2 * n, n : 2 * n].set(-Minv @ D)
     B = jnp.zeros(size, dtype).at[n : 2 * n].set(Minv @ drive)
-    at = 2 * n
-    for stamp, p, gate in extra:
+    row = 2 * n
+    for stamp, p, gate in with_states:
         m, vector = len(stamp.own), jnp.asarray(p, dtype)
         own = jnp.stack([jnp.stack([_scalar(c, dtype) for c in row]) for row in stamp.own])
         speed = jnp.stack([_scalar(c, dtype) for c in stamp.from_speed])
         torque = jnp.stack([_scalar(c, dtype) for c in stamp.torque])
-        A = A.at[at : at + m, at : at + m].set(own)
-        A = A.at[at : at + m, n : 2 * n].set(speed[:, None] * vector[None, :])
-        A = A.at[n : 2 * n, at : at + m].set(gate * (Minv @ vector)[:, None] * torque[None, :])
-        B = B.at[at : at + m].set(jnp.stack([_scalar(c, dtype) for c in stamp.from_voltage]))
-        at += m
+        A = A.at[row : row + m, row : row + m].set(own)
+        A = A.at[row : row + m, n : 2 * n].set(speed[:, None] * vector[None, :])
+        A = A.at[n : 2 * n, row : row + m].set(gate * (Minv @ vector)[:, None] * torque[None, :])
+        B = B.at[row : row + m].set(jnp.stack([_scalar(c, dtype) for c in stamp.from_voltage]))
+        row += m
     ports = jnp.zeros((size, len(P)), dtype).at[n : 2 * n].set(Minv @ jnp.asarray(P.T, dtype))
-    return Equations(A, B, ports, Minv)
+    return EquationsOfMotion(A, B, ports, Minv)
 
 
-def _scalar(value: Scalar, dtype: jnp.dtype) -> jax.Array:
+def _scalar(value: Scalar, dtype: jnp.dtype) -> Array:
     return jnp.asarray(value, dtype)
 
 
 class Constants(NamedTuple):
-    """What the exponential step needs, formed once per parameter set.
+    """Constants of the exponential step, formed once per parameter set.
 
-    With `phi_k` the exponential-integrator functions of `A h`: `E = exp(A h)`, `input = h phi_1 B`,
-    `hold = h phi_1 b_p` (answer to a constant port torque), `ramp = h phi_2 b_p`, `rise = h phi_3 b_p`;
-    `half_*` the same for `h / 2`. `stop[i, j]` is the speed that a unit torque at port j, held for one
-    step, gives port i; `mobility` the same for a unit impulse; `push` what that does to the coordinates,
-    one row per linear state. `apart` is what a gear with play needs besides (`gear`).
+    With `phi_k` the functions of an exponential integrator at `A h`, m linear states and p torque ports; each
+    array has a last axis of directions where sensitivities are carried along.
+
+    Attributes:
+        values: Parameter values.
+        gates: One factor per effect.
+        h: Length of the step [s].
+        E: `exp(A h)`.
+        input: `h phi_1 B`.
+        hold: `h phi_1 b_p`, the response to a constant port torque.
+        ramp: `h phi_2 b_p`.
+        rise: `h phi_3 b_p`.
+        half_E: `E` of a step of `h / 2`.
+        half_input: `input` of such a step.
+        half_hold: `hold` of such a step.
+        stop: Speed that a unit torque at port j, held for one step, gives port i [rad/s per N m].
+        mobility: The same for a unit impulse.
+        push: Response of the linear states to a unit impulse that acts on positions.
+        gear: Constants of a gear with play (`gear.GearConstants`), None without one.
     """
 
-    values: jax.Array
-    gates: jax.Array
-    h: jax.Array
-    E: jax.Array
-    input: jax.Array
-    hold: jax.Array
-    ramp: jax.Array
-    rise: jax.Array
-    half_E: jax.Array
-    half_input: jax.Array
-    half_hold: jax.Array
-    stop: jax.Array
-    mobility: jax.Array
-    push: jax.Array
-    apart: Any = None
+    values: Real[Array, "P *D"]
+    gates: Float[Array, "E *D"]
+    h: Float[Array, "*D"]
+    E: Float[Array, "m m *D"]
+    input: Float[Array, "m *D"]
+    hold: Float[Array, "m p *D"]
+    ramp: Float[Array, "m p *D"]
+    rise: Float[Array, "m p *D"]
+    half_E: Float[Array, "m m *D"]
+    half_input: Float[Array, "m *D"]
+    half_hold: Float[Array, "m p *D"]
+    stop: Float[Array, "p p *D"]
+    mobility: Float[Array, "p p *D"]
+    push: Float[Array, "m p *D"]
+    gear: Any = None
 
 
-def constants(mechanism: Mechanism, values: jax.Array, gates: jax.Array, h: jax.Array) -> Constants:
+def constants(
+    mechanism: Mechanism, values: Real[Array, " P"], gates: Float[Array, " E"], h: Float[Array, ""]
+) -> Constants:
     """Constants of a step of length `h` [s] for traced parameter values."""
     layout = Layout.of(mechanism.structure)
     return from_equations(equations(mechanism.with_values(values), gates), layout, values, gates, h)
 
 
 def from_equations(
-    eq: Equations, layout: Layout, values: jax.Array, gates: jax.Array, h: jax.Array
+    eq: EquationsOfMotion,
+    layout: Layout,
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    h: Float[Array, ""],
 ) -> Constants:
     """Constants of a step of length `h` [s] for equations whose states are in the order of the layout."""
     n = layout.n
     V = jnp.concatenate([eq.B[:, None], eq.ports], axis=1)
-    E, one, two, three = integrals(eq.A, V, h, 3)
-    half_E, half = integrals(eq.A, V, h / 2, 1)
+    E, one, two, three = phi_functions(eq.A, V, h, 3)
+    half_E, half = phi_functions(eq.A, V, h / 2, 1)
     P = jnp.asarray(np.array(layout.port_matrix).reshape(len(layout.torque_ports), n), E.dtype)
     # An impulse at a port moves the coordinates as the torque accelerates them.
     push = jnp.zeros_like(eq.ports).at[:n].set(eq.ports[n : 2 * n])
@@ -216,22 +294,24 @@ def from_equations(
     )
 
 
-def driven_voltage(mechanism: Mechanism, gates: jax.Array, u: jax.Array, Ts: Scalar) -> jax.Array:
-    """Voltage (N,) that reaches the motor after all actuation effects, nearest to the command first."""
+def motor_voltage(
+    mechanism: Mechanism, gates: Float[Array, " E"], u: Float[Array, " N"], Ts: Period
+) -> Float[Array, " N"]:
+    """Voltage that reaches the motor after all actuation effects, in the order of their stages."""
     v = u
     for i, effect in sorted(effects_of(mechanism, Actuation), key=lambda pair: pair[1].stage):
         v = v + gates[i] * (effect.drive(v, Ts) - v)
     return v
 
 
-def rest_state(structure: Mechanism, dtype: DTypeLike) -> np.ndarray:
+def rest_state(structure: Mechanism, dtype: DTypeLike) -> Float[np.ndarray, " n"]:
     """State at rest: zero motion, memories at their initial value."""
     layout = Layout.of(structure)
     memory = [e.initial() for _, e in effects_of(structure, Memory)]
     return np.array([0.0] * layout.linear + memory, dtype=dtype)
 
 
-def whole_state(structure: Mechanism, x0: jax.Array) -> jax.Array:
-    """States (..., n) from their first entries (..., m), such as positions and speeds; the rest at rest."""
+def whole_state(structure: Mechanism, x0: Float[Array, "*batch m"]) -> Float[Array, "*batch n"]:
+    """States from their first entries, such as positions and speeds; the remaining ones at rest."""
     rest = jnp.asarray(rest_state(structure, np.float64), x0.dtype)[x0.shape[-1] :]
     return jnp.concatenate([x0, jnp.broadcast_to(rest, (*x0.shape[:-1], len(rest)))], axis=-1)

@@ -1,63 +1,65 @@
-"""One step with play in the gear: rotor and port turn as one, or the rotor flies, meets a stop, lets go.
+"""One step with play in the gear: rotor and port in contact, or the rotor in flight between the stops.
 
-As one they obey the equations without play, whose exact step serves. Apart they obey the equations of one
-coordinate more, and the teeth push with a torque that is whatever keeps the rotor inside its stops. A step in
-which the teeth meet or part counts that torque by its first three moments over the step: an impulse at the
-instant at which the stop is reached and a constant torque after it, or a torque that falls to zero on a line.
+In contact the equations are those without play, whose exact step is used. In flight the equations have one
+coordinate more, and the torque of the teeth keeps the rotor within its stops. A step in which the teeth make
+contact or separate represents that torque by its first three moments over the step: an impulse at the instant
+of impact and a constant torque after it, or a torque that falls linearly to zero.
 
-Source: F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 6, for the two
-states of a contact and what ends them.
+Source: F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 6, for the
+states of a contact and the conditions that end them.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Real
 
-from rotflex_jax.effects.kinds import Gear, Linear
-from rotflex_jax.effects.stamp import Stamp
+from rotflex_jax.effects.base import Gear, Linear, Stamp
 from rotflex_jax.mechanism.assembly import (
-    Acting,
     Constants,
-    Equations,
+    EquationsOfMotion,
     Layout,
-    assembled,
+    PlacedStamp,
     effects_of,
+    equations_from_stamps,
     from_equations,
+    phi_functions,
 )
-from rotflex_jax.mechanism.combine import apply
-from rotflex_jax.mechanism.exponential import integrals
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.small_matrices import matvec
 
-# Polynomial of degree two on [0, 1] with given moments of order 0, 1, 2: inverse of the Hilbert matrix.
-POLYNOMIAL = np.array([[9.0, -36.0, 30.0], [-36.0, 192.0, -180.0], [30.0, -180.0, 180.0]])
+# From moments of order 0, 1, 2 on [0, 1] to the polynomial of degree two that has them: inverse of the
+# Hilbert matrix.
+MOMENTS_TO_POLYNOMIAL = np.array([[9.0, -36.0, 30.0], [-36.0, 192.0, -180.0], [30.0, -180.0, 180.0]])
 
 
-class Apart(NamedTuple):
-    """What a step with play needs, formed once per parameter set.
+class GearConstants(NamedTuple):
+    """Constants of a step with play, formed once per parameter set.
 
     Attributes:
-        gap: Angle from the middle to each stop, zero where the gear is switched off.
-        free: The step while the rotor turns alone.
-        line: What the teeth's torque on the port does to the linear states: columns for a constant one and
-            for one that grows from 0 to 1 over the step (m, 2).
-        moments: The same for a torque with only the first, second, third moment (m, 3).
-        settle: Constant and growing torque that take back an error of the rotor's angle and speed (2, 2).
-        mass: Inertia that an impact of the teeth meets [kg m^2].
+        gap: Angle from the middle to each stop, zero where the gear is switched off [rad].
+        flight: Constants of the step while the rotor is in flight.
+        line: Response of the m linear states to the teeth's torque on the port: one column for a constant
+            torque, one for a torque that grows from 0 to 1 over the step.
+        moments: The same for a torque with the first, second or third moment in_flight.
+        correction: Constant and growing torque that cancel an error of the rotor's angle and speed.
+        mass: Effective inertia of an impact of the teeth [kg m^2].
     """
 
-    gap: jax.Array
-    free: Constants
-    line: jax.Array
-    moments: jax.Array
-    settle: jax.Array
-    mass: jax.Array
+    gap: Float[Array, ""]
+    flight: Constants
+    line: Float[Array, "m 2"]
+    moments: Float[Array, "m 3"]
+    correction: Float[Array, "2 2"]
+    mass: Float[Array, ""]
 
 
-def apart(mechanism: Mechanism, values: jax.Array, gates: jax.Array, h: jax.Array) -> Apart | None:
-    """Constants for `geared_step`, or None where no gear has play."""
+def gear_constants(
+    mechanism: Mechanism, values: Real[Array, " P"], gates: Float[Array, " E"], h: Float[Array, ""]
+) -> GearConstants | None:
+    """Constants of `geared_step`, or None where no gear has play."""
     known = mechanism.with_values(values)
     gears = effects_of(known, Gear)
     if not gears:
@@ -65,25 +67,25 @@ def apart(mechanism: Mechanism, values: jax.Array, gates: jax.Array, h: jax.Arra
     ((i, gear),) = gears
     layout = Layout.of(mechanism.structure)
     eq, teeth = _equations(known, gear, gates, layout)
-    _, one, two, three = integrals(eq.A, teeth[:, None], h, 3)
+    _, one, two, three = phi_functions(eq.A, teeth[:, None], h, 3)
     ends = jnp.concatenate([one, two, 2 * three], axis=1)
     angle, speed = layout.rotor, layout.rotor + 1
     line = ends[:, :2]
     (a, b), (p, q) = line[angle], line[speed]
-    return Apart(
+    return GearConstants(
         gap=gates[i] * gear.stops(),
-        free=from_equations(eq, layout, values, gates, h),
+        flight=from_equations(eq, layout, values, gates, h),
         line=line,
-        moments=ends @ jnp.asarray(POLYNOMIAL, ends.dtype),
-        settle=-jnp.array([[q, -b], [-p, a]]) / (a * q - b * p),
+        moments=ends @ jnp.asarray(MOMENTS_TO_POLYNOMIAL, ends.dtype),
+        correction=-jnp.array([[q, -b], [-p, a]]) / (a * q - b * p),
         mass=-1 / teeth[speed],
     )
 
 
-def _equations(known: Mechanism, gear: Gear, gates: jax.Array, layout: Layout) -> tuple[Equations, jax.Array]:
-    """Equations of motion with the rotor on its own, and the column of the teeth's torque on the port.
+def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tuple[EquationsOfMotion, Array]:
+    """Equations of motion with the rotor in flight, and the column of the teeth's torque on the port.
 
-    The rotor's angle against the port is one coordinate more, and the motor acts at port plus rotor.
+    The rotor's angle relative to the port is an additional coordinate, and the motor acts at port plus rotor.
     """
     n, share = layout.n, gear.rotor()
     acting = []
@@ -92,117 +94,129 @@ def _equations(known: Mechanism, gear: Gear, gates: jax.Array, layout: Layout) -
         p = np.array([*known.port_vectors[e.at], 1.0 if here and e.motor else 0.0])
         if here and not e.motor:
             rotor = Stamp(inertia=share * stamp.inertia)
-            acting.append(Acting(rotor, np.array([*known.port_vectors[e.at], 1.0]), gates[i]))
+            acting.append(PlacedStamp(rotor, np.array([*known.port_vectors[e.at], 1.0]), gates[i]))
             stamp = stamp._replace(inertia=(1 - share) * stamp.inertia)
-        acting.append(Acting(stamp, p, gates[i]))
+        acting.append(PlacedStamp(stamp, p, gates[i]))
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), n)
     P = np.vstack([np.column_stack([P, np.zeros(len(P))]), np.eye(n + 1)[n]])
-    eq = assembled(acting, P, layout.linear, gates.dtype)
+    eq = equations_from_stamps(acting, P, layout.linear, gates.dtype)
     # From (q, r, dq, dr, linear states) to the order of the layout.
     order = np.array([*range(n), *range(n + 1, 2 * n + 1), *range(2 * n + 2, layout.linear), n, 2 * n + 1])
     ports = eq.ports[order]
-    ordered = Equations(eq.A[order][:, order], eq.B[order], ports[:, :-1], eq.inverse_mass)
+    ordered = EquationsOfMotion(eq.A[order][:, order], eq.B[order], ports[:, :-1], eq.inverse_mass)
     return ordered, -ports[:, -1]
 
 
 def geared_step(
     mechanism: Mechanism,
-    x: jax.Array,
+    x: Float[Array, "n *S"],
     c: Constants,
-    advance: Callable[[jax.Array, Constants, jax.Array | None], jax.Array],
-) -> jax.Array:
+    advance: Callable[[Float[Array, "n *S"], Constants, Float[Array, "m *S"] | None], Float[Array, "n *S"]],
+) -> Float[Array, "n *S"]:
     """State at the end of a step.
 
     Args:
-        mechanism: With (traced) numbers.
-        x: State (n, ...).
-        c: Constants with `apart`.
-        advance: State and constants to the state after the step; its last argument is what else comes
-            to the linear states by then.
+        mechanism: With (traced) parameter values.
+        x: State, or states side by side.
+        c: Constants with `gear`.
+        advance: State and constants to the state after the step; its last argument is added to the linear
+            states at the end of the step.
     """
-    layout, a = Layout.of(mechanism.structure), c.apart
+    layout, a = Layout.of(mechanism.structure), c.gear
     k, gap = layout.rotor, a.gap
     r = jnp.where(x[k] > gap, gap, jnp.where(x[k] < -gap, -gap, x[k]))
     s = x[k + 1]
     x = x.at[k].set(r)
-    one, alone = advance(x, c, None), advance(x, a.free, None)
+    in_contact, in_flight = advance(x, c, None), advance(x, a.flight, None)
     touching = (jnp.abs(r) >= gap * (1 - 1e-9)) & (s == 0)
-    kept, parting = _parting(r, alone[k], alone[k + 1], touching, a)
-    beyond = jnp.abs(alone[k]) > gap
-    stop = jnp.where(alone[k] > 0, gap, -gap)
-    # Left for good and thrown back at once: as if it had stayed.
-    kept = kept | (touching & ~parting.leaves & beyond & (stop * r > 0)) | (gap <= 0)
-    hits = beyond & ~parting.leaves
-    meeting = _meeting(r, s, alone[k], alone[k + 1], stop, hits, c)
-    moments = jnp.where(parting.leaves[None], parting.moments, jnp.where(hits[None], meeting.moments, 0.0))
-    push = apply(a.moments, moments)
+    stays, separation = _separation(r, in_flight[k], in_flight[k + 1], touching, a)
+    beyond = jnp.abs(in_flight[k]) > gap
+    stop = jnp.where(in_flight[k] > 0, gap, -gap)
+    # Separated and driven back to the same stop within the step: as if it had stayed in contact.
+    stays = stays | (touching & ~separation.separates & beyond & (stop * r > 0)) | (gap <= 0)
+    impacts = beyond & ~separation.separates
+    impact = _impact(r, s, in_flight[k], in_flight[k + 1], stop, impacts, c)
+    moments = jnp.where(impacts[None], impact.moments, 0.0)
+    moments = jnp.where(separation.separates[None], separation.moments, moments)
+    push = matvec(a.moments, moments)
     push = jnp.concatenate([push, jnp.zeros_like(x[len(push) :])])
-    answer = advance(x, a.free, push[: len(a.line)]) - alone - push
-    end = alone + push + jnp.where(hits[None], _late(meeting.t, answer, layout), answer)
-    rests = hits & meeting.rests
-    # Friction and other torques have answered to the teeth.
+    response = advance(x, a.flight, push[: len(a.line)]) - in_flight - push
+    end = in_flight + push + jnp.where(impacts[None], _delayed(impact.t, response, layout), response)
+    rests = impacts & impact.rests
+    # Friction and other torques have responded to the torque of the teeth.
     error = jnp.stack([end[k] - stop, end[k + 1]])
-    taken = apply(a.line, jnp.where(rests[None], apply(a.settle, error), 0.0))
-    end = end.at[: len(taken)].add(taken)
+    corrected = matvec(a.line, jnp.where(rests[None], matvec(a.correction, error), 0.0))
+    end = end.at[: len(corrected)].add(corrected)
     angle = jnp.where(rests, stop, jnp.where(end[k] > gap, gap, jnp.where(end[k] < -gap, -gap, end[k])))
     end = end.at[k].set(angle).at[k + 1].set(jnp.where(rests, 0.0, end[k + 1]))
-    return jnp.where(kept[None], one.at[k + 1].set(0.0), end)
+    return jnp.where(stays[None], in_contact.at[k + 1].set(0.0), end)
 
 
-class Parting(NamedTuple):
-    """Teeth that touch at the start and let go within the step, and the moments of their torque."""
+class Separation(NamedTuple):
+    """Teeth in contact at the start that separate within the step.
 
-    leaves: jax.Array
-    moments: jax.Array
+    Attributes:
+        separates: Whether they do.
+        moments: Moments of their torque over the step.
+    """
+
+    separates: Bool[Array, "*S"]
+    moments: Float[Array, "3 *S"]
 
 
-def _parting(
-    r: jax.Array, angle: jax.Array, speed: jax.Array, touching: jax.Array, a: Apart
-) -> tuple[jax.Array, Parting]:
-    """Whether touching teeth keep touching; otherwise when they part.
+def _separation(
+    r: Array, angle: Array, speed: Array, touching: Array, a: GearConstants
+) -> tuple[Array, Separation]:
+    """Whether teeth stay in contact; otherwise how they separate.
 
     Args:
-        r: Angle of the rotor at the start, at a stop where the teeth touch.
-        angle: At the end of a step in which they let go at once.
+        r: Angle of the rotor at the start, at a stop where the teeth are in contact.
+        angle: At the end of a step in which they separate at once.
         speed: The same.
-        touching: Whether they touch.
+        touching: Whether they are in contact.
         a: Constants.
     """
     side = jnp.where(r > 0, 1.0, -1.0)
-    # The torque that would keep them together, on a line from the start of the step to its end.
-    first, growth = side[None] * apply(a.settle, jnp.stack([angle - r, speed]))
+    # The torque that would keep them in contact, linear over the step.
+    first, growth = side[None] * matvec(a.correction, jnp.stack([angle - r, speed]))
     last = first + growth
-    kept = touching & (first >= 0) & (last >= 0)
-    leaves = touching & (first > 0) & (last < 0)
-    t = jnp.where(leaves, first, 0.0) / jnp.where(leaves, first - last, 1.0)
+    stays = touching & (first >= 0) & (last >= 0)
+    separates = touching & (first > 0) & (last < 0)
+    t = jnp.where(separates, first, 0.0) / jnp.where(separates, first - last, 1.0)
     moments = side[None] * jnp.stack([first * t ** (m + 1) / ((m + 1) * (m + 2)) for m in range(3)])
-    return kept, Parting(leaves, moments)
+    return stays, Separation(separates, moments)
 
 
-def _late(t: jax.Array, answer: jax.Array, layout: Layout) -> jax.Array:
-    """What friction and other torques answer to an impact at the share `t` of a step, not at its start."""
+def _delayed(t: Array, response: Array, layout: Layout) -> Array:
+    """Response of friction and other torques to an impact at the fraction `t` of a step, from that at 0."""
     positions = {*range(layout.n), layout.rotor}
-    return answer * jnp.stack([(1 - t) ** 2 if i in positions else 1 - t for i in range(len(answer))])
+    return response * jnp.stack([(1 - t) ** 2 if i in positions else 1 - t for i in range(len(response))])
 
 
-class Meeting(NamedTuple):
-    """Teeth that meet within the step: when, whether they stay together, and the moments of their torque."""
+class Impact(NamedTuple):
+    """Teeth that come into contact within the step.
 
-    t: jax.Array
-    rests: jax.Array
-    moments: jax.Array
+    Attributes:
+        t: Fraction of the step until the impact.
+        rests: Whether they stay in contact.
+        moments: Moments of their torque over the step.
+    """
+
+    t: Float[Array, "*S"]
+    rests: Bool[Array, "*S"]
+    moments: Float[Array, "3 *S"]
 
 
-def _meeting(
-    r: jax.Array,
-    s: jax.Array,
-    angle: jax.Array,
-    speed: jax.Array,
-    stop: jax.Array,
-    hits: jax.Array,
+def _impact(
+    r: Array,
+    s: Array,
+    angle: Array,
+    speed: Array,
+    stop: Array,
+    impacts: Array,
     c: Constants,
-) -> Meeting:
-    """What happens at a stop that a rotor in flight has passed by the end of the step.
+) -> Impact:
+    """Impact at a stop that a rotor in flight has passed by the end of the step.
 
     Args:
         r: Angle of the rotor at the start.
@@ -210,35 +224,35 @@ def _meeting(
         angle: At the end of the step without the stop.
         speed: The same.
         stop: The stop that it passes.
-        hits: Where that is so; the rest is any finite number.
+        impacts: Where it does; elsewhere the result is any finite number.
         c: Constants.
     """
     # The cubic through both ends, in units of the step: r + b t + d t^2 + e t^3.
-    way, b, last = angle - r, c.h * s, c.h * speed
-    d, e = 3 * way - 2 * b - last, b + last - 2 * way
-    t = jnp.where(hits, _passage(stop - r, b, way - b), 0.0)
+    travel, b, last = angle - r, c.h * s, c.h * speed
+    d, e = 3 * travel - 2 * b - last, b + last - 2 * travel
+    t = jnp.where(impacts, _crossing_time(stop - r, b, travel - b), 0.0)
     for _ in range(2):
         slope = b + t * (2 * d + 3 * t * e)
-        safe = hits & (slope * stop > 0)
+        safe = impacts & (slope * stop > 0)
         miss = r + t * (b + t * (d + t * e)) - stop
         t = t - jnp.where(safe, miss, 0.0) / jnp.where(safe, slope, 1.0)
         t = jnp.where(t < 0, 0.0, jnp.where(t > 1, 1.0, t))
     slope = b + t * (2 * d + 3 * t * e)
-    mass = c.apart.mass / c.h**2
+    mass = c.gear.mass / c.h**2
     impulse, after = mass * slope, mass * (last - slope)
     rests = after * stop >= 0
     held = jnp.where(rests, after, 0.0)
-    spread = (1.0, (1 + t) / 2, (1 + t + t * t) / 3)  # moments of one over what is left of the step
-    return Meeting(t, rests, jnp.stack([impulse * t**m + held * spread[m] for m in range(3)]))
+    after_impact = (1.0, (1 + t) / 2, (1 + t + t * t) / 3)  # moments of a unit torque after the impact
+    return Impact(t, rests, jnp.stack([impulse * t**m + held * after_impact[m] for m in range(3)]))
 
 
-def _passage(gone: jax.Array, b: jax.Array, d: jax.Array) -> jax.Array:
-    """The later root of `b t + d t^2 = gone` where the motion is through there and not back."""
-    way = jnp.where(gone + 0.0 == 0, jnp.sign(b + d), jnp.sign(gone))
-    square = b * b + 4 * d * gone
+def _crossing_time(distance: Array, b: Array, d: Array) -> Array:
+    """The root of `b t + d t^2 = distance` at which the motion crosses outwards."""
+    way = jnp.where(distance + 0.0 == 0, jnp.sign(b + d), jnp.sign(distance))
+    square = b * b + 4 * d * distance
     positive = square > 0
     root = way * jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
     straight = way * b >= 0
     below = jnp.where(straight, b + root, 2 * d)
-    above = jnp.where(straight, 2 * gone, root - b)
+    above = jnp.where(straight, 2 * distance, root - b)
     return above / jnp.where(below == 0, 1.0, below)

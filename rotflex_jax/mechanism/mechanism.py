@@ -3,21 +3,26 @@
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float, Real
 
-from rotflex_jax.effects.kinds import Effect, Linear
+from rotflex_jax.effects.base import Effect, Linear
+from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
-from rotflex_jax.mechanism import given
-from rotflex_jax.mechanism.consistent import check
+from rotflex_jax.mechanism import validation
+from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.mechanism.units import TURNING, Units
+from rotflex_jax.mechanism.validation import check
 from rotflex_jax.parameters import Specification, specifications
+from rotflex_jax.text.markup import card, paragraph, table
+from rotflex_jax.text.numbers import equation, unit_text
 
 
 class _Slot:
-    """Stands for a number whose value is given elsewhere."""
+    """Placeholder of a parameter value in a structure."""
 
     def __repr__(self) -> str:
         return "·"
@@ -42,7 +47,7 @@ class Mechanism:
         effects: Physical effects; inertias, springs, dampers and the motor among them.
         outputs: Channel -> port (its position) or (port, "speed").
         trusted: Full names `port.effect.parameter` of constants that fits hold.
-        units: How its ports move: turning, unless told otherwise.
+        units: Units of its ports; rotary by default.
 
     Raises:
         InputError: A port, output or trusted name that does not exist, or two equal effects at a port.
@@ -60,11 +65,11 @@ class Mechanism:
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - frozen class
-        put("coordinates", given.names(self.coordinates, "coordinates"))
-        put("ports", given.ports(self.ports))
-        put("effects", given.effects(self.effects))
-        put("outputs", given.outputs(self.outputs))
-        put("trusted", frozenset(given.names(self.trusted, "trusted parameters")))
+        put("coordinates", validation.names(self.coordinates, "coordinates"))
+        put("ports", validation.ports(self.ports))
+        put("effects", validation.effects(self.effects))
+        put("outputs", validation.outputs(self.outputs))
+        put("trusted", frozenset(validation.names(self.trusted, "trusted parameters")))
         check(self)
         for name in sorted(self.trusted):
             self._must_exist(name)
@@ -88,29 +93,34 @@ class Mechanism:
         """Names of the outputs, in order."""
         return tuple(channel for channel, _ in self.outputs)
 
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What each output measures, in order."""
+        return tuple(Quantity(what) for _, (_, what) in self.outputs)
+
     @functools.cached_property
-    def structure(self) -> Self:
-        """The mechanism without its numbers; hashable, and equal for equal structure."""
+    def structure(self) -> "Mechanism":
+        """The mechanism without parameter values; hashable, and equal for equal structure."""
         empty = tuple(e.replace(**dict.fromkeys(e.values, _SLOT)) for e in self.effects)
         return dataclasses.replace(self, effects=empty, trusted=frozenset())
 
-    def __add__(self, effect: Effect) -> Self:
+    def __add__(self, effect: Effect) -> "Mechanism":
         """The mechanism with one more effect."""
         if not isinstance(effect, Effect):
             return NotImplemented
         return dataclasses.replace(self, effects=(*self.effects, effect))
 
-    def without(self, name: str, at: str) -> Self:
+    def without(self, name: str, at: str) -> "Mechanism":
         """The mechanism without the effect `name` at port `at`."""
-        kept = tuple(e for e in self.effects if (e.name, e.at) != (name, at))
-        if len(kept) == len(self.effects):
+        others = tuple(e for e in self.effects if (e.name, e.at) != (name, at))
+        if len(others) == len(self.effects):
             present = ", ".join(f"{e.name} at {e.at}" for e in self.effects)
             raise InputError(
                 f"{name!r} at {at!r} was to be removed, but the mechanism has {present}; name one."
             )
-        gone = f"{at}.{name}."
-        trusted = frozenset(t for t in self.trusted if not t.startswith(gone))
-        return dataclasses.replace(self, effects=kept, trusted=trusted)
+        prefix = f"{at}.{name}."
+        trusted = frozenset(t for t in self.trusted if not t.startswith(prefix))
+        return dataclasses.replace(self, effects=others, trusted=trusted)
 
     def effect(self, name: str, at: str) -> Effect:
         """The effect `name` at port `at`."""
@@ -119,9 +129,29 @@ class Mechanism:
                 return e
         raise InputError(f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first.")
 
+    def locations(self, effect: Effect | type[Effect]) -> tuple[str, ...]:
+        """Where an effect can act here: the ports, the voltage (`input`), or the outputs."""
+        if effect.acts_on == "input":
+            return ("input",)
+        return self.channels if effect.acts_on == "channel" else tuple(name for name, _ in self.ports)
+
+    def linear_effects(self, port: str) -> list[Linear]:
+        """Linear effects at a port."""
+        return [e for e in self.effects if isinstance(e, Linear) and e.at == port]
+
+    def lacking(self, effect: Effect | type[Effect], port: str) -> list[str]:
+        """What an effect needs at a port that is not there: `motor`, `inertia`."""
+        has = {"motor": self.has_motor, "inertia": self.has_inertia}
+        return [name for name in effect.needs() if not has[name](port)]
+
+    def accepts(self, effect: type[Effect], at: str) -> bool:
+        """Whether an effect of this class can be added at a port, at the voltage or at an output."""
+        taken = effect.single and any(e.kind_label == effect.kind_label for e in self.effects)
+        return at in self.locations(effect) and not self.lacking(effect, at) and not taken
+
     def has_motor(self, port: str) -> bool:
         """Whether a linear motor drives the port."""
-        return any(isinstance(e, Linear) and e.motor and e.at == port for e in self.effects)
+        return any(e.motor for e in self.linear_effects(port))
 
     def has_inertia(self, port: str) -> bool:
         """Whether an inertia is entered at the port."""
@@ -145,21 +175,23 @@ class Mechanism:
         )
 
     def sentence(self, effect: Effect) -> str:
-        """What an effect is, in words with numbers, in the units of this mechanism."""
+        """An effect in words, in the units of this mechanism."""
         return self.units.sentence(effect.sentence())
 
     @property
-    def values(self) -> np.ndarray:
+    def values(self) -> Float[np.ndarray, " P"]:
         """Parameter values [declared units], one vector."""
         return np.array([v for e in self.effects for v in e.values.values()], dtype=float)
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Parameters that a fit moves, all but the trusted ones."""
+        """Parameters that a fit estimates, all but the trusted ones."""
         return tuple(n for n in self.parameter_names if n not in self.trusted)
 
-    def with_values(self, values: Mapping[str, float] | Sequence[Any] | np.ndarray | jax.Array) -> Self:
-        """The same mechanism with other numbers, given by full name or as the whole vector."""
+    def with_values(
+        self, values: Mapping[str, float] | Sequence[Any] | Real[np.ndarray, " P"] | Real[Array, "P ..."]
+    ) -> "Mechanism":
+        """The same mechanism with other parameter values, by full name or as the whole vector."""
         if isinstance(values, Mapping):
             for name in values:
                 self._must_exist(name)
@@ -174,12 +206,12 @@ class Mechanism:
             start += len(names)
         return dataclasses.replace(self, effects=tuple(effects))
 
-    def trust(self, *names: str) -> Self:
-        """Hold these parameters in fits."""
+    def trust(self, *names: str) -> "Mechanism":
+        """The mechanism with these parameters held constant in fits."""
         return dataclasses.replace(self, trusted=self.trusted | set(names))
 
-    def release(self, *names: str) -> Self:
-        """Let fits move these parameters."""
+    def release(self, *names: str) -> "Mechanism":
+        """The mechanism with these parameters free in fits."""
         for name in names:
             self._must_exist(name)
         return dataclasses.replace(self, trusted=self.trusted - set(names))
@@ -192,7 +224,7 @@ class Mechanism:
 
     @classmethod
     def tree_unflatten(cls, aux: Any, leaves: Sequence[Any]) -> "Mechanism":
-        """Rebuild from leaves (numbers or tracers)."""
+        """The mechanism with these leaves (numbers or tracers)."""
         structure, trusted = aux
         effects, start = [], 0
         for e in structure.effects:
@@ -212,9 +244,20 @@ class Mechanism:
         return rebuilt
 
     def _repr_html_(self) -> str:
-        from rotflex_jax.display.cards import mechanism_card  # the layer above, when a notebook asks
-
-        return mechanism_card(self)
+        """Ports and effects with their equations, and every parameter with unit and value."""
+        vectors = ((name, ", ".join(f"{v:g}" for v in p)) for name, p in self.port_vectors.items())
+        effects = [(effect_label(e.name, e.at), equation(e.equation)) for e in self.effects]
+        described = zip(self.parameter_names, self.parameter_specifications, self.values, strict=True)
+        rows = [
+            (name, unit_text(spec.unit), spec.meaning, "held" if name in self.trusted else "", f"{value:.6g}")
+            for name, spec, value in described
+        ]
+        return card(
+            f"Mechanism of {', '.join(self.coordinates)}; outputs {', '.join(self.channels)}",
+            paragraph(f"Ports, as shares of the coordinates: {', '.join(f'{n} ({p})' for n, p in vectors)}"),
+            table(("effect", "equation"), effects, words=2),
+            table(("parameter", "unit", "meaning", "", "value"), rows, words=4),
+        )
 
     def __str__(self) -> str:
         lines = [f"Mechanism of {', '.join(self.coordinates)}; outputs {', '.join(self.channels)}"]

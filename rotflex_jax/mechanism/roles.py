@@ -1,51 +1,51 @@
-"""What the ports and sensors of any machine are to the search: the words of the flexible joint.
+"""Roles of the ports and sensors of any machine, in the names of the flexible joint.
 
-An effect says where it is worth looking for in the words of that joint: at the driven `hub`, at the
-elastic `joint`, at the `arm` that is carried along; at the sensor `theta` from which angles count, at
-the sensor `alpha` of something else. A machine with ports and channels of other names is read by what
-acts there, so that an effect needs no list of machines and a machine none of effects.
+An effect names the places where a search tries it by the ports of that joint: the driven `hub`, the elastic
+`joint`, the `arm` that is carried along; the sensor `theta` of the absolute angle and the sensor `alpha` of
+anything else. Ports and channels with other names get these roles by the effects at them, so that an effect
+needs no list of machines and a machine none of effects.
 """
 
-from rotflex_jax.effects.catalogue import CATALOG
-from rotflex_jax.effects.kinds import Actuation, Effect, Linear, Sensing
+from collections.abc import Callable
+
+from rotflex_jax.effects.base import CATALOG, Effect
 from rotflex_jax.mechanism.mechanism import Mechanism
 
 PORTS, SENSORS = ("hub", "arm", "joint"), ("theta", "alpha")
-Place = tuple[str, str]
 
 
 def port_roles(mechanism: Mechanism, port: str) -> set[str]:
-    """What a port is: its own name if the joint has one of that name, otherwise by what acts there.
+    """Roles of a port: its own name if the joint has one of that name, otherwise by the effects at it.
 
     A motor makes it a `hub`, a spring a `joint`, and neither an `arm`; one that moves in metres is an
     `axis` as well.
     """
     if port in PORTS:
         return {port}
-    springs = (e for e in mechanism.effects if isinstance(e, Linear) and e.at == port)
+    stiff = any(float(e.stamp().stiffness) != 0 for e in mechanism.linear_effects(port))
     roles = {"hub"} if mechanism.has_motor(port) else set()
-    roles |= {"joint"} if any(float(e.stamp().stiffness) != 0 for e in springs) else set()
+    roles |= {"joint"} if stiff else set()
     along = {"axis"} if mechanism.units.motion == "m" else set()
     return (roles or {"arm"}) | along
 
 
 def sensor_role(mechanism: Mechanism, channel: str) -> str:
-    """What a sensor is: `theta` for the first that shows a position which no spring holds, else `alpha`.
+    """Role of a sensor: `theta` for the first of a position that no spring holds, else `alpha`.
 
-    The angle that nothing holds has no zero of its own, and all gains are relative to its sensor's.
+    A position that no spring holds has no zero of its own, and all gains are relative to its sensor's.
     """
     if channel in SENSORS:
         return channel
     free = [
         name
-        for name, (port, what) in mechanism.outputs
-        if what == "position" and "joint" not in port_roles(mechanism, port)
+        for (name, (port, _)), quantity in zip(mechanism.outputs, mechanism.quantities, strict=True)
+        if quantity.is_position and "joint" not in port_roles(mechanism, port)
     ]
     return "theta" if channel in free[:1] else "alpha"
 
 
 def search_places(mechanism: Mechanism) -> list[tuple[type[Effect], str]]:
-    """Every (class, place) of the catalogue that a search of this machine tries when not told otherwise.
+    """Every (class, place) of the catalogue that a search of this machine tries by default.
 
     >>> from rotflex_jax.effects import Motor, Spring
     >>> drive = Mechanism(("a", "b"), {"shaft": (1, 0), "belt": (-1, 1), "drum": (0, 1)},
@@ -61,16 +61,16 @@ def search_places(mechanism: Mechanism) -> list[tuple[type[Effect], str]]:
 
 
 def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
-    if issubclass(cls, Actuation):
-        return list(cls.searched)
-    if issubclass(cls, Sensing):
-        if cls.relative and len(mechanism.outputs) == 1:
-            return []
-        roles = {c: {sensor_role(mechanism, c)} for c in mechanism.channels}
-    else:
-        if cls.turning and mechanism.units.motion != "rad":
-            return []
-        roles = {p: port_roles(mechanism, p) for p in mechanism.port_vectors}
+    if getattr(cls, "relative", False) and len(mechanism.outputs) == 1:
+        return []
+    if cls.turning and mechanism.units.motion != "rad":
+        return []
+    read: dict[str, Callable[[str], set[str]]] = {
+        "port": lambda port: port_roles(mechanism, port),
+        "input": lambda voltage: {voltage},
+        "channel": lambda channel: {sensor_role(mechanism, channel)},
+    }
+    roles = {place: read[cls.acts_on](place) for place in mechanism.locations(cls)}
     wanted = set(cls.searched)
     # A place that the effect itself names comes in its order, others in the machine's.
     named = [place for place in cls.searched if place in roles]
@@ -79,16 +79,16 @@ def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
     ]
 
 
-def calibrations(mechanism: Mechanism) -> list[Place]:
-    """What every recording may need to be read rightly, whatever the physics.
+def calibrations(mechanism: Mechanism) -> list[tuple[str, str]]:
+    """Calibrations (effect, location) that each recording has, independent of the physics.
 
-    An offset of the voltage, and a bias of every sensor that has a zero of its own; not of one that is
-    alone and shows a speed, for there it is the same as the offset.
+    An offset of the voltage, and a bias of every sensor that has a zero of its own; not of a single sensor
+    of speed, whose bias is equivalent to the offset.
     """
     alone = len(mechanism.outputs) == 1
     biased = [
         name
-        for name, (_, what) in mechanism.outputs
-        if sensor_role(mechanism, name) == "alpha" and not (alone and what == "speed")
+        for name, quantity in zip(mechanism.channels, mechanism.quantities, strict=True)
+        if sensor_role(mechanism, name) == "alpha" and not (alone and not quantity.is_position)
     ]
     return [("voltage_offset", "input"), *(("sensor_bias", name) for name in biased)]

@@ -1,23 +1,63 @@
-"""Free run and prediction on arrays; everything is pure, jitted once per structure and differentiable."""
+"""Free run and prediction on arrays: pure, compiled once per structure, differentiable."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
 
-from rotflex_jax.effects.kinds import Gear
-from rotflex_jax.mechanism.assembly import Layout, driven_voltage, effects_of, rest_state
-from rotflex_jax.mechanism.blocks import WORTH, linear_outputs
-from rotflex_jax.mechanism.combine import apply
+from rotflex_jax.effects.base import Sensing
+from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_voltage, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.programs import kept
-from rotflex_jax.mechanism.propagate import states
-from rotflex_jax.mechanism.sensors import read_outputs, read_with_sign, sensed
-from rotflex_jax.mechanism.smooth import SmoothRK4
+from rotflex_jax.mechanism.scan import BLOCKED_FROM_SAMPLES, linear_outputs, states
+from rotflex_jax.mechanism.small_matrices import evaluate_effect, matvec, sparse_matvec
+from rotflex_jax.mechanism.smooth_rk4 import SmoothRK4
 from rotflex_jax.mechanism.step import Exponential
-from rotflex_jax.precision import working_precision
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import working_precision
+
+
+def true_outputs(structure: Mechanism, x: Float[Array, "n *S"]) -> Float[Array, "C *S"]:
+    """Readings of ideal sensors."""
+    return sparse_matvec(Layout.of(structure).output_rows, x)
+
+
+def sensor_readings(
+    mechanism: Mechanism, gates: Float[Array, "E *D"], y: Float[Array, "C *S"]
+) -> Float[Array, "C *S"]:
+    """Sensor readings of true outputs."""
+    for i, effect in effects_of(mechanism, Sensing):
+        c = mechanism.channels.index(effect.at)
+        read = y[c] + gates[i] * (evaluate_effect(effect, lambda e, true: e.measure(true), y[c]) - y[c])
+        y = jnp.concatenate([y[:c], read[None], y[c + 1 :]])
+    return y
+
+
+def read_outputs(
+    mechanism: Mechanism, gates: Float[Array, "E *D"], x: Float[Array, "n *S"]
+) -> Float[Array, "C *S"]:
+    """Sensor readings of states."""
+    return sensor_readings(mechanism, gates, true_outputs(mechanism.structure, x))
+
+
+def readings_with_slope_sign(
+    mechanism: Mechanism, gates: Float[Array, "E *D"], x: Float[Array, "n *S"]
+) -> tuple[Float[Array, "C *S"], Float[Array, "C *S"]]:
+    """Readings, and the sign of their derivative with respect to the true value.
+
+    The Kalman gain is that of ideal sensors. The reading of a full-wave rectifier falls as the true value
+    rises from below zero: without the sign the correction would be unstable.
+    """
+    true = true_outputs(mechanism.structure, x)
+    if not effects_of(mechanism, Sensing):
+        return true, jnp.ones_like(true)
+    read, slope = jax.jvp(lambda y: sensor_readings(mechanism, gates, y), (true,), (jnp.ones_like(true),))
+    return read, jnp.sign(slope)
+
 
 Solver = Exponential | SmoothRK4
 
@@ -32,10 +72,9 @@ class FreeStep:
     @property
     def linear(self) -> bool:
         """Whether the state after the step is linear in state and voltage."""
-        rough = Layout.of(self.structure).torque_ports or effects_of(self.structure, Gear)
-        return isinstance(self.solver, Exponential) and not rough
+        return isinstance(self.solver, Exponential) and all(e.exact_step for e in self.structure.effects)
 
-    def __call__(self, x: jax.Array, v: jax.Array, c: Any) -> jax.Array:
+    def __call__(self, x: Float[Array, "n *S"], v: Float[Array, "*hS"], c: Any) -> Float[Array, "n *S"]:
         """State one sample later under the voltage `v`."""
         return self.solver.advance(self.structure, x, v, c)
 
@@ -47,46 +86,53 @@ class PredictorStep:
     structure: Mechanism
     solver: Solver
 
-    def __call__(self, x: jax.Array, w: tuple[jax.Array, ...], constants: Any) -> jax.Array:
+    def __call__(
+        self, x: Float[Array, "n *S"], w: tuple[Float[Array, "..."], ...], constants: Any
+    ) -> Float[Array, "n *S"]:
         """State one sample later; `w` is voltage, outputs, and whether they may correct the state."""
         v, y, seen = w
         c, K = constants
         mechanism = self.structure.with_values(c.values)
-        read, way = read_with_sign(mechanism, c.gates, x)
-        e = (y - read) * way * seen[None]
-        return self.solver.advance(self.structure, x + apply(K, e), v, c)
+        read, sign = readings_with_slope_sign(mechanism, c.gates, x)
+        e = (y - read) * sign * seen[None]
+        return self.solver.advance(self.structure, x + matvec(K, e), v, c)
 
 
-def driven(
-    structure: Mechanism, solver: Solver, values: jax.Array, gates: jax.Array, u: jax.Array, Ts: jax.Array
+def prepared_run(
+    structure: Mechanism,
+    solver: Solver,
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    u: Float[Array, " N"],
+    Ts: Float[Array, ""],
 ) -> tuple[Mechanism, Any, Any]:
-    """The mechanism with its numbers, what the solver takes at each sample of `u` (N,), its constants."""
+    """The mechanism with its parameter values, the solver's input at each sample, the solver's constants."""
     mechanism = structure.with_values(values)
     constants = solver.prepare(structure, values, gates, Ts)
-    return mechanism, solver.inputs(driven_voltage(mechanism, gates, u, Ts)), constants
+    return mechanism, solver.inputs(motor_voltage(mechanism, gates, u, Ts)), constants
 
 
 def free_run(
     structure: Mechanism,
     solver: Solver,
-    values: jax.Array,
-    gates: jax.Array,
-    x0: jax.Array,
-    u: jax.Array,
-    Ts: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Simulated states (N, n) and outputs (N, C) from the first state and the voltage alone.
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    x0: Float[Array, " n"],
+    u: Float[Array, " N"],
+    Ts: Float[Array, ""],
+) -> tuple[Float[Array, "N n"], Float[Array, "N C"]]:
+    """Simulated states and outputs from the first state and the voltage alone.
 
     Args:
         structure: `mechanism.structure`; static.
         solver: Integration rule; static.
-        values: Parameter values (P,).
+        values: Parameter values.
         gates: One factor per effect, 1 where it is on.
-        x0: First state (n,).
-        u: Voltage (N,) [V], held over each sample.
+        x0: First state.
+        u: Voltage [V], held over each sample.
         Ts: Sampling period [s].
     """
-    mechanism, v, c = driven(structure, solver, values, gates, u, Ts)
+    mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
     X = states(FreeStep(structure, solver), x0, v, c)
     return X, read_outputs(mechanism, gates, X.T).T
 
@@ -94,64 +140,64 @@ def free_run(
 def predictor_run(
     structure: Mechanism,
     solver: Solver,
-    values: jax.Array,
-    gates: jax.Array,
-    x0: jax.Array,
-    u: jax.Array,
-    y: jax.Array,
-    seen: jax.Array,
-    K: jax.Array,
-    Ts: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """States before correction (N, n) and outputs predicted one step ahead (N, C).
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    x0: Float[Array, " n"],
+    u: Float[Array, " N"],
+    y: Float[Array, "N C"],
+    seen: Float[Array, " N"],
+    K: Float[Array, "n C"],
+    Ts: Float[Array, ""],
+) -> tuple[Float[Array, "N n"], Float[Array, "N C"]]:
+    """States before correction and outputs predicted one step ahead.
 
     Args:
         structure: `mechanism.structure`; static.
         solver: Integration rule; static.
-        values: Parameter values (P,).
+        values: Parameter values.
         gates: One factor per effect.
-        x0: First state (n,).
-        u: Voltage (N,) [V].
-        y: Measured outputs (N, C).
-        seen: One where a sample may correct the state, zero where it may not (N,).
-        K: Gain (n, C); zero is a free run.
+        x0: First state.
+        u: Voltage [V].
+        y: Measured outputs.
+        seen: One where a sample may correct the state, zero where it may not.
+        K: Gain; zero for a free run.
         Ts: Sampling period [s].
     """
-    mechanism, v, c = driven(structure, solver, values, gates, u, Ts)
+    mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
     X = states(PredictorStep(structure, solver), x0, (v, y, seen), (c, K))
     return X, read_outputs(mechanism, gates, X.T).T
 
 
-@kept(static=2)
-def _free_states(structure: Mechanism, solver: Solver, *given: jax.Array) -> jax.Array:
+@persistent_jit(static=2)
+def _free_states(structure: Mechanism, solver: Solver, *given: Array) -> Array:
     return free_run(structure, solver, *given)[0]
 
 
-@kept(static=2)
+@persistent_jit(static=2)
 def _free_outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN202 - as `free_run`
-    """Outputs (N, C) alone: no state is kept."""
-    mechanism, v, c = driven(structure, solver, values, gates, u, Ts)
+    """Outputs (N, C) alone: no state is stored."""
+    mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
     step = FreeStep(structure, solver)
-    if step.linear and len(u) >= WORTH:
+    if step.linear and len(u) >= BLOCKED_FROM_SAMPLES:
         rows = jnp.asarray(Layout.of(structure).output_rows, x0.dtype)
         rows = jnp.pad(rows, ((0, 0), (0, len(x0) - rows.shape[1])))
-        return sensed(mechanism, gates, linear_outputs(step, x0, v, c, rows).T).T
+        return sensor_readings(mechanism, gates, linear_outputs(step, x0, v, c, rows).T).T
     body = lambda x, w: (step(x, w, c), read_outputs(mechanism, gates, x))  # noqa: E731
     return jax.lax.scan(body, x0, v)[1]
 
 
 def simulate(
     mechanism: Mechanism,
-    u: np.ndarray,
+    u: Real[ArrayLike, " N"] | Sequence[float],
     Ts: float,
-    x0: np.ndarray | None = None,
+    x0: Real[ArrayLike, " m"] | Sequence[float] | None = None,
     solver: Solver | None = None,
-) -> np.ndarray:
-    """Outputs (N, C) of a free run from `x0` (rest if None), in the precision of `u`.
+) -> Float[np.ndarray, "N C"]:
+    """Outputs of a free run from `x0` (rest if None), in the precision of `u`.
 
     Args:
         mechanism: Model.
-        u: Voltage (N,) [V], held over each sample.
+        u: Voltage [V], held over each sample.
         Ts: Sampling period [s].
         x0: First state, or only its positions and speeds.
         solver: Integration rule; `Exponential()` if None.
@@ -161,12 +207,12 @@ def simulate(
 
 def simulate_states(
     mechanism: Mechanism,
-    u: np.ndarray,
+    u: Real[ArrayLike, " N"] | Sequence[float],
     Ts: float,
-    x0: np.ndarray | None = None,
+    x0: Real[ArrayLike, " m"] | Sequence[float] | None = None,
     solver: Solver | None = None,
-) -> np.ndarray:
-    """States (N, n) of a free run: positions, speeds, then states of motor and memories."""
+) -> Float[np.ndarray, "N n"]:
+    """States of a free run: positions, speeds, then states of motor and memories."""
     return _simulated(_free_states, mechanism, u, Ts, x0, solver)
 
 
@@ -178,5 +224,5 @@ def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typ
         start[: len(x0)] = x0
     with working_precision(u):
         gates = np.ones(len(mechanism.effects), u.dtype)
-        numbers = (mechanism.values.astype(u.dtype), gates, start, u, np.asarray(Ts, u.dtype))
-        return np.asarray(run(mechanism.structure, solver or Exponential(), *numbers))
+        values, period = mechanism.values.astype(u.dtype), np.asarray(Ts, u.dtype)
+        return np.asarray(run(mechanism.structure, solver or Exponential(), values, gates, start, u, period))

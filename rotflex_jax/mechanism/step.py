@@ -10,51 +10,176 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Real
 
-from rotflex_jax.effects.kinds import DryFriction, Force, Memory
+from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of
-from rotflex_jax.mechanism.between import Between, smoothed
-from rotflex_jax.mechanism.combine import along, apply, beside, in_each
-from rotflex_jax.mechanism.friction import contacts, solve_masked, within
-from rotflex_jax.mechanism.gear import apart, geared_step
+from rotflex_jax.mechanism.friction import coupled_contacts, limited, solve_masked
+from rotflex_jax.mechanism.gear import gear_constants, geared_step
+from rotflex_jax.mechanism.intersample import Intersample, substep_voltages
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.torques import port_motion, remember, torques
+from rotflex_jax.mechanism.small_matrices import (
+    evaluate_effect,
+    expand_axes,
+    matvec,
+    scaled_vector,
+    sparse_matvec,
+)
+
+
+def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "p *S"], Float[Array, "p *S"]]:
+    """Positions and speeds of the torque ports at linear states."""
+    P, n = layout.port_matrix, layout.n
+    return sparse_matvec(P, x[:n]), sparse_matvec(P, x[n : 2 * n])
+
+
+def motor_torque(
+    mechanism: Mechanism,
+    at: str,
+    x: Float[Array, "m *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "*S"]:
+    """Torque [N m] of the linear motors at a port for the linear state `x` and the voltage `v`.
+
+    The current takes its steady value: it follows every new voltage within a fraction of the step, so its
+    values at the ends of a step say nothing about its mean.
+    """
+    layout = Layout.of(mechanism.structure)
+    speed = sparse_matvec((mechanism.port_vectors[at],), x[layout.n : 2 * layout.n])[0]
+    total = jnp.zeros_like(speed)
+    for i, e in effects_of(mechanism, Linear):
+        if not (e.motor and e.at == at):
+            continue
+        stamp = e.stamp()
+        total = total + gates[i] * (stamp.drive * v - stamp.damping * speed)
+        if e.order:
+            own = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in row]) for row in stamp.own])
+            columns = (stamp.from_speed, stamp.from_voltage)
+            inputs = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in column]) for column in columns])
+            per_speed, per_volt = -jnp.linalg.solve(own, inputs.T).T @ jnp.stack(
+                [jnp.asarray(c, x.dtype) for c in stamp.torque]
+            )
+            total = total + gates[i] * (per_speed * speed + per_volt * v)
+    return total
+
+
+def _drive(mechanism: Mechanism, e: Memory, x: Array, v: Array, gates: Array) -> Array:
+    """Last argument of `flow` and `force` of a memory."""
+    return v if e.driven_by == "voltage" else motor_torque(mechanism, e.at, x, v, gates)
+
+
+def torques(
+    mechanism: Mechanism,
+    x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "p *S"]:
+    """Torques of forces and memories at the torque ports.
+
+    Args:
+        mechanism: With (traced) parameter values.
+        x: Linear part of the state.
+        z: Memories.
+        v: Voltage [V].
+        gates: One factor per effect.
+    """
+    layout = Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
+    force = lambda e, *signals: e.force(*signals)  # noqa: E731
+    for i, e in effects_of(mechanism, Force):
+        k = layout.torque_ports.index(e.at)
+        total[k] = total[k] + gates[i] * evaluate_effect(e, force, position[k], speed[k], v)
+    for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
+        k = layout.torque_ports.index(e.at)
+        drive = _drive(mechanism, e, x, v, gates)
+        total[k] = total[k] + gates[i] * evaluate_effect(e, force, z[m], position[k], speed[k], drive)
+    return jnp.stack(total)
+
+
+def memory_rates(
+    mechanism: Mechanism,
+    x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "z *S"]:
+    """Time derivatives of the memories; arguments as for `torques`."""
+    layout = Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    rates, flow = [], lambda e, *signals: e.flow(*signals)
+    for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
+        k = layout.torque_ports.index(e.at)
+        drive = _drive(mechanism, e, x, v, gates)
+        rates.append(jnp.asarray(evaluate_effect(e, flow, z[m], position[k], speed[k], drive)))
+    return jnp.stack(rates)
+
+
+def advance_memories(
+    mechanism: Mechanism,
+    z: Float[Array, "z *S"],
+    x: Float[Array, "m *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+    h: Float[Array, "*D"],
+) -> Float[Array, "z *S"]:
+    """Memories after `h` [s], motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
+    if not z.shape[0]:
+        return z
+    flow = lambda s: memory_rates(mechanism, x, s, v, gates)  # noqa: E731
+    # Each flow depends on its own state only, so one direction gives all derivatives.
+    rate, slope = jax.jvp(flow, (z,), (jnp.ones_like(z),))
+    h = expand_axes(h[None], z)
+    a = slope * h
+    small = jnp.abs(a) < 1e-6
+    phi = jnp.where(small, 1 + a / 2, jnp.expm1(a) / jnp.where(small, 1.0, a))
+    return z + h * phi * rate
 
 
 @dataclasses.dataclass(frozen=True)
 class Exponential:
-    """The step of this toolkit.
+    """The exponential integrator: exact linear part, Runge-Kutta for smooth torques, set-valued dry friction.
 
     Attributes:
         order: 2 or 4, the order of the rule for smooth torques.
         substeps: Steps per sample; compare with a larger number to see the error.
-        passes: Passes over coupled friction contacts, as in `friction.contacts`; None settles any case.
-        between: What the voltage does between its samples: "held", or "smooth" as behind a low-pass filter,
-            which wants four substeps or so.
+        passes: Passes over coupled friction contacts, see `friction.coupled_contacts`; None solves any case.
+        between: The voltage between its samples: "held", or "smooth" as behind a low-pass filter, which needs
+            about four substeps.
     """
 
     order: int = 2
     substeps: int = 1
     passes: int | None = None
-    between: Between = "held"
+    between: Intersample = "held"
 
-    def inputs(self, v: jax.Array) -> jax.Array:
-        """What `advance` takes at each sample, for a sequence of voltages (N,)."""
-        return v if self.between == "held" else smoothed(v, self.substeps)
+    def inputs(self, v: Float[Array, " N"]) -> Float[Array, "N *h"]:
+        """Input of `advance` at each sample, for a sequence of voltages."""
+        return v if self.between == "held" else substep_voltages(v, self.substeps)
 
-    def prepare(self, structure: Mechanism, values: jax.Array, gates: jax.Array, Ts: jax.Array) -> Constants:
+    def prepare(
+        self,
+        structure: Mechanism,
+        values: Real[Array, " P"],
+        gates: Float[Array, " E"],
+        Ts: Float[Array, ""],
+    ) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
         h = Ts / self.substeps
         c = constants(structure, values, gates, h)
-        return c._replace(apart=apart(structure, values, gates, h))
+        return c._replace(gear=gear_constants(structure, values, gates, h))
 
-    def advance(self, structure: Mechanism, x: jax.Array, v: jax.Array, c: Constants) -> jax.Array:
-        """State one sample later, for one state or for many side by side.
+    def advance(
+        self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*hS"], c: Constants
+    ) -> Float[Array, "n *S"]:
+        """State one sample later, for one state or for several side by side.
 
         Args:
-            structure: The mechanism without numbers.
-            x: State (n, ...).
-            v: Voltage held over the sample (...) [V], or over each substep (substeps, ...); from `inputs`.
+            structure: The mechanism without parameter values.
+            x: State.
+            v: Voltage held over the sample (*S) [V], or over each substep (substeps, *S); from `inputs`.
             c: From `prepare`.
         """
         mechanism = structure.with_values(c.values)
@@ -65,65 +190,63 @@ class Exponential:
         return jax.lax.fori_loop(0, self.substeps, body, x)
 
 
-def _step(mechanism: Mechanism, x: jax.Array, v: jax.Array, c: Constants, solver: Exponential) -> jax.Array:
-    if c.apart is None:
-        return _advance(mechanism, x, v, c, solver)
-    moved = lambda x, c, extra: _advance(mechanism, x, v, c, solver, extra)  # noqa: E731
-    return geared_step(mechanism, x, c, moved)
+def _step(mechanism: Mechanism, x: Array, v: Array, c: Constants, solver: Exponential) -> Array:
+    if c.gear is None:
+        return _advance_smooth(mechanism, x, v, c, solver)
+    advance = lambda x, c, extra: _advance_smooth(mechanism, x, v, c, solver, extra)  # noqa: E731
+    return geared_step(mechanism, x, c, advance)
 
 
-def _advance(
+def _advance_smooth(
     mechanism: Mechanism,
-    x: jax.Array,
-    v: jax.Array,
+    x: Array,
+    v: Array,
     c: Constants,
     solver: Exponential,
-    extra: jax.Array | None = None,
-) -> jax.Array:
-    """The step under one set of equations; `extra` comes to the linear states from elsewhere."""
+    extra: Array | None = None,
+) -> Array:
+    """The step under one set of equations; `extra` is added to the linear states at its end."""
     layout = Layout.of(mechanism.structure)
     L, z = x[: layout.linear], x[layout.linear :]
-    start = apply(c.E, L) + along(c.input, v)
+    start = matvec(c.E, L) + scaled_vector(c.input, v)
     start = start if extra is None else start + extra
     if not layout.torque_ports:
         return start
     smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
     if not smooth:
-        return _brake(mechanism, L, start, c, solver.passes)
+        return _with_dry_friction(mechanism, L, start, c, solver.passes)
     f0 = torques(mechanism, L, z, v, c.gates)
-    guess = start + apply(c.hold, f0)
-    brake = _brake_guess(mechanism, L, guess, c) if layout.contacts else None
-    end = guess if brake is None else guess + apply(c.hold, brake)
-    z1 = remember(mechanism, z, (L + end) / 2, v, c.gates, c.h)
+    guess = start + matvec(c.hold, f0)
+    brake = _predicted_friction(mechanism, L, guess, c) if layout.contacts else None
+    end = guess if brake is None else guess + matvec(c.hold, brake)
+    z1 = advance_memories(mechanism, z, (L + end) / 2, v, c.gates, c.h)
     if solver.order == 2:
-        final = guess + apply(c.ramp, torques(mechanism, end, z1, v, c.gates) - f0)
+        final = guess + matvec(c.ramp, torques(mechanism, end, z1, v, c.gates) - f0)
     else:
         own = end if extra is None else end - extra
         final = guess + _fourth_order(mechanism, L, z, z1, v, f0, brake, own, c)
-    final = _brake(mechanism, L, final, c, solver.passes)
+    final = _with_dry_friction(mechanism, L, final, c, solver.passes)
     return jnp.concatenate([final, z1]) if z.shape[0] else final
 
 
-def _fourth_order(mechanism, L, z, z1, v, f0, brake, end, c):  # noqa: ANN001, ANN202 - as in `_advance`
-    """What comes to the state as the torques do not stay `f0`, ETDRK4; `end` is where that would lead."""
+def _fourth_order(mechanism, L, z, z1, v, f0, brake, end, c):  # noqa: ANN001, ANN202 - as in `_advance_smooth`
+    """Correction of the state for torques that change from `f0`, ETDRK4; `end` is the state without it."""
     held = (lambda f: f) if brake is None else lambda f: f + brake
-    half = apply(c.half_E, L) + along(c.half_input, v)
-    a = half + apply(c.half_hold, held(f0))
-    zh = remember(mechanism, z, (L + a) / 2, v, c.gates, c.h / 2)
+    half = matvec(c.half_E, L) + scaled_vector(c.half_input, v)
+    a = half + matvec(c.half_hold, held(f0))
+    zh = advance_memories(mechanism, z, (L + a) / 2, v, c.gates, c.h / 2)
     fa = torques(mechanism, a, zh, v, c.gates)
-    b = half + apply(c.half_hold, held(fa))
+    b = half + matvec(c.half_hold, held(fa))
     fb = torques(mechanism, b, zh, v, c.gates)
-    # Two half steps make a whole one: half_E half_hold + half_hold = hold, and so for the rest.
-    e = end + apply(c.half_hold, 2 * (fb - f0))
+    # Two half steps are a whole one: half_E half_hold + half_hold = hold, and so for the other columns.
+    e = end + matvec(c.half_hold, 2 * (fb - f0))
     fe = torques(mechanism, e, z1, v, c.gates)
     middle = fa + fb
     slope, bend = 2 * middle - 3 * f0 - fe, 4 * (f0 - middle + fe)
-    return apply(c.ramp, slope) + apply(c.rise, bend)
+    return matvec(c.ramp, slope) + matvec(c.rise, bend)
 
 
-def _levels(
-    mechanism: Mechanism, x: jax.Array, end: jax.Array, gates: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _friction_levels(mechanism: Mechanism, x: Array, end: Array, gates: Array) -> tuple[Array, Array]:
     """Friction levels against positive and negative motion of each friction port."""
     layout = Layout.of(mechanism.structure)
     position, before = port_motion(layout, x)
@@ -132,25 +255,25 @@ def _levels(
     down = list(up)
     for i, e in effects_of(mechanism, DryFriction):
         k = layout.torque_ports.index(e.at)
-        for levels, way in ((up, 1.0), (down, -1.0)):
-            level = in_each(e, lambda e, q, s, way=way: e.limit(q, s, way), position[k], speed[k])
+        for levels, direction in ((up, 1.0), (down, -1.0)):
+            level = evaluate_effect(e, lambda e, q, s, d=direction: e.limit(q, s, d), position[k], speed[k])
             levels[k] = levels[k] + gates[i] * level
     return jnp.stack(up), jnp.stack(down)
 
 
-def _brake_guess(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants) -> jax.Array:
-    """Friction torques good enough for the stages: exact where a port slides, contacts uncoupled."""
+def _predicted_friction(mechanism: Mechanism, x: Array, end: Array, c: Constants) -> Array:
+    """Friction torques for the stages: exact where a port slides, contacts uncoupled."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
-    up, down = _levels(mechanism, x, end, c.gates)
+    up, down = _friction_levels(mechanism, x, end, c.gates)
     own = jnp.stack([1 / c.stop[i, i] for i in range(k)])
     needed = -port_motion(layout, end)[1][:k]
-    needed = needed * beside(own, needed)
+    needed = needed * expand_axes(own, needed)
     none = jnp.zeros((len(layout.torque_ports) - k, *x.shape[1:]), x.dtype)
-    return jnp.concatenate([within(needed, up, down), none])
+    return jnp.concatenate([limited(needed, up, down), none])
 
 
-def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants, passes: int | None) -> jax.Array:
+def _with_dry_friction(mechanism: Mechanism, x: Array, end: Array, c: Constants, passes: int | None) -> Array:
     """The state at the end of the step with dry friction, positions matched to the stop inside it."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
@@ -158,23 +281,23 @@ def _brake(mechanism: Mechanism, x: jax.Array, end: jax.Array, c: Constants, pas
         return end
     q0, v0 = (m[:k] for m in port_motion(layout, x))
     free, stop = port_motion(layout, end)[1][:k], c.stop[:k, :k]
-    levels = _levels(mechanism, x, end, c.gates)
+    levels = _friction_levels(mechanism, x, end, c.gates)
     if not all(e.steady for _, e in effects_of(mechanism, DryFriction)):
         # The level belongs to the speed that friction leaves, not to the one without it.
-        rough = contacts(v0, free, stop, *levels, passes=1)
-        levels = _levels(mechanism, x, end + apply(c.hold[:, :k], rough.torque), c.gates)
-    found = contacts(v0, free, stop, *levels, passes=passes)
-    end = end + apply(c.hold[:, :k], found.torque)
+        rough = coupled_contacts(v0, free, stop, *levels, passes=1)
+        levels = _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], rough.torque), c.gates)
+    found = coupled_contacts(v0, free, stop, *levels, passes=passes)
+    end = end + matvec(c.hold[:, :k], found.torque)
     q1, v1 = (m[:k] for m in port_motion(layout, end))
-    # A held torque takes the speed from v0 to v1 on a line; in truth it reaches zero after t h. A port
-    # that holds moves by nothing at all, not even by the curvature of that line.
-    half = beside(c.h[None], v0) / 2
+    # A constant torque changes the speed linearly from v0 to v1; in truth it reaches zero after t h. A port
+    # that sticks does not move at all, not even by the curvature of that line.
+    half = expand_axes(c.h[None], v0) / 2
     late = half * (found.t * v0 + (1 - found.t) * v1 - v0 - v1)
     curved = half * (v0 + v1) - (q1 - q0)
     shift = late + (1 - found.t) * found.holds * curved
-    # A contact that is off has nothing to correct; what it would do if it came in, it would do alone.
-    own = beside(jnp.stack([c.mobility[i, i] for i in range(k)]), shift)
+    # A contact that is switched off needs no correction; its derivative is that of the contact alone.
+    own = expand_axes(jnp.stack([c.mobility[i, i] for i in range(k)]), shift)
     alone = jnp.where(found.crossed, shift / own, 0.0)
     works = found.crossed & (levels[0] + levels[1] > 0)
     impulse = solve_masked(c.mobility[:k, :k], works, shift, alone)
-    return end + apply(c.push[:, :k], impulse)
+    return end + matvec(c.push[:, :k], impulse)

@@ -16,13 +16,13 @@ _WORDS = (("torque", "force"), ("turning", "moving"), ("turns", "moves"), ("turn
 
 
 class Units(NamedTuple):
-    """How the ports of a machine move.
+    """Units of the ports of a machine.
 
     Attributes:
         motion: Unit of a port's position.
-        effort: Unit of what drives it.
-        motion_size: How large its positions are, next to the radians of a small joint.
-        effort_size: The same for what drives it, next to newton metres.
+        effort: Unit of the force or torque.
+        motion_size: Typical size of its positions, relative to the radians of a small joint.
+        effort_size: The same for the force or torque, relative to newton metres.
     """
 
     motion: str = "rad"
@@ -31,7 +31,7 @@ class Units(NamedTuple):
     effort_size: float = 1.0
 
     def unit(self, declared: str) -> str:
-        """A unit that an effect declares, as it is for this machine.
+        """The unit of this machine for a unit that an effect declares.
 
         >>> Units("m", "N").unit("N m s/rad"), Units("m", "N").unit("kg m^2")
         ('N s/m', 'kg')
@@ -48,7 +48,7 @@ class Units(NamedTuple):
         return _written(whole)
 
     def size(self, declared: str) -> float:
-        """By what a typical size that an effect declares grows for this machine."""
+        """Factor on a typical size that an effect declares, for this machine."""
         powers = _powers(declared)
         return self.effort_size ** powers.get("N m", 0) * self.motion_size ** powers.get("rad", 0)
 

@@ -1,28 +1,198 @@
-"""What is wrong with a recording, or worth knowing of it: named, never repaired.
+"""Faults and properties of a recording: reported, never repaired.
 
-A real joint with dry friction sits still for long, often at the very end of its motion, and its
-encoder counts in steps: neither is a fault, and the checks here are built to know the difference.
+A joint with dry friction is at rest for long, often at the end of its motion, and its encoder quantises:
+neither is a fault, and the checks here distinguish them from one.
+
+A spring that carries only an inertia deflects in proportion to an acceleration, so at low frequency a
+deflection falls with the square of the frequency: `alpha / theta = w^2 / (w_n^2 - w^2)`. The absolute
+angle of the arm is `theta + alpha`, and `(theta + alpha) / theta = 1 / (1 - w^2 / w_n^2)` tends to one. A
+deflection is as large as theta at one frequency at most; an octave above, their ratio is far from one.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording.arm_angle import looks_absolute
-from rotflex_jax.recording.sensor import cut_off
+
+
+def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
+    """The step of a quantised signal.
+
+    All distinct values must lie on one lattice, to 5 % of its step, so that text rounded to a few
+    digits counts too. A chance lattice among m free values has probability below 0.1^(m - 1).
+
+    Args:
+        x: the signal.
+
+    Returns:
+        The step [unit of x], None where the values are on no lattice, or never repeat.
+
+    >>> t = np.arange(1000) / 100
+    >>> quantisation_step(0.25 * np.round(8 * np.sin(t) / 0.25))
+    0.25
+    >>> quantisation_step(np.sin(t)) is None
+    True
+    """
+    rounding = 16 * np.finfo(x.dtype).eps * np.max(np.abs(x))
+    levels = np.unique(x).astype(np.float64)
+    # Equal values that arithmetic has moved apart by a rounding error are one level.
+    levels = levels[np.diff(levels, prepend=-np.inf) > rounding]
+    if len(levels) < 10 or len(levels) == len(x):
+        return None
+    gaps = np.diff(levels)
+    smallest = np.median(gaps[gaps < 1.5 * gaps.min()])
+    for part in range(1, 6):  # neighbouring levels may all be missing: the smallest gap is 2 or 3
+        index = np.concatenate([[0.0], np.cumsum(np.round(gaps * part / smallest))])
+        spread = index - index.mean()
+        step = spread @ (levels - levels.mean()) / (spread @ spread)
+        if step < 100 * rounding:
+            break
+        if np.max(np.abs(levels - levels.mean() - step * spread)) < 0.05 * step:
+            return float(f"{step:.10g}")
+    return None
+
+
+def cut_off(
+    x: Float[np.ndarray, " N"], step: float | None, u: Float[np.ndarray, " N"], Ts: float
+) -> tuple[float, int] | None:
+    """The end of a sensor's range, where the signal would have gone further.
+
+    A joint may rest exactly at the end of its motion, so many equal samples prove nothing. What proves
+    saturation is a signal that arrives and leaves without slowing down, or one that stays while the input
+    is at its strongest in both directions.
+
+    Args:
+        x: signal.
+        step: its quantisation step, None if there is none [unit of x].
+        u: input.
+        Ts: sampling period [s].
+
+    Returns:
+        The end [unit of x] and the number of samples there, None where nothing is cut off.
+
+    >>> wave = np.sin(np.arange(2000) / 50)
+    >>> cut_off(wave, None, wave, 0.002)
+    >>> cut_off(np.minimum(wave, 0.7), None, wave, 0.002)
+    (0.7, 553)
+    """
+    for end, z in ((x.max(), x.max() - x), (x.min(), x - x.min())):
+        there = z <= 1e-6 * (step or 0.0)
+        count = int(np.sum(there))
+        if count >= 10 and (_passes_straight(z, there, step or 0.0) or _is_driven(there, u, Ts)):
+            return float(end), count
+    return None
+
+
+def _passes_straight(z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], step: float) -> bool:
+    """Whether the signal arrives at an end and leaves it without slowing down.
+
+    What stops or turns follows a parabola: over the last distance D it needs twice the time that it
+    needs over the last D / 4; what is cut off goes straight on, and needs four times. The ratio of
+    these times, over all visits together, must be above 2.5 for arriving and for leaving.
+    """
+    far = max(40 * step, 0.1 * z.max())
+    visits = 0
+    near_times = far_times = np.zeros(2)
+    while far <= 0.5 * z.max():  # a motion of a few steps tells nothing
+        visits, near_times, far_times = _passing_times(z, there, step, far)
+        if np.sum(far_times) >= 12 * visits:
+            break
+        far *= 2  # so few samples on the way that a half at each end counts
+    return visits >= 2 and bool(np.all(far_times > 2.5 * near_times))
+
+
+def _passing_times(
+    z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], step: float, far: float
+) -> tuple[int, Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """The visits to an end, and the samples from `far / 4` and from `far`, arriving and leaving."""
+    edges = np.flatnonzero(np.diff(z < far / 4, prepend=False, append=False))
+    beyond = np.concatenate([[-np.inf], np.flatnonzero(z >= far), [np.inf]])
+    visits, near_times, far_times = set(), np.zeros(2), np.zeros(2)
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        at_end = start + np.flatnonzero(there[start:stop])
+        if len(at_end) < 2:
+            continue
+        first, last = at_end[0], at_end[-1]
+        nearest = np.searchsorted(beyond, first)
+        # The end is reached half a sample before the first there, and left half a sample late.
+        arriving = first - start + 0.5, first - beyond[nearest - 1] - 0.5
+        leaving = stop - last - 0.5, beyond[nearest] - last - 0.5
+        for side, (near, full) in enumerate((arriving, leaving)):
+            # Beyond six it has paused on the way, or not come from further away: no evidence.
+            # In its time at the end it must have had more to go than a turning point can hide.
+            if full < 6 * near and len(at_end) * far / 4 / near > 3 * np.sqrt(step * far):
+                visits.add(start)
+                near_times[side] += near
+                far_times[side] += full
+    return len(visits), near_times, far_times
+
+
+def _is_driven(there: Bool[np.ndarray, " N"], u: Float[np.ndarray, " N"], Ts: float) -> bool:
+    """Whether the input is at its strongest, both ways, in the longest stay at an end."""
+    edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
+    stay = np.argmax(edges[1::2] - edges[::2])
+    start, stop = edges[2 * stay], edges[2 * stay + 1]
+    width = min(len(u), max(1, round(0.1 / Ts)))
+    lasting = np.convolve(u, np.full(width, 1 / width), mode="same")
+    during = lasting[start:stop]
+    return bool(
+        stop - start >= 20
+        and during.max() >= 0.8 * lasting.max() > 0
+        and during.min() <= 0.8 * lasting.min() < 0
+    )
+
+
+SLOW_BANDS = ((1, 4, 0.05), (4, 8, 0.15))
+"""Slow motion: first harmonic of the recording, harmonic after the last, tolerance of a slope of one."""
+
+LEAST_COHERENCE, LEAST_SLOW_SHARE = 0.99, 0.003
+"""In each band: of the two angles, and of the hub's motion in the band in all of it."""
+
+
+def is_absolute(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) -> bool:
+    """Whether alpha follows theta one to one in slow motion, in each of two bands.
+
+    False where there is no slow motion, as in a short recording or one of a single sine: there a
+    deflection may look the same.
+
+    Args:
+        theta: angle of the hub [rad].
+        alpha: angle that is given as the deflection of the arm [rad].
+
+    >>> t = np.linspace(0, 10, 5000)
+    >>> theta, swing = np.cos(t) + 0.3 * np.sin(3 * t), 0.05 * np.sin(20 * t)
+    >>> is_absolute(theta, theta + swing), is_absolute(theta, swing)
+    (True, False)
+    """
+    if len(theta) < 2 * SLOW_BANDS[-1][1]:
+        return False
+    # With low side lobes a strong motion in one band does not leak into the other.
+    window = np.blackman(len(theta))
+    hub, arm = (np.fft.rfft(window * (x - window @ x / window.sum())) for x in (theta, alpha))
+    for start, stop, far in SLOW_BANDS:
+        a, b = hub[start:stop], arm[start:stop]
+        size, other = np.linalg.norm(a), np.linalg.norm(b)
+        if size <= LEAST_SLOW_SHARE * np.linalg.norm(hub) or other == 0:
+            return False
+        together = np.vdot(a, b)
+        if abs(together / size**2 - 1) > far or abs(together) < LEAST_COHERENCE * size * other:
+            return False
+    return True
+
 
 ACCEPTABLE = ("short", "constant_input", "constant", "saturated", "units", "huge")
 """Faults that a user can accept by name; all others have no sensible reading."""
 
-SHORTEST = 50
-"""Samples below which no fit is worth its name."""
+SHORTEST_RECORDING = 50
+"""Samples below which no fit makes sense."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something about the quality of a recording.
+    """A fault or property of a recording.
 
     Args:
         kind: short name, such as `quantised`; the name to accept it by where that is possible.
@@ -41,19 +211,19 @@ class Finding:
 
 
 def inspect(
-    u: np.ndarray,
-    y: np.ndarray,
+    u: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, "N C"],
     Ts: float,
     names: Sequence[str],
     units: Sequence[str],
     resolution: Mapping[str, float | None],
     accept: Sequence[str] = (),
 ) -> tuple[Finding, ...]:
-    """Everything there is to say about a recording, by signal.
+    """All findings on a recording, signal by signal.
 
     Args:
-        u: input (N,).
-        y: outputs (N, C).
+        u: input.
+        y: outputs.
         Ts: sampling period [s].
         names: of the input and then of the outputs.
         units: in the same order.
@@ -76,7 +246,7 @@ def inspect(
         found += [_quantised(name, unit, step), _cut_off(x, u, Ts, name, unit, step)]
         if unit == "rad":
             found.append(_like_degrees(x, u, Ts, name, units[0]))
-    found.append(_in_the_room(y, names[1:]))
+    found.append(_absolute_angle(y, names[1:]))
     accepted = {("error", kind): "warning" for kind in accept}
     return tuple(
         replace(finding, severity=accepted.get((finding.severity, finding.kind), finding.severity))
@@ -108,18 +278,20 @@ def acceptable(accept: str | Sequence[str]) -> tuple[str, ...]:
     return kinds
 
 
-def _still(x: np.ndarray) -> bool:
+def _still(x: Float[np.ndarray, " N"]) -> bool:
     return bool(np.ptp(x) <= 1e-12 * np.max(np.abs(x)))
 
 
-def _short(u: np.ndarray) -> Finding | None:
-    if len(u) >= SHORTEST:
+def _short(u: Float[np.ndarray, " N"]) -> Finding | None:
+    if len(u) >= SHORTEST_RECORDING:
         return None
-    message = f"The recording must have at least {SHORTEST} samples, but has {len(u)}; record longer."
+    message = (
+        f"The recording must have at least {SHORTEST_RECORDING} samples, but has {len(u)}; record longer."
+    )
     return Finding("short", "time", message, "error")
 
 
-def _of_input(u: np.ndarray, name: str, unit: str) -> list[Finding]:
+def _of_input(u: Float[np.ndarray, " N"], name: str, unit: str) -> list[Finding]:
     if _still(u):
         message = (
             f"Input {name!r} is {u[0]:g} {unit} throughout, which moves nothing to learn from; "
@@ -128,7 +300,7 @@ def _of_input(u: np.ndarray, name: str, unit: str) -> list[Finding]:
         return [Finding("constant_input", name, message, "error")]
     found = []
     levels, counts = np.unique(u, return_counts=True)
-    # A two-level or stepped input holds every level for long; a clipped one only the outermost.
+    # A two-level or stepped input holds every level for long; a clipped one only the extremes.
     often = max(5.0, 0.005 * len(u), 5.0 * float(np.median(counts)))
     ends = [f"{levels[k]:g}" for k in (0, -1) if counts[k] >= often and levels[k] != 0]
     if len(levels) >= 10 and ends:
@@ -153,11 +325,13 @@ def _quantised(name: str, unit: str, step: float | None) -> Finding | None:
     return Finding("quantised", name, f"Channel {name!r} is quantised in steps of {size}.", "note")
 
 
-def _like_degrees(x: np.ndarray, u: np.ndarray, Ts: float, name: str, input_unit: str) -> Finding | None:
+def _like_degrees(
+    x: Float[np.ndarray, " N"], u: Float[np.ndarray, " N"], Ts: float, name: str, input_unit: str
+) -> Finding | None:
     """Angles beyond what a joint can do in radians.
 
     A deflection of half a turn is none. A geared servo makes about 2 rad/s per volt, in degrees
-    100; the line is drawn between them, for the speed over 20 ms, which noise cannot reach.
+    100; the limit lies between them, for the speed over 20 ms, which noise does not reach.
     """
     lag = max(1, round(0.02 / Ts))
     speed = np.max(np.abs(x[lag:] - x[:-lag]), initial=0.0) / (lag * Ts)
@@ -174,10 +348,10 @@ def _like_degrees(x: np.ndarray, u: np.ndarray, Ts: float, name: str, input_unit
     return Finding("units", name, message, "warning")
 
 
-def _in_the_room(y: np.ndarray, names: Sequence[str]) -> Finding | None:
+def _absolute_angle(y: Float[np.ndarray, "N C"], names: Sequence[str]) -> Finding | None:
     if not {"theta", "alpha"} <= set(names):
         return None
-    if not looks_absolute(*(y[:, names.index(name)] for name in ("theta", "alpha"))):
+    if not is_absolute(*(y[:, names.index(name)] for name in ("theta", "alpha"))):
         return None
     message = (
         "Channel 'alpha' follows 'theta' one to one in slow motion, as the angle of the arm in the room "
@@ -187,7 +361,12 @@ def _in_the_room(y: np.ndarray, names: Sequence[str]) -> Finding | None:
 
 
 def _cut_off(
-    x: np.ndarray, u: np.ndarray, Ts: float, name: str, unit: str, step: float | None
+    x: Float[np.ndarray, " N"],
+    u: Float[np.ndarray, " N"],
+    Ts: float,
+    name: str,
+    unit: str,
+    step: float | None,
 ) -> Finding | None:
     end, count = cut_off(x, step, u, Ts) or (None, 0)
     if end is None:

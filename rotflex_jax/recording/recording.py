@@ -1,4 +1,4 @@
-"""One experiment as it was measured."""
+"""A recording: the measured input and outputs of one experiment."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import quality
-from rotflex_jax.recording.quality import Finding
+from rotflex_jax.recording.quality import Finding, quantisation_step
 from rotflex_jax.recording.samples import (
     aligned,
     finite,
@@ -19,14 +19,17 @@ from rotflex_jax.recording.samples import (
     real_numbers,
     sampling_period,
 )
-from rotflex_jax.recording.sensor import quantisation_step
+from rotflex_jax.text.colours import FINAL
+from rotflex_jax.text.markup import bullets, card, paragraph, picture, table
+from rotflex_jax.text.numbers import plain_number, readable
+from rotflex_jax.text.svg import Panel, signals
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class Recording:
     """One experiment: the input, the outputs and the sampling period, uniformly sampled.
 
-    `u[k]` is held over `[k Ts, (k + 1) Ts)`; `y[k]` is measured at its beginning.
+    `u[k]` is held over `[k Ts, (k + 1) Ts)`; `y[k]` is measured at its start.
 
     Not for data sampled unevenly: resample them first, with a method you can defend.
 
@@ -45,11 +48,11 @@ class Recording:
         accept: faults to accept, which then are findings of severity `warning`: `short`,
             `constant_input`, `constant`, `saturated`, `units`.
         resolution: quantisation step by channel, where it is known; found from the data otherwise.
-        continues: the recording that ended as this one began, if any; a part of a recording knows what
-            came before it. What no sensor shows (a warm motor) is as that recording left it.
+        continues: the recording that ended where this one starts, if any; a part of a recording knows the
+            part before it. States that no sensor shows (a warm motor) continue from there.
 
     Raises:
-        InputError: the data are not what they must be, told in one sentence.
+        InputError: the data are not what they must be.
 
     >>> u = np.sin(np.arange(100.0))
     >>> recording = Recording(u=u, y=0.01 * np.cumsum(u), Ts=0.01, source="an integrator")
@@ -117,13 +120,13 @@ class Recording:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        # A part of a recording accepts everything: its findings wait until somebody asks.
+        # A part of a recording accepts everything: its findings are computed when they are needed.
         if self.accept != quality.ACCEPTABLE:
             quality.refuse(self.findings)
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """What there is to know about the quality of the data."""
+        """Findings on the quality of the data."""
         names, units = (self.input_name, *self.channels), (self.input_unit, *self.units)
         return quality.inspect(self.u, self.y, self.Ts, names, units, self.resolution, self.accept)
 
@@ -151,7 +154,7 @@ class Recording:
     def slice(self, i: int, j: int) -> "Recording":
         """The samples from `i` up to, but without, `j`.
 
-        What is still in a part, or short, is no error: the whole has passed the checks.
+        A part that is short, or at rest, is no error: the whole has passed the checks.
         """
         if not 0 <= i < j <= self.N:
             raise InputError(
@@ -165,14 +168,14 @@ class Recording:
             start=self.start + i * self.Ts,
             n_init=min(self.n_init, max(1, (j - i) // 4)),
             accept=quality.ACCEPTABLE,
-            # One sample alone is no recording, and leaves nothing behind.
+            # One sample alone is no recording to continue.
             continues=self.slice(0, i) if i > 1 else self.continues if not i else None,
         )
 
     def split(
         self, share: float | None = None, *, seconds: float | None = None
     ) -> tuple["Recording", "Recording"]:
-        """Cuts the recording in two, in the order of time: one part to learn from, one to judge on.
+        """Cuts the recording in two, in the order of time: one part for training, one for validation.
 
         Args:
             share: of the samples in the first part [-]; 0.7 where neither is given.
@@ -202,7 +205,7 @@ class Recording:
 
         The mean keeps the impulse of the held input, to first order in `k Ts`. The output is not
         filtered: a filter would have to be part of the model, and angles have next to no content
-        beyond the new Nyquist frequency. Not for outputs with strong noise there, which folds back.
+        beyond the new Nyquist frequency. Not for outputs with strong noise there, which is aliased.
 
         Args:
             k: factor; samples at the end that do not fill a group are left out.
@@ -223,9 +226,27 @@ class Recording:
         )
 
     def _repr_html_(self) -> str:
-        from rotflex_jax.display.cards import recording_card  # the layer above, when a notebook asks
-
-        return recording_card(self)
+        """What was measured: extent, ranges, steps of the sensors, findings, and the signals over time."""
+        rows, panels = [], []
+        outputs = zip(self.channels, self.units, self.y.T, strict=True)
+        columns = [(self.input_name, self.input_unit, self.u, None)]
+        columns += [(name, unit, values, self.resolution.get(name)) for name, unit, values in outputs]
+        for name, unit, values, step in columns:
+            factor, read = readable(1.0, unit)
+            low, high = factor * float(np.min(values)), factor * float(np.max(values))
+            quantum = "" if step is None else plain_number(factor * step)
+            std = plain_number(factor * float(np.std(values)))
+            rows.append((name, read, f"{plain_number(low)} … {plain_number(high)}", std, quantum))
+            lines = [(factor * np.asarray(values, float), FINAL, "")]
+            panels.append(Panel(f"{name} [{read}]", lines))
+        rate = f"{self.N} samples, {self.duration:g} s at {1 / self.Ts:g} Hz"
+        return card(
+            f"Recording{f': {self.source}' if self.source else ''}",
+            paragraph(f"{rate}; models may see the first {self.n_init} samples"),
+            picture(signals(self.t, panels, "time [s]"), "The input and the outputs over time."),
+            table(("signal", "unit", "range", "standard deviation", "sensor step"), rows, words=2),
+            bullets(finding.message for finding in self.findings),
+        )
 
     def __repr__(self) -> str:
         pairs = zip(self.channels, self.units, strict=True)

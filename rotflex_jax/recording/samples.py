@@ -1,19 +1,20 @@
-"""What numbers must be before they are of use: real, finite, aligned, evenly spaced, enough to begin with."""
+"""Checks of samples: real, finite, aligned, evenly spaced; sampling period and initial samples."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Real
 
 from rotflex_jax.errors import InputError
 
 
-def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0) -> np.ndarray:
+def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0) -> Real[np.ndarray, "..."]:
     """An array of real numbers, text parsed strictly.
 
     Args:
         values: what was given.
-        label: begins the sentence of an error, such as "run.csv: column 'theta'".
+        label: first words of an error, such as "run.csv: column 'theta'".
         where: what one entry is called.
         first: number of the first entry.
 
@@ -39,9 +40,11 @@ def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0)
     numbers = np.empty(len(array))
     for k, entry in enumerate(array):
         try:
+            if isinstance(entry, str) and "_" in entry:
+                raise ValueError("Python alone takes 1_000 for a number")
             numbers[k] = float(entry)
-        except (TypeError, ValueError) as error:
-            text = entry.decode(errors="replace") if isinstance(entry, bytes) else str(entry)
+        except (TypeError, ValueError, OverflowError) as error:
+            text = entry.decode(errors="replace") if isinstance(entry, bytes) else f"{entry!s:.50}"
             what = f"holds {text!r}" if text.strip() else "is empty"
             raise InputError(
                 f"{label} {what} at {where} {first + k} where a number is needed; "
@@ -50,7 +53,7 @@ def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0)
     return numbers
 
 
-def finite(x: np.ndarray, label: str, where: str = "sample", first: int = 0) -> None:
+def finite(x: Real[np.ndarray, " N"], label: str, where: str = "sample", first: int = 0) -> None:
     """Refuses NaN and infinity, naming the first.
 
     Raises:
@@ -71,8 +74,10 @@ cut the recording there, or record again, since nothing is filled in silently.
         )
 
 
-def aligned(u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Input and outputs as (N,) and (N, C) of one precision, copied and read only.
+def aligned(
+    u: Real[np.ndarray, "..."], y: Real[np.ndarray, "..."]
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N C"]]:
+    """Input and outputs in one precision, copied and read only.
 
     Raises:
         InputError: other shapes, or lengths that differ.
@@ -112,7 +117,7 @@ def sampling_period(Ts: Any, label: str = "Argument `Ts`") -> float:
 but is 'fast'; give for instance 0.002.
     """
     value = np.asarray(Ts)
-    if value.size != 1 or value.dtype.kind not in "iuf" or not 0 < value.item() < np.inf:
+    if value.size != 1 or value.dtype.kind not in "iuf" or not 1e-300 < value.item() < np.inf:
         what = f"{value.item()!r}" if value.size == 1 else f"{value.size} values"
         raise InputError(
             f"{label} must be a positive number of seconds, but is {what}; give for instance 0.002."
@@ -120,12 +125,12 @@ but is 'fast'; give for instance 0.002.
     return float(value.item())
 
 
-def even_spacing(t: np.ndarray, label: str, where: str = "sample", first: int = 0) -> float:
+def even_spacing(t: Real[np.ndarray, " N"], label: str, where: str = "sample", first: int = 0) -> float:
     """The sampling period of time stamps that must be evenly spaced, each to 1 % of it.
 
     Args:
         t: time stamps [s].
-        label: begins the sentence of an error.
+        label: first words of an error.
         where: what one entry is called.
         first: number of the first entry.
 
@@ -162,7 +167,7 @@ def even_spacing(t: np.ndarray, label: str, where: str = "sample", first: int = 
     if steps[worst] > 1.5 * period:
         raise InputError(
             f"{label} has a gap of {steps[worst]:g} s {place(worst)} at a sampling period of "
-            f"{period:g} s, about {round(steps[worst] / period) - 1} samples lost; "
+            f"{period:g} s, about {float(steps[worst]) / period - 1:.0f} samples lost; "
             "load the parts before and after it as recordings of their own."
         )
     if abs(steps[worst] - period) > 0.01 * period:
@@ -178,7 +183,7 @@ def even_spacing(t: np.ndarray, label: str, where: str = "sample", first: int = 
 
 
 def initial_samples(n_init: int | None, N: int, Ts: float) -> int:
-    """How many samples a model may look at: 0.2 s, at least ten, at most a quarter, if not given."""
+    """How many samples a model may see: 0.2 s, at least ten, at most a quarter, if not given."""
     if n_init is None:
         return max(1, min(max(10, round(0.2 / Ts)), N // 4))
     if n_init != int(n_init) or not 1 <= n_init < N:

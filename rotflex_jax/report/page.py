@@ -1,47 +1,248 @@
-"""Pages that need no other file and no network: their templates, and the folder they are written to."""
+"""The report of a search as one HTML page."""
 
-from collections.abc import Mapping
-from functools import cache
+import platform
+from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
-import jinja2
+from rotflex_jax.discover.explanation import Explanation
+from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
+from rotflex_jax.discover.learned_torque import LearnedTorqueResult
+from rotflex_jax.discover.result import NEAR_FLOOR, Ranked, SearchResult, Where
+from rotflex_jax.discover.tables import (
+    Outcome,
+    channel_headings,
+    channel_units,
+    error_rows,
+    next_steps,
+    noise_ratios,
+    noise_row,
+    outcomes,
+    parameter_rows,
+    stage_labels,
+)
+from rotflex_jax.effects.labels import effect_label, effect_title, sentence
+from rotflex_jax.latent import LatentTorque
+from rotflex_jax.parameters import Estimate
+from rotflex_jax.recording import Recording
+from rotflex_jax.report.figures import pictures
+from rotflex_jax.text.colours import stage_colours
+from rotflex_jax.text.numbers import equation, plain_number, readable, together, value_and_interval
+from rotflex_jax.text.plotting import by_section
+from rotflex_jax.text.templates import as_json, fill_template, write_files
 
-from rotflex_jax.errors import InputError
+REPORTED_PACKAGES = ("rotflex_jax", "jax", "equinox", "optimistix", "numpy", "scipy", "matplotlib")
 
 
-@cache
-def template(name: str, package: str = "rotflex_jax.report") -> jinja2.Template:
-    """A template of a package; all share the style sheet of the report."""
-    environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(p) for p in (package, "rotflex_jax.report")]),
-        autoescape=jinja2.select_autoescape(("html.j2",)),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(name)
+def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]:
+    """What the template fills in; plain text that the template escapes."""
+    labels, colours = stage_labels(discovery), stage_colours(len(discovery.stages))
+    latent, learned, remaining = explanation.latent, explanation.learned, explanation.remaining
+    return {
+        "tone": discovery.verdict.shown.tone,
+        "headline": discovery.verdict.shown.headline,
+        "summary": sentence(discovery.sentence),
+        "seconds": f"{discovery.baseline.window_seconds:g}",
+        "tiles": _tiles(discovery),
+        "rounds": [_round(discovery, k) for k in range(len(discovery.rounds))],
+        "notes": discovery.notes,
+        "steps": next_steps(discovery),
+        "stages": list(zip(labels, colours, strict=True)),
+        "errors": error_rows(discovery),
+        "headings": channel_headings(discovery),
+        "noise": noise_row(discovery),
+        "at_noise": f"{NEAR_FLOOR:g}",
+        "pictures": by_section(pictures(discovery, explanation).values()),
+        "places": _places(discovery.where),
+        "torques": _latent_lines(latent) if latent else [],
+        "learned": _learned_torque(discovery, learned) if learned else None,
+        "remaining": _places(remaining),
+        "arises": any("arises" in w.statement for w in (*discovery.where, *remaining)),
+        "ranking": [_ranked(r, outcome) for r, outcome in outcomes(discovery)],
+        "hidden": sum(not r.excited for r in discovery.ranking),
+        "parameters": parameter_rows(discovery),
+        "recordings": _recordings(discovery),
+        "settings": _settings(discovery),
+        "model": str(discovery.model.mechanism),
+        "source": next((r.source for r in discovery.test if r.source), ""),
+    }
 
 
-def save(folder: Path, files: Mapping[str, str | bytes]) -> None:
-    """Write files into a folder, which is created; files of these names are replaced.
+def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
+    """The error of each channel before and after, large."""
+    tiles, multiples = [], noise_ratios(discovery)
+    for channel, unit in channel_units(discovery).items():
+        before, read = readable(discovery.baseline.held_out_rmse_windows[channel], unit)
+        after, _ = readable(discovery.final.held_out_rmse_windows[channel], unit)
+        times = multiples[channel]
+        text = f"{plain_number(times, 2)} × the sensor noise" if times == times else "held-out error"
+        tiles.append(
+            {
+                "channel": channel,
+                "before": plain_number(before) if discovery.rounds else "",
+                "after": f"{plain_number(after)} {read}",
+                "note": text,
+                "reached": "yes" if times < NEAR_FLOOR else "",
+            }
+        )
+    return tiles
 
-    Raises:
-        InputError: The folder is a file, or cannot be written to.
-    """
+
+def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
+    added, before = discovery.rounds[k], discovery.stages[k]
+    falls = []
+    for channel, unit in channel_units(discovery).items():
+        old, read = readable(before.held_out_rmse_windows[channel], unit)
+        new, _ = readable(added.stage.held_out_rmse_windows[channel], unit)
+        falls.append(f"{channel} {plain_number(old)} → {plain_number(new)} {read}")
+    return {
+        "title": f"{effect_title(added.effect)}, {added.port}",
+        "label": f"{added.effect} at {added.port}",
+        "sentence": sentence(added.sentence),
+        "equation": equation(added.equation),
+        "parameters": [
+            (name, *value_and_interval(e), together(e.unit), _later(discovery, e), e.note)
+            for name, e in added.parameters.items()
+        ],
+        "equivalent": " or ".join(effect_label(*pair) for pair in added.equivalent),
+        "gain": plain_number(added.held_out_gain_nats),
+        "score": plain_number(added.score),
+        "falls": ", ".join(falls),
+    }
+
+
+def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
+    return [
+        {"text": together(w.statement), "p": _p_value(w.p_value), "none": len(w.edges) < 2} for w in places
+    ]
+
+
+def _later(discovery: SearchResult, estimate: Estimate) -> str:
+    """The estimate of the same parameter in the final model, where it is another one."""
+    value = value_and_interval(estimate)[0]
+    for last in discovery.final.estimates:
+        if last.name == estimate.name and last.value != estimate.value:
+            text = value_and_interval(last)[0]
+            return text if text != value else ""
+    return ""
+
+
+def _p_value(p: float) -> str:
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
+def _ranked(r: Ranked, outcome: Outcome) -> dict[str, str]:
+    return {
+        "label": effect_label(r.effect, r.port),
+        "title": effect_title(r.effect),
+        "score": plain_number(r.score),
+        "own": f"{100 * r.unconfounded:.2g} %",
+        "state": outcome.value,
+    }
+
+
+def _recordings(discovery: SearchResult) -> list[dict[str, Any]]:
+    parts = [("fitted", r) for r in discovery.train] + [("held out", r) for r in discovery.test]
+    return [
+        {
+            "use": use,
+            "source": r.source or "unnamed",
+            "span": f"{r.start:g} to {r.start + r.duration:g} s",
+            "samples": f"{r.N} at {1 / r.Ts:g} Hz",
+            "signals": _signals(r),
+            "findings": [(f.severity, f.message) for f in r.findings],
+        }
+        for use, r in parts
+    ]
+
+
+def _signals(r: Recording) -> str:
+    outputs = ", ".join(f"{c} [{u}]" for c, u in zip(r.channels, r.units, strict=True))
+    return f"{r.input_name} [{r.input_unit}] → {outputs}"
+
+
+def _settings(discovery: SearchResult) -> list[tuple[str, str]]:
+    seen = sorted({r.n_init for r in discovery.test})
+    rows = [
+        ("Windows of the short held-out runs", f"{discovery.baseline.window_seconds:g} s"),
+        (
+            "Samples at the start of each window from which the first state is estimated",
+            ", ".join(map(str, seen)),
+        ),
+        ("Candidate effects", str(len(discovery.ranking))),
+        ("Time taken", f"{discovery.elapsed_s:.1f} s"),
+    ]
+    for label, stage in zip(stage_labels(discovery), discovery.stages, strict=True):
+        noise = ", ".join(f"{p} {plain_number(q)}" for p, q in stage.process_noise.items())
+        rows.append((f"White torque that the data ask for, {label} [(N\xa0m)² s]", noise or "none"))
+    versions = ", ".join(f"{p} {_version(p)}" for p in REPORTED_PACKAGES)
+    rows.append(("Versions", f"Python {platform.python_version()}, {versions}"))
+    return rows
+
+
+def _version(package: str) -> str:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in files.items():
-            if isinstance(data, bytes):
-                (folder / name).write_bytes(data)
-            else:
-                (folder / name).write_text(data, encoding="utf-8")
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(
-            f"{folder} cannot hold the report, since {error.filename or folder} is a file and no "
-            "folder; name another folder."
-        ) from error
-    except OSError as error:
-        raise InputError(
-            f"{folder} cannot be written to ({error.strerror or error}), but the report needs a "
-            "folder of its own; name another folder."
-        ) from error
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def _latent_lines(latent: LatentTorqueComparison) -> list[str]:
+    """How large the torques are that the models lack, in words."""
+    lines = []
+    for port in latent.before.ports:
+        before, after = (None if x is None else x.size(port) for x in (latent.before, latent.after))
+        line = f"At the {port} the baseline lacks {_size(before, latent.before)}"
+        lines.append(line + ("." if after is None else f", the final model {_size(after, latent.before)}."))
+    return lines
+
+
+def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> dict[str, Any]:
+    """A learned torque in words: what it is worth and how it reads."""
+    falls, unit = [], learned.model.mechanism.units.unit
+    for channel, read_in in channel_units(discovery).items():
+        old, read = readable(learned.before.held_out_rmse_windows[channel], read_in)
+        new, _ = readable(learned.after.held_out_rmse_windows[channel], read_in)
+        falls.append(f"{channel} {plain_number(old)} → {plain_number(new)} {read}")
+    return {
+        "port": learned.at,
+        "kept": learned.kept,
+        "falls": ", ".join(falls),
+        "gain": plain_number(learned.held_out_gain_nats) + "\xa0nat",
+        "formula": together(equation(f"tau = {learned.reading}")) if learned.formula.terms else "",
+        "terms": [
+            (
+                equation(t.name) if t.name != "1" else "constant",
+                f"{plain_number(t.coefficient)} ± {plain_number(1.96 * t.std, 2)} {together(unit(t.unit))}",
+                f"{100 * t.share:.0f}\xa0%",
+            )
+            for t in learned.formula.terms
+        ],
+    }
+
+
+def _size(size: float | None, torque: LatentTorque) -> str:
+    if size is None or size < 1e-3 * torque.scale:
+        return "nothing that could be seen"
+    return (
+        together(f"{plain_number(size, 2)} {torque.effort}")
+        + f" rms, {plain_number(100 * size / torque.scale, 2)} % of the motor's torque"
+    )
+
+
+def write(discovery: SearchResult, folder: Path, explanation: Explanation | None = None) -> Path:
+    """Write `report.html`, `result.json` and a learned torque; returns the path of the page."""
+    explanation = explanation or Explanation()
+    files = {"result.json": as_json(discovery.to_dict())}
+    if explanation.learned is not None:
+        files["learned_torque.json"] = as_json(explanation.learned.to_dict())
+    write_files(folder, files | {"report.html": render(discovery, explanation)})
+    return folder / "report.html"
+
+
+def render(discovery: SearchResult, explanation: Explanation | None = None) -> str:
+    """The page as text, with what was computed for it."""
+    return fill_template(
+        "rotflex_jax.report", "report.html.j2", content(discovery, explanation or Explanation())
+    )

@@ -5,104 +5,173 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int, Real
 
 from rotflex_jax.adaptive import LMS, run
-from rotflex_jax.adaptive.learning import learning_curve
+from rotflex_jax.adaptive.learning_curve import learning_curve, settling_step_size
 from rotflex_jax.adaptive.moments import Moments
+from rotflex_jax.adaptive.step_sizes import Stability, analyse
 from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.basis.orthogonalise import GramSchmidt, Hermite
 from rotflex_jax.fit import least_squares
+from rotflex_jax.models.series import Series
 from rotflex_jax.recording import Recording
-from rotflex_jax.reproduce import signals
-from rotflex_jax.reproduce.prediction import Prediction, predict
-from rotflex_jax.reproduce.records import Records, symmetric
+from rotflex_jax.reproduce.records import Records, autocovariance, symmetric
 from rotflex_jax.reproduce.settings import Settings
-from rotflex_jax.series import Series
 
-KEPT = 400
-"""Points of a path that are kept."""
-NOISE = 0.2
-"""Share of its end value that a path may wander and still be said to settle."""
-SIGNIFICANT = 4.0
-"""Standard errors by which a coefficient must differ from zero before it can settle on anything."""
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """Step sizes and the convergence that theory predicts for them, before any run.
+
+    Attributes:
+        eigenvalue: Of the direction in which the observed coefficient converges.
+        step_sizes: Degree -> step size.
+        mu: Step size of each weight.
+        settle: Iterations after which the mean of the coefficient is within 5 % of its final value.
+        stability: Margin to divergence, and excess error.
+    """
+
+    eigenvalue: float
+    step_sizes: dict[int, float]
+    mu: Float[np.ndarray, " P"]
+    settle: float
+    stability: Stability
+
+
+def settling_eigenvalue(
+    covariance: Float[np.ndarray, "P P"], degrees: Int[np.ndarray, " P"], index: int
+) -> float:
+    """The eigenvalue that governs how fast one quadratic weight converges.
+
+    The constant converges fast and absorbs the mean of the products, so the covariance of the products about
+    their means counts. Of its eigenvectors the one with the largest share of the weight decides; with
+    white input of variance 1 that is 2 for a square and 1 for a product of two samples.
+
+    Args:
+        covariance: Second moments of the regressors.
+        degrees: Degree of every regressor.
+        index: Of the regressor.
+
+    >>> R = np.array([[1.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 1.0]])
+    >>> settling_eigenvalue(R, np.array([0, 2, 2]), 1), settling_eigenvalue(R, np.array([0, 2, 2]), 2)
+    (2.0, 1.0)
+    """
+    pick, constant = np.flatnonzero(degrees == 2), np.flatnonzero(degrees == 0)
+    centred = covariance[np.ix_(pick, pick)]
+    for k in constant:
+        mean = covariance[pick, k]
+        centred = centred - np.outer(mean, mean) / covariance[k, k]
+    values, vectors = np.linalg.eigh(centred)
+    share = vectors[pick.tolist().index(index)] ** 2
+    # Eigenvectors of nearly equal eigenvalues are arbitrary: their shares count together.
+    alike = np.isclose(values[:, None], values[None, :], rtol=0.05)
+    return float(values[np.argmax(alike @ share + 1e-9 * share)])
+
+
+def predict(s: Settings, degrees: Int[np.ndarray, " P"], moments: Moments, index: int) -> Prediction:
+    """Step sizes for `settle_at`, or the prediction for given ones.
+
+        mu2 = ln 20 / (settle_at eigenvalue)
+
+    Args:
+        s: Settings `mu1`, `mu2`, `settle_at`.
+        degrees: Of the regressors.
+        moments: Of the regressors.
+        index: Regressor of the observed coefficient.
+    """
+    eigenvalue = settling_eigenvalue(moments.R, degrees, index)
+    mu2 = s.mu2 or settling_step_size(eigenvalue, s.settle_at)
+    sizes = {0: s.mu1, 1: s.mu1, 2: mu2}
+    mu = np.array([sizes[int(d)] for d in degrees])
+    return Prediction(eigenvalue, sizes, mu, float(np.log(20) / (mu2 * eigenvalue)), analyse(moments, mu))
+
+
+PATH_POINTS = 400
+"""Points of a path that are stored."""
+MOST_PATH_NOISE = 0.2
+"""Standard deviation of a path about the exponential below which it counts as settling, as a share of its
+final value."""
+LEAST_T_VALUE = 4.0
+"""Standard errors by which a coefficient must differ from zero for a settling time to be given."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Adaptation:
-    """What the adaptive filter did.
+    """Result of the adaptive filter.
 
     Attributes:
         model: With the last weights, frozen; None after a divergence.
         size: Number of weights.
         prediction: Made before the run.
-        times: Iterations (K,).
-        paths: Watched coefficient of every run (runs, K).
-        mean_path: What the prediction says of their mean (K,).
-        target: Where it should end: least squares over all runs.
-        settle: Iterations to 95 % of the way, by an exponential through the mean of the runs; None where
-            the noise hides it.
+        times: Iterations.
+        paths: Observed coefficient of every run.
+        mean_path: Its predicted mean.
+        target: Its final value by least squares over all runs.
+        settle: Iterations to 95 % of it, by an exponential through the mean of the runs; None where the
+            noise is too large.
         crossed: First iteration at which the mean of the runs is within 5 % of the target.
-        symmetric: The watched coefficient where friction and dead zone are symmetric (K,), if simulated.
+        symmetric: The coefficient where friction and dead zone are symmetric, if simulated.
         online: A-priori errors of the last half of the run, relative to the variance (NMSE). Not an error
-            of the model: the weights move with the data.
-        passes: How often the training records were gone through.
+            of the model: the weights follow the data.
+        passes: How often the training recordings were used.
         status: "ok", or "diverged at sample k".
     """
 
     model: Series | None
     size: int
     prediction: Prediction
-    times: np.ndarray
-    paths: np.ndarray
-    mean_path: np.ndarray
+    times: Int[np.ndarray, " K"]
+    paths: Float[np.ndarray, "runs K"]
+    mean_path: Float[np.ndarray, " K"]
     target: float
     settle: float | None
     crossed: int | None
-    symmetric: np.ndarray | None
+    symmetric: Float[np.ndarray, " K"] | None
     online: float
     passes: int
     status: str
 
 
-def adapt(s: Settings, records: Records, say: Callable[[str], None]) -> Adaptation:
-    """Predict, run, freeze.
+def adapt(s: Settings, records: Records, progress: Callable[[str], None]) -> Adaptation:
+    """Predicts the convergence, runs the filter and freezes its weights.
 
     Args:
         s: Settings.
-        records: To learn from.
-        say: Told of every step.
+        records: For training.
+        progress: Called with a line of text for every step.
     """
     series = Volterra(Delays(s.memory), order=2, constant=s.constant, layout=s.layout)
     basis = _transformed(s, series, records)
-    index = watched(s, series)
+    index = watched_index(s, series)
     theory = moments(s, basis, records)
     prediction = predict(s, basis.degrees, theory, index)
-    say(
+    progress(
         f"predicted: a quadratic step size of {prediction.step_sizes[2]:.3g} settles after "
         f"{prediction.settle:.0f} iterations"
     )
     phi, y = _stacked(basis, records.train, records.channel)
     passes = max(1, int(np.ceil(2 * s.settle_at / len(y)))) if records.measured else 1
     phi, y = np.tile(phi, (passes, 1)), np.tile(y, passes)
-    every = max(1, len(y) // KEPT)
+    every = max(1, len(y) // PATH_POINTS)
     lms = LMS(mu=prediction.mu)
-    say("LMS")
+    progress("LMS")
     first = run(lms, phi, y, keep_every=every)
     raw = lambda path: np.stack([_raw(basis, w) for w in path])[:, index]  # noqa: E731
     paths, fits = [raw(first.path)], [least_squares(series, list(records.train), records.channel)]
     for number, record in enumerate(records.repeats, start=2):
-        say(f"LMS: run {number} of {len(records.repeats) + 1}")
-        again = run(lms, *_stacked(basis, (record,), records.channel), keep_every=every)
-        paths.append(raw(again.path)[: len(paths[0])])
+        progress(f"LMS: run {number} of {len(records.repeats) + 1}")
+        repeated = run(lms, *_stacked(basis, (record,), records.channel), keep_every=every)
+        paths.append(raw(repeated.path)[: len(paths[0])])
         fits.append(least_squares(series, record, records.channel))
     target = np.mean([fit.weights for fit in fits], axis=0)
-    # Runs are independent, so their t-values add up like this.
-    certain = abs(sum(fit.t[index] for fit in fits)) / np.sqrt(len(fits)) > SIGNIFICANT
-    same = None
+    # Runs are independent, so the sum of their t-values has the variance `len(fits)`.
+    certain = abs(sum(fit.t[index] for fit in fits)) / np.sqrt(len(fits)) > LEAST_T_VALUE
+    symmetric_path = None
     if not records.measured:
-        say("LMS: symmetric friction")
+        progress("LMS: symmetric friction")
         twin = symmetric(s, records.train[0])
-        same = raw(run(lms, *_stacked(basis, (twin,), records.channel), keep_every=every).path)
+        symmetric_path = raw(run(lms, *_stacked(basis, (twin,), records.channel), keep_every=every).path)
     mean = np.mean(paths, axis=0)
     settle, crossed = settling(first.path_times, mean, target[index]) if certain else (None, None)
     return Adaptation(
@@ -115,14 +184,14 @@ def adapt(s: Settings, records: Records, say: Callable[[str], None]) -> Adaptati
         float(target[index]),
         settle,
         crossed,
-        same,
+        symmetric_path,
         online_nmse(first.errors, y),
         passes,
         first.status,
     )
 
 
-def watched(s: Settings, series: Volterra) -> int:
+def watched_index(s: Settings, series: Volterra) -> int:
     """Position of the coefficient of Fig. 9 among the weights."""
     one, two = s.coefficient
     kernels = [series.kernels(weights) for weights in np.eye(series.size)]
@@ -131,52 +200,58 @@ def watched(s: Settings, series: Volterra) -> int:
 
 
 def _transformed(s: Settings, series: Volterra, records: Records) -> Any:
-    """The basis whose weights LMS moves: the series itself, or orthogonal combinations of its regressors."""
+    """The basis whose weights LMS adapts: the series itself, or orthogonal combinations of its regressors."""
     if s.transform == "hermite":
         lags = np.arange(s.memory)
-        r = signals.autocovariance(s, s.memory) if not records.measured else _sample_covariance(s, records)
+        r = autocovariance(s, s.memory) if not records.measured else _sample_covariance(s, records)
         return Hermite.of(series, r[np.abs(lags[:, None] - lags)])
     if s.transform == "gram_schmidt":
         return GramSchmidt.of(series, records.train[0].u)
     return series
 
 
-def _sample_covariance(s: Settings, records: Records) -> np.ndarray:
+def _sample_covariance(s: Settings, records: Records) -> Float[np.ndarray, " lags"]:
     lagged = np.concatenate([Delays(s.memory).outputs(r.u)[r.n_init :] for r in records.train])
     return (lagged.T @ lagged / len(lagged))[0]
 
 
-def _stacked(basis: Any, records: Sequence[Recording], channel: str) -> tuple[np.ndarray, np.ndarray]:
-    """Regressors and output of several records, without the samples whose past is unknown."""
+def _stacked(
+    basis: Any, records: Sequence[Recording], channel: str
+) -> tuple[Float[np.ndarray, "N P"], Float[np.ndarray, " N"]]:
+    """Regressors and output of several recordings, without the samples whose past is unknown."""
     phi = [np.asarray(basis.regressors(r.u.astype(float)))[r.n_init :] for r in records]
     y = [r.channel(channel)[r.n_init :].astype(float) for r in records]
     return np.concatenate(phi), np.concatenate(y)
 
 
-def _raw(basis: Any, weights: np.ndarray) -> np.ndarray:
+def _raw(basis: Any, weights: Float[np.ndarray, " P"]) -> Float[np.ndarray, " V"]:
     """Weights of the Volterra series."""
     return basis.raw_weights(weights) if hasattr(basis, "raw_weights") else weights
 
 
 def _mean_path(
-    theory: Moments, mu: np.ndarray, basis: Any, target: np.ndarray, times: np.ndarray
-) -> np.ndarray:
-    """What theory says of the mean of the Volterra weights (K, P), on their way to `target`."""
+    theory: Moments,
+    mu: Float[np.ndarray, " P"],
+    basis: Any,
+    target: Float[np.ndarray, " V"],
+    times: Int[np.ndarray, " K"],
+) -> Float[np.ndarray, "K V"]:
+    """Predicted mean of the Volterra weights, which converge to `target`."""
     back = np.stack([_raw(basis, w) for w in np.eye(basis.size)], axis=1)
     end = np.linalg.lstsq(back, target, rcond=None)[0]
     return learning_curve(theory, mu, end, times).weights @ back.T
 
 
 def moments(s: Settings, basis: Any, records: Records) -> Moments:
-    """Of the regressors: from the input's filter alone, or from measured input."""
+    """Of the regressors: from the spectrum of the input alone, or from a measured input."""
     if records.measured or s.transform != "none":
         return Moments.of_regressors(_stacked(basis, records.train, records.channel)[0])
     lags = np.arange(s.memory)
-    R1 = signals.autocovariance(s, s.memory)[np.abs(lags[:, None] - lags)]
+    R1 = autocovariance(s, s.memory)[np.abs(lags[:, None] - lags)]
     return Moments.gaussian(R1, sorted(set(basis.degrees.tolist())), s.layout)
 
 
-def online_nmse(errors: np.ndarray, y: np.ndarray) -> float:
+def online_nmse(errors: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"]) -> float:
     """Of the a-priori errors, over the last half."""
     half = len(y) // 2
     if not np.all(np.isfinite(errors)):
@@ -184,13 +259,15 @@ def online_nmse(errors: np.ndarray, y: np.ndarray) -> float:
     return float(np.sum(errors[half:] ** 2) / np.sum((y[half:] - y[half:].mean()) ** 2))
 
 
-def settling(times: np.ndarray, path: np.ndarray, target: float) -> tuple[float | None, int | None]:
-    """Iterations to 95 % of the way: of an exponential towards the target, and of the path itself.
+def settling(
+    times: Real[np.ndarray, " K"], path: Float[np.ndarray, " K"], target: float
+) -> tuple[float | None, int | None]:
+    """Iterations to 95 % of the target: of an exponential through the path, and of the path itself.
 
         path ~ target (1 - exp(-t / tau)),  settled at ln(20) tau
 
-    Gradient noise moves the path about; the exponential averages over it. Nothing settles where the noise
-    is a fifth of the target or more, or where the path is still far from its end.
+    The exponential averages over the gradient noise. There is no settling time where the noise is a fifth of
+    the target or more, or where the path is still far from it.
 
     >>> t = np.arange(0.0, 5000.0, 10.0)
     >>> settle, crossed = settling(t, 2.0 * (1 - np.exp(-t / 1000.0)), 2.0)
@@ -199,14 +276,14 @@ def settling(times: np.ndarray, path: np.ndarray, target: float) -> tuple[float 
     """
     from scipy.optimize import minimize_scalar  # takes long to import
 
-    if not target or not np.all(np.abs(path) < 100 * np.abs(target)):  # noise, or a filter that runs away
+    if not target or not np.all(np.abs(path) < 100 * np.abs(target)):  # noise, or a filter that diverges
         return None, None
-    way = path / target
-    inside = np.flatnonzero(np.abs(way - 1) < 0.05)
+    share = path / target
+    inside = np.flatnonzero(np.abs(share - 1) < 0.05)
     crossed = int(times[inside[0]]) if len(inside) else None
-    left = lambda log_tau: way - 1 + np.exp(-times / np.exp(log_tau))  # noqa: E731
+    left = lambda log_tau: share - 1 + np.exp(-times / np.exp(log_tau))  # noqa: E731
     span = np.log(times[1] / 10), np.log(times[-1] * 10)
     best = minimize_scalar(lambda log_tau: np.sum(left(log_tau) ** 2), bounds=span, method="bounded")
     tau = float(np.exp(best.x))
-    seen = np.std(left(best.x)) < NOISE and 2 * tau < times[-1]
+    seen = np.std(left(best.x)) < MOST_PATH_NOISE and 2 * tau < times[-1]
     return (float(np.log(20) * tau) if seen else None), crossed

@@ -1,20 +1,18 @@
-"""What `rotflex reproduce` leaves behind: a page, its figures as PNG, and the numbers as JSON."""
+"""What `rotflex reproduce` leaves behind: a page, its figures as PNG, and the result as JSON."""
 
-import datetime
 import io
-import json
 import math
 from pathlib import Path
 from typing import Any
 
-from rotflex_jax.report.figures import Picture
-from rotflex_jax.report.page import save, template
-from rotflex_jax.report.style import on_page
 from rotflex_jax.reproduce import wording
 from rotflex_jax.reproduce.experiment import Reproduction
-from rotflex_jax.reproduce.figures import pictures
+from rotflex_jax.reproduce.figures import FIGURES
 from rotflex_jax.reproduce.wording import number
+from rotflex_jax.text.plotting import Picture, by_section
+from rotflex_jax.text.templates import as_json, fill_template, write_files
 
+# Resolution of the figures [dots per inch].
 DPI = 150
 
 
@@ -28,11 +26,10 @@ def write(result: Reproduction, folder: Path) -> Path:
     Raises:
         InputError: The folder is a file, or cannot be written to.
     """
-    drawn = pictures(result)
-    page = template("reproduce.html.j2", "rotflex_jax.reproduce").render(content(result, drawn))
-    text = json.dumps(result.to_dict(), indent=2, ensure_ascii=False) + "\n"
+    drawn = FIGURES.pictures(result)
+    page = fill_template("rotflex_jax.reproduce", "reproduce.html.j2", content(result, drawn))
     images = {f"{name}.png": _png(picture) for name, picture in drawn.items()}
-    save(folder, {**images, "result.json": text, "reproduce.html": page})
+    write_files(folder, {**images, "result.json": as_json(result.to_dict()), "reproduce.html": page})
     return folder / "reproduce.html"
 
 
@@ -57,11 +54,10 @@ def content(result: Reproduction, drawn: dict[str, Picture]) -> dict[str, Any]:
         "rows": _rows(result),
         "pulsed": bool(records.pulses),
         "measured": records.measured,
-        "kernels": "" if result.bridge is None else str(result.bridge),
+        "kernels": "" if result.kernels is None else str(result.kernels),
         "settings": [_setting(row) for row in result.setting_rows()],
-        "pictures": {name: on_page(p.figure, p.caption, p.description) for name, p in drawn.items()},
+        "pictures": by_section(drawn.values()),
         "source": ", ".join(sources) if records.measured else f"simulated, {s.scenario}",
-        "date": datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         "elapsed": number(result.elapsed_s, 2),
     }
 

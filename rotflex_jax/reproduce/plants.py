@@ -1,6 +1,6 @@
-"""Flexible joints with known faults, on which a method can be tried against the truth.
+"""Simulated flexible joints with known effects, on which a method can be tested.
 
-S0 is the paper's joint as listed: linear. The others add what a real joint may have. Only the joint
+S0 is the paper's joint as listed: linear. The others add effects that a real joint may have. Only the joint
 itself comes from the paper: **every friction level, dead zone and spring term here is an
 assumption**, since nobody has published a measured one for this module.
 """
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Inexact, Real
 
 from rotflex_jax.effects import (
     Coulomb,
@@ -19,24 +20,24 @@ from rotflex_jax.effects import (
     QuadraticSpring,
     VoltageOffset,
 )
-from rotflex_jax.effects.kinds import Effect
+from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import SPRINGS, paper
 from rotflex_jax.joints.springs import ARM_ANCHORS, HUB_ANCHORS, SIDE, SpringType
 from rotflex_jax.mechanism import Exponential, Mechanism, simulate
 
-STEP = 2.5e-4
+LONGEST_SIMULATION_STEP = 2.5e-4
 """Longest step of the simulation [s]; the deflection after friction then errs by about 1e-5 (NMSE)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """What is added to the paper's joint.
+    """Effects that are added to the paper's joint.
 
     Attributes:
         about: In words, with numbers.
-        odd: Whether turning the voltage round turns every motion round: then a kernel of even
-            degree has nothing to hold on to.
+        odd: Whether the negative voltage gives the negative motion: then all kernels of even degree are
+            zero.
         effects: The effects for a port of the arm's friction, "joint" or "arm".
     """
 
@@ -140,14 +141,16 @@ def plant(name: str, arm_friction: str = "joint", **numbers: Any) -> Mechanism:
     return mechanism
 
 
-def response(mechanism: Mechanism, u: np.ndarray, Ts: float, *, step: float = STEP) -> np.ndarray:
-    """Outputs (N, C) from rest, in float64; sample k is what is seen when `u[k]` begins.
+def response(
+    mechanism: Mechanism, u: Real[np.ndarray, " N"], Ts: float, *, step: float = LONGEST_SIMULATION_STEP
+) -> Float[np.ndarray, "N C"]:
+    """Outputs from rest, in float64; sample k is the output at the start of `u[k]`.
 
     Args:
         mechanism: From `plant`, or any other.
-        u: Voltage (N,) [V], held over each sample.
+        u: Voltage [V], held over each sample.
         Ts: Sampling period [s].
-        step: Longest step of the integration [s]; one step a sample carries dry friction only
+        step: Longest step of the integration [s]; one step a sample simulates dry friction only
             where the sampling is fast.
     """
     substeps = max(1, int(np.ceil(Ts / step - 1e-9)))
@@ -157,7 +160,7 @@ def response(mechanism: Mechanism, u: np.ndarray, Ts: float, *, step: float = ST
 def spring_series(
     left: int, right: int, hub_anchor: str, arm_anchor: int
 ) -> tuple[float, float, float, float]:
-    """The torque of two springs that need not be alike, about the angle at which they balance.
+    """The torque of two springs that may differ, about the angle at which they balance.
 
         tau = K a + K2 a^2 + K3 a^3,   a = alpha - alpha_0,   tau = dU/dalpha
 
@@ -187,7 +190,9 @@ def spring_series(
     return alpha, series[1], series[2], series[3]
 
 
-def _torque(kit: SpringType, d: float, R: float, side: float, alpha: np.ndarray) -> np.ndarray:
+def _torque(
+    kit: SpringType, d: float, R: float, side: float, alpha: Inexact[np.ndarray, " K"]
+) -> Inexact[np.ndarray, " K"]:
     """Of one spring, from its length: dU/dalpha = force dlength/dalpha [N m]."""
     along, aside = R * np.cos(alpha) - d, R * np.sin(alpha) - side
     length = np.sqrt(along**2 + aside**2)

@@ -1,47 +1,115 @@
-"""What the experiment learns from and is judged on: simulated, or measured and thinned out."""
+"""Recordings for training and evaluation: simulated, or measured and decimated."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
+from rotflex_jax.data.excitation import noise
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.model import Model
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
-from rotflex_jax.reproduce import signals
 from rotflex_jax.reproduce.machine import linear_joint, machine, symmetric_twin
 from rotflex_jax.reproduce.plants import response
 from rotflex_jax.reproduce.settings import Settings
 
-REMEMBERED = 0.4
-"""What the joint remembers of its input [s]; where a record begins in motion, errors count after it."""
+BUTTERWORTH_ORDER = 4
+"""Order of the Butterworth filter."""
+
+
+def filtered_noise(s: Settings, N: int, seed: int | np.random.Generator) -> Float[np.ndarray, " {N}"]:
+    """The voltage [V], stationary from its first sample.
+
+        u = sigma F(q) w / norm2(F),   w ~ N(0, 1)
+
+    The variance is that of the process, by the L2 norm of the filter's impulse response. Scaling by the
+    standard deviation of the sample would make the input depend on its future.
+
+    Args:
+        s: Settings `filter`, `cutoff`, `variance`, `Ts`.
+        N: Samples.
+        seed: Of the random numbers.
+
+    >>> u = filtered_noise(Settings(filter="fir"), 40000, 0)
+    >>> round(float(np.var(u)), 1)
+    1.0
+    """
+    rms = float(np.sqrt(s.variance))
+    if s.filter == "ar1":
+        return noise(N, s.Ts, rms=rms, bandwidth=s.cutoff, seed=seed)
+    h = impulse_response(s)
+    w = np.random.default_rng(seed).standard_normal(N + len(h) - 1)
+    return rms * np.convolve(w, h / np.linalg.norm(h), mode="valid")
+
+
+def impulse_response(s: Settings) -> Float[np.ndarray, " L"]:
+    """Of the filter, until it has decayed."""
+    from scipy import signal  # takes long to import
+
+    if s.filter == "ar1":
+        a = np.exp(-2 * np.pi * s.cutoff * s.Ts)
+        return np.sqrt(1 - a**2) * a ** np.arange(_length(a))
+    if s.filter == "butterworth":
+        sections = np.asarray(signal.butter(BUTTERWORTH_ORDER, s.cutoff, fs=1 / s.Ts, output="sos"))
+        radius = max(float(np.max(np.abs(np.roots(section[3:])))) for section in sections)
+        return np.asarray(signal.sosfilt(sections, np.eye(1, _length(radius))[0]))
+    # Long enough that the window, and not the cut, shapes the band.
+    taps = 2 * max(1, round(1.0 / (s.cutoff * s.Ts))) + 1
+    return np.asarray(signal.firwin(taps, min(s.cutoff, 0.499 / s.Ts), fs=1 / s.Ts))
+
+
+def autocovariance(s: Settings, lags: int) -> Float[np.ndarray, " {lags}"]:
+    """Of the input at the lags 0, 1, ... [V²], from the filter alone.
+
+    >>> autocovariance(Settings(), 2).round(4)
+    array([1.    , 0.0432])
+    """
+    h = impulse_response(s)
+    h = np.pad(h / np.linalg.norm(h), (0, lags))
+    return s.variance * np.array([h[: len(h) - k] @ h[k:] for k in range(lags)])
+
+
+def pulse(s: Settings, height: float) -> Float[np.ndarray, " N"]:
+    """A rectangular pulse with zeros before and after it [V]."""
+    before, width, after = (round(t / s.Ts) for t in (s.pulse_delay, s.pulse_width, s.pulse_after))
+    return np.concatenate([np.zeros(before), np.full(width, height), np.zeros(after)])
+
+
+def _length(radius: float) -> int:
+    """Samples after which a pole has fallen to 1e-12."""
+    return int(np.ceil(np.log(1e-12) / np.log(max(radius, 1e-9)))) + 2
+
+
+MEMORY_SECONDS = 0.4
+"""Memory of the joint [s]; where a recording starts in motion, errors count only after it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Records:
-    """Records of one sampling interval.
+    """Recordings of one sampling interval.
 
     Attributes:
-        train: To learn from; each with voltage and outputs.
-        test: To be judged on.
+        train: For training; each with voltage and outputs.
+        test: For the evaluation.
         channel: The output that is identified.
         unit: Of that output.
-        linearised: What the linear physical model makes of each record in `test` (N,).
+        linearised: Output of the linear physical model on each recording in `test`.
         joint: That model.
-        machine: The simulated machine; None for measured records.
-        repeats: More records like the first of `train`, with other inputs; none for measured ones.
-        pulses: Answers to the pulse and to its negative; none for measured ones.
-        phases: Into how many records each recording was thinned out.
-        whole: Recordings to learn from and to judge on as they were before that.
+        machine: The simulated machine; None for measured recordings.
+        repeats: More recordings like the first of `train`, with other inputs; none for measured ones.
+        pulses: Responses to the pulse and to its negative; none for measured ones.
+        phases: Decimated recordings per measured one.
+        whole: Recordings for training and for the evaluation before the decimation.
     """
 
     train: tuple[Recording, ...]
     test: tuple[Recording, ...]
     channel: str
     unit: str
-    linearised: tuple[np.ndarray, ...]
+    linearised: tuple[Float[np.ndarray, " _"], ...]
     joint: Mechanism
     machine: Mechanism | None = None
     repeats: tuple[Recording, ...] = ()
@@ -56,7 +124,7 @@ class Records:
 
     @property
     def measured(self) -> bool:
-        """Whether a real machine was recorded."""
+        """Whether the recordings were measured on a real machine."""
         return self.machine is None
 
 
@@ -66,19 +134,19 @@ class PulseRun:
 
     Attributes:
         height: Of the pulse [V].
-        recording: Voltage and answer, one sample per `Ts`.
-        linearised: Answer of the linearised model (N,).
-        t: Times of the answer between the samples [s], counted from the start of the pulse.
-        alpha: The answer there.
+        recording: Voltage and response, one sample per `Ts`.
+        linearised: Response of the linearised model.
+        t: Times of the finely sampled response [s], from the start of the pulse.
+        alpha: The response at these times.
         alpha_linearised: That of the linearised model.
     """
 
     height: float
     recording: Recording
-    linearised: np.ndarray
-    t: np.ndarray
-    alpha: np.ndarray
-    alpha_linearised: np.ndarray
+    linearised: Float[np.ndarray, " N"]
+    t: Float[np.ndarray, " F"]
+    alpha: Float[np.ndarray, " F"]
+    alpha_linearised: Float[np.ndarray, " F"]
 
 
 def simulated(s: Settings) -> Records:
@@ -88,28 +156,28 @@ def simulated(s: Settings) -> Records:
         s: Settings.
 
     Returns:
-        Training, held-out and repeated records, and the pulse.
+        Recordings for training and evaluation, repetitions, and pulses.
     """
     real, linear = machine(s), linear_joint(s)
     streams = np.random.SeedSequence(s.seed).spawn(s.runs + 1)
     lengths = [s.samples] * s.runs + [s.held_out]
     voltages = [
-        signals.filtered_noise(s, N, np.random.default_rng(stream.spawn(1)[0]))
+        filtered_noise(s, N, np.random.default_rng(stream.spawn(1)[0]))
         for N, stream in zip(lengths, streams, strict=True)
     ]
     noises = [np.random.default_rng(stream.spawn(1)[0]) for stream in streams]
-    *learn, judge = (_record(s, real, u, noise) for u, noise in zip(voltages, noises, strict=True))
+    *training, evaluation = (_record(s, real, u, noise) for u, noise in zip(voltages, noises, strict=True))
     return Records(
-        train=(learn[0],),
-        test=(judge,),
+        train=(training[0],),
+        test=(evaluation,),
         channel="alpha",
         unit="rad",
-        linearised=(s.sign * response(linear, judge.u, s.Ts, step=s.step)[:, 1],),
+        linearised=(s.sign * response(linear, evaluation.u, s.Ts, step=s.step)[:, 1],),
         joint=linear,
         machine=real,
-        whole=((learn[0],), (judge,)),
-        repeats=tuple(learn[1:]),
-        # The kernel of even degree answers both alike, friction both oppositely: one pulse cannot tell.
+        whole=((training[0],), (evaluation,)),
+        repeats=tuple(training[1:]),
+        # A kernel of even degree responds equally to both, friction oppositely: one pulse is not enough.
         pulses=(_pulse(s, real, linear, s.pulse), _pulse(s, real, linear, -s.pulse)),
     )
 
@@ -119,30 +187,32 @@ def symmetric(s: Settings, like: Recording) -> Recording:
     return _record(s, symmetric_twin(s), like.u, np.random.default_rng(0))
 
 
-def _record(s: Settings, real: Mechanism, u: np.ndarray, noise: np.random.Generator) -> Recording:
+def _record(
+    s: Settings, real: Mechanism, u: Float[np.ndarray, " N"], noise: np.random.Generator
+) -> Recording:
     y = s.sign * response(real, u, s.Ts, step=s.step)
     y = y + s.sensor_noise * noise.standard_normal(y.shape)
     return _plain(Recording(u=u, y=y, Ts=s.Ts, source=s.scenario), s)
 
 
 def _plain(recording: Recording, s: Settings) -> Recording:
-    """With as many samples before errors count as the memory of model and machine needs."""
-    n_init = max(s.memory - 1, round(REMEMBERED / recording.Ts))
+    """With as many initial samples as the memory of model and machine needs."""
+    n_init = max(s.memory - 1, round(MEMORY_SECONDS / recording.Ts))
     return dataclasses.replace(recording, n_init=min(recording.N // 2, n_init), accept=ACCEPTABLE)
 
 
 def _pulse(s: Settings, real: Mechanism, linear: Mechanism, height: float) -> PulseRun:
-    u = signals.pulse(s, height)
+    u = pulse(s, height)
     fine = max(1, round(s.Ts / 0.005))
-    answers = [
+    responses = [
         s.sign * response(joint, np.repeat(u, fine), s.Ts / fine, step=s.step)[:, 1]
         for joint in (real, linear)
     ]
     t = np.arange(len(u) * fine) * s.Ts / fine - s.pulse_delay
     recording = Recording(
-        u=u, y=answers[0][::fine], Ts=s.Ts, channels="alpha", source="pulse", accept=ACCEPTABLE
+        u=u, y=responses[0][::fine], Ts=s.Ts, channels="alpha", source="pulse", accept=ACCEPTABLE
     )
-    return PulseRun(height, recording, answers[1][::fine], t, *answers)
+    return PulseRun(height, recording, responses[1][::fine], t, *responses)
 
 
 def from_measured(
@@ -154,14 +224,14 @@ def from_measured(
 ) -> Records:
     """Measured recordings at the sampling interval of the experiment.
 
-    A recording is thinned out to every k-th sample, from each of its first k samples on: k records of
-    one sampling interval, no sample lost. They say the same thing k times over, so they do not make up
-    for a short recording.
+    A recording is decimated to every k-th sample, starting at each of its first k samples: k recordings of
+    one sampling interval, no sample lost. Their information is nearly the same, so they do not replace a
+    longer recording.
 
     Args:
-        s: Settings; of the machine and the input nothing is used.
-        train: To learn from.
-        test: To be judged on.
+        s: Settings; those of the machine and the input are not used.
+        train: For training.
+        test: For the evaluation.
         joint: Linear physical model to compare with; it must have the channel.
         channel: Output to identify; alpha, or the only one, if None.
 
@@ -171,37 +241,39 @@ def from_measured(
     name = channel or ("alpha" if "alpha" in train[0].channels else train[0].channels[0])
     if name == "theta":
         raise InputError(
-            "The servo angle theta was to be identified, but it adds up its past for ever, which no "
-            "series of fading memory can hold; give recordings with the deflection alpha, or name its "
+            "The servo angle theta was to be identified, but it integrates its past, which no series "
+            "of fading memory can represent; give recordings with the deflection alpha, or name its "
             "column."
         )
-    thin = [_thinned(s, recording, name) for recording in (*train, *test)]
-    learn, judge = thin[: len(train)], thin[len(train) :]
-    test_parts = tuple(part for parts in judge for part in parts)
+    decimated = [_decimated(s, recording, name) for recording in (*train, *test)]
+    training, evaluation = decimated[: len(train)], decimated[len(train) :]
+    test_parts = tuple(part for parts in evaluation for part in parts)
     return Records(
-        train=tuple(part for parts in learn for part in parts),
+        train=tuple(part for parts in training for part in parts),
         test=test_parts,
         channel=name,
         unit=train[0].units[train[0].channels.index(name)],
-        linearised=thinned_like(test_parts, [_physical(joint, recording, name) for recording in test]),
+        linearised=decimate_like(test_parts, [_physical(joint, recording, name) for recording in test]),
         joint=joint,
-        phases=len(thin[0]),
+        phases=len(decimated[0]),
         whole=(tuple(train), tuple(test)),
     )
 
 
-def thinned_like(parts: Sequence[Recording], outputs: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Outputs of whole recordings, thinned out as the recordings were.
+def decimate_like(
+    parts: Sequence[Recording], outputs: Sequence[Float[np.ndarray, " _"]]
+) -> tuple[Float[np.ndarray, " _"], ...]:
+    """Outputs of whole recordings, decimated as the recordings were.
 
     Args:
-        parts: Thinned-out records, those of one recording after the other.
-        outputs: One for each whole recording (N,).
+        parts: Decimated recordings, those of one recording after the other.
+        outputs: One for each whole recording.
     """
     k = len(parts) // len(outputs)
     return tuple(outputs[i // k][i % k :: k][: part.N] for i, part in enumerate(parts))
 
 
-def _thinned(s: Settings, recording: Recording, name: str) -> list[Recording]:
+def _decimated(s: Settings, recording: Recording, name: str) -> list[Recording]:
     k = round(s.Ts / recording.Ts)
     where = recording.source or "The recording"
     if k < 1 or abs(k * recording.Ts / s.Ts - 1) > 0.02:
@@ -212,18 +284,18 @@ def _thinned(s: Settings, recording: Recording, name: str) -> list[Recording]:
     y = recording.channel(name)[:, None]
     unit = recording.units[recording.channels.index(name)]
     one = dataclasses.replace(recording, y=y, channels=(name,), units=(unit,), accept=ACCEPTABLE)
-    least = 4 * max(s.memory, round(REMEMBERED / s.Ts))
+    least = 4 * max(s.memory, round(MEMORY_SECONDS / s.Ts))
     if (one.N - k + 1) // k < least:
         raise InputError(
             f"{where} has a part of {one.duration:.3g} s, but memory {s.memory} at a sampling interval of "
             f"{s.Ts:g} s needs {least * s.Ts:.3g} s; give a longer recording or a shorter Ts."
         )
-    # All of one length: whatever is compiled for one of them serves the others.
+    # All of one length: the code compiled for one of them serves the others.
     N = (one.N - k + 1) // k * k
     return [_plain(one.slice(phase, phase + N).decimate(k), s) for phase in range(k)]
 
 
-def _physical(joint: Mechanism, recording: Recording, name: str) -> np.ndarray:
+def _physical(joint: Mechanism, recording: Recording, name: str) -> Float[np.ndarray, " N"]:
     """Free run of the physical model at the recording's own sampling interval."""
     model = Model(joint)
     missing = [c for c in joint.channels if c not in recording.channels]

@@ -2,16 +2,97 @@
 
 The paper gives the memory, the variance of the input, the pulse and a table of constants. It gives
 neither sampling interval, filter, step sizes nor number of samples, no friction and no dead zone, no
-sign convention, and no error as a number. None of these is hidden here.
+sign convention, and no error as a number. All of these are settings here.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.reproduce.declared import ASSUMPTION, NUMERICS, PAPER, TINY, checked, read, setting
 from rotflex_jax.reproduce.plants import SCENARIOS
+
+PAPER, ASSUMPTION, NUMERICS = "paper", "assumption", "numerics"
+TINY = 1e-12  # least value of a positive setting
+
+
+def setting(
+    default: Any,
+    source: str,
+    why: str,
+    *,
+    unit: str = "",
+    choices: tuple[Any, ...] = (),
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> Any:
+    """A field of the settings.
+
+    Args:
+        default: Value where none is given; its type is the type of the setting.
+        source: `PAPER`, `ASSUMPTION` or `NUMERICS`.
+        why: Reason for the default, in words.
+        unit: Of a number.
+        choices: All that may be given; empty for a number.
+        least: Smallest number; `TINY` for anything above zero.
+        most: Largest number.
+    """
+    about = {"source": source, "why": why, "unit": unit, "choices": choices, "least": least, "most": most}
+    return dataclasses.field(default=default, metadata=about)
+
+
+def checked(field: dataclasses.Field, value: Any) -> Any:
+    """The value in the type of the setting, or a refusal that says what is needed."""
+    about, unit = field.metadata, field.metadata["unit"]
+    default: Any = field.default
+    if about["choices"]:
+        if value not in about["choices"]:
+            choices = ", ".join(map(str, about["choices"]))
+            raise InputError(
+                f"Setting {field.name} was given {value!r}, but is one of {choices}; choose one."
+            )
+        return value
+    if isinstance(default, tuple):
+        return value  # checked by `_consistent`, since it depends on other settings
+    try:
+        number = type(default)(value)
+        right = math.isfinite(number) and number == value
+    except (TypeError, ValueError, OverflowError):
+        right, number = False, 0
+    if not right or not about["least"] <= number <= about["most"]:
+        kind = "a whole number" if isinstance(default, int) else "a number"
+        raise InputError(
+            f"Setting {field.name} was given {value!r}, but it needs {kind}{_bounds(about)}"
+            f"{f' in {unit}' if unit else ''}; give for instance {default:g}."
+        )
+    return number
+
+
+def _bounds(about: Mapping[str, Any]) -> str:
+    least, most = about["least"], about["most"]
+    low = "" if least == -math.inf else " above 0" if least == TINY else f" of at least {least:g}"
+    return low + ("" if most == math.inf else f" and at most {most:g}")
+
+
+def read(field: dataclasses.Field, value: Any) -> Any:
+    """Text as the value of a setting; text that cannot be read is returned for the check to refuse."""
+    if not isinstance(value, str):
+        return value
+    try:
+        if field.name == "coefficient":
+            return tuple(int(part) for part in value.replace("(", "").replace(")", "").split(","))
+        if isinstance(field.default, bool):
+            return {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}[
+                value.lower()
+            ]
+        if isinstance(field.default, int | float):
+            number = float(value)
+            return int(number) if isinstance(field.default, int) and number == int(number) else number
+    except (KeyError, ValueError, OverflowError):
+        return value
+    return value
+
 
 FILTERS = ("ar1", "butterworth", "fir")
 TRANSFORMS = ("none", "hermite", "gram_schmidt")
@@ -163,10 +244,10 @@ class Settings:
             object.__setattr__(self, field.name, value)
         _consistent(self)
 
-    def replace(self, changes: Mapping[str, Any]) -> Self:
+    def replace(self, changes: Mapping[str, Any]) -> "Settings":
         """The same settings with some changed; text is read as the kind of value that is needed.
 
-        A name with dots is that of a number of the machine and goes to `plant`.
+        A name with dots is that of a parameter of the machine and belongs to `plant`.
 
         >>> Settings().replace({"memory": "8", "coefficient": "1,2"}).coefficient
         (1, 2)
@@ -207,7 +288,7 @@ class Settings:
 
 
 def _consistent(s: Settings) -> None:
-    """What one value alone cannot tell."""
+    """Checks of settings that depend on each other."""
     lags = s.coefficient
     if not (
         isinstance(lags, tuple | list)

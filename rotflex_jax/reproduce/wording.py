@@ -1,4 +1,4 @@
-"""What a run has shown, in sentences whose numbers come from the run."""
+"""What a run has shown, in sentences that quote its results."""
 
 import math
 
@@ -6,15 +6,16 @@ import numpy as np
 
 from rotflex_jax.reproduce.experiment import Reproduction
 from rotflex_jax.reproduce.records import PulseRun
+from rotflex_jax.text.numbers import digits, readable
 
 
-def number(value: float, digits: int = 3) -> str:
+def number(value: float, count: int = 3) -> str:
     """A number for people; a dash where there is none.
 
     >>> number(0.015234), number(7052.3, 4), number(float("nan"))
     ('0.0152', '7052', '–')
     """
-    return f"{value:.{digits}g}" if math.isfinite(value) else "–"
+    return digits(value, count, missing="–")
 
 
 def headline(result: Reproduction) -> str:
@@ -25,8 +26,8 @@ def headline(result: Reproduction) -> str:
     if a.settle is None:
         late = a.prediction.settle > a.times[-1]
         return "The run is too short for Figure 9" if late else "Figure 9 settles on nothing but noise"
-    found, promised = number(a.settle, 4), number(a.prediction.settle, 4)
-    return f"Figure 9 settles after {found} iterations; {promised} were predicted"
+    found, predicted = number(a.settle, 4), number(a.prediction.settle, 4)
+    return f"Figure 9 settles after {found} iterations; {predicted} were predicted"
 
 
 def summary(result: Reproduction) -> str:
@@ -54,15 +55,15 @@ def names(result: Reproduction) -> tuple[str, str, str]:
     return f"{M} quadratic, LMS", f"{M} linear", "linearised joint"
 
 
-def percent(share: float) -> str:
-    """A share for people.
+def percent(fraction: float) -> str:
+    """A fraction in percent, for people.
 
     >>> percent(0.0152), percent(0.608), percent(1.59)
     ('1.5 %', '61 %', '159 %')
     """
-    if not math.isfinite(share):
+    if not math.isfinite(fraction):
         return "–"
-    return f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"
+    return f"{100 * fraction:.1f} %" if fraction < 0.1 else f"{100 * fraction:.0f} %"
 
 
 def online(result: Reproduction) -> list[str]:
@@ -78,8 +79,8 @@ def online(result: Reproduction) -> list[str]:
         f"The step sizes are {_sizes(result)}. By theory they are {stability.sentence}, and cost "
         f"{percent(stability.misadjustment)} of the smallest error in the end.",
     ]
-    if result.trap is not None:
-        t = result.trap
+    if result.short_memory is not None:
+        t = result.short_memory
         texts.append(
             f"How far the two can part: at a sampling interval of {1e3 * t.Ts:g} ms, where "
             f"{result.settings.memory} samples span next to nothing of the joint, the a-priori error falls "
@@ -114,7 +115,7 @@ def lessons(result: Reproduction) -> list[str]:
     grey = [row for row in result.rows if row.name == "grey box"]
     if grey:
         found.append(
-            f"The joint's own equations with friction, {grey[0].size} numbers learnt from a part of the "
+            f"The joint's own equations with friction, {grey[0].size} parameters fitted to a part of the "
             f"data, leave {number(grey[0].held_out)}: what a series cannot follow is not noise."
         )
     found += [_one_sign(pulse.height) for pulse in _best_linearised(result)][:1]
@@ -147,14 +148,14 @@ def _seconds(result: Reproduction) -> str:
 
 
 def plateau(result: Reproduction) -> str:
-    """The law of the plateau, checked on this run."""
+    """Where the model rests within a pulse, computed from its kernels."""
     series = result.row(names(result)[0]).series
     if series is None or not result.records.pulses:
         return ""
     kernels, height = series.kernels(), result.settings.pulse
-    law = [h * np.sum(kernels[1]) + h * h * np.sum(kernels[2]) for h in (height, -height)]
-    scale, unit = (180 / np.pi, "deg") if result.records.unit == "rad" else (1.0, result.records.unit)
-    up, down = (number(scale * float(value), 2).replace("-", "−") for value in law)
+    heights = [h * np.sum(kernels[1]) + h * h * np.sum(kernels[2]) for h in (height, -height)]
+    scale, unit = readable(1.0, result.records.unit)
+    up, down = (number(scale * float(value), 2).replace("-", "−") for value in heights)
     return (
         f"Within a pulse of height A, once {result.settings.memory} samples have passed, the model rests "
         f"at h0 + A Σh1 + A² Σh2. Without h0 that is {up} {unit} for +{height:g} V and {down} {unit} for "

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 import rotflex_jax as rf
-from rotflex_jax.mechanism.linearise import StateSpace, inverse_mass
+from rotflex_jax.mechanism.linear import StateSpace, inverse_mass
 
 Array = NDArray[np.float64]
 

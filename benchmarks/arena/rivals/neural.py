@@ -20,7 +20,7 @@ from arena.rivals.answer import Answer
 from arena.rivals.motion import Array, Motion, motion
 from arena.rivals.selection import rows, select
 from arena.rivals.terms import linear_columns, terms
-from rotflex_jax.mechanism.linearise import zero_order_hold
+from rotflex_jax.mechanism.linear import zero_order_hold
 
 WIDTH, RUN_SECONDS, STEPS, RATE = 24, 0.5, 1200, 5e-3
 

@@ -7,8 +7,8 @@ import numpy as np
 import rotflex_jax as rf
 from arena.laws import Place
 from arena.rivals.answer import Answer
-from rotflex_jax.discover.room import make_room
 from rotflex_jax.mechanism.roles import search_places
+from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 
 ROUNDS, MARGIN = 2, 5.0
 
@@ -23,7 +23,7 @@ def refit(train: rf.Recording) -> Answer:
         for kind, port in search_places(model):
             if (kind.name, port) in rounds:
                 continue
-            make_room()
+            clear_compilation_caches()
             try:
                 fit = rf.fit(best.model + kind(at=port), train)
             except (rf.InputError, ValueError, FloatingPointError):

@@ -10,7 +10,7 @@ from arena.rivals.answer import Answer
 from arena.rivals.motion import Array, Motion, linear_joint, motion
 from arena.rivals.selection import rows, select
 from arena.rivals.terms import linear_columns, terms
-from rotflex_jax.mechanism.linearise import zero_order_hold
+from rotflex_jax.mechanism.linear import zero_order_hold
 
 
 def residual(train: rf.Recording) -> Answer:

@@ -1,0 +1,361 @@
+"""Damaged files of every format that is read: each must end as a recording, a model or `InputError`.
+
+    python benchmarks/fuzz_input.py                        # 2,000 of each format
+    python benchmarks/fuzz_input.py --count 200 --formats mat hdf5
+
+Small files are made here and changed: bits, bytes, numbers that tell a size, blocks cut, put in or repeated;
+inside the compressed parts too. A process of its own reads them, since a fault may end it, under a limit
+of memory and of time. The table counts how they end; the exit status is 1 where one ends in any other way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import io
+import json
+import os
+import random
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SECONDS = 5
+"""Time that one file may take [s]."""
+
+MEMORY = 1_500_000_000
+"""Memory that reading may take beyond what the imported packages take [bytes]."""
+
+MAX_BYTES = 300_000_000
+"""Limit that the reader is given [bytes]."""
+
+ALL_FAULTS = ("short", "constant_input", "constant", "saturated", "units")
+"""Faults of the signals are accepted, so that what is read gets as far as it can."""
+
+
+def columns(samples: int = 60) -> dict[str, np.ndarray]:
+    """One small recording."""
+    k = np.arange(samples)
+    signals = np.random.default_rng(3).normal(size=samples), 0.3 * np.sin(k / 9), 0.1 * np.cos(k / 4)
+    return dict(zip(("t", "voltage", "theta", "alpha"), (0.002 * k, *signals), strict=True))
+
+
+def csv_seeds() -> list[bytes]:
+    """Commas, semicolons with decimal commas and a line of units, spaces below remarks."""
+    rows = np.column_stack(list(columns().values())).tolist()
+    plain = ["t,voltage,theta,alpha", *(",".join(f"{x:.6g}" for x in row) for row in rows)]
+    german = ["t;voltage;theta;alpha", "s;V;rad;rad", *(line.replace(".", "_") for line in plain[1:])]
+    german = [line.replace(",", ";").replace("_", ",") for line in german]
+    spaces = ["# a log", "# of a joint", *(line.replace(",", "  ") for line in plain)]
+    return ["\n".join(lines).encode() + b"\n" for lines in (plain, german, spaces)]
+
+
+def npz_seeds() -> list[bytes]:
+    """Stored and compressed."""
+    found = []
+    for write in (np.savez, np.savez_compressed):
+        write(out := io.BytesIO(), **columns(), log=np.ones((60, 3), np.float32), kind=np.array("run 7"))  # type: ignore[arg-type]
+        found.append(out.getvalue())
+    return found
+
+
+def mat_seeds() -> list[bytes]:
+    """Version 4; version 5 with structures, cells, text, sparse and complex matrices, also compressed."""
+    import scipy.io
+    import scipy.sparse
+
+    plain = columns()
+    rich = plain | {
+        "log": {"u": plain["voltage"], "inner": {"name": "joint", "count": np.arange(5, dtype=np.int16)}},
+        "cells": np.array([np.ones(3), "text", np.zeros((2, 2))], dtype=object),
+        "sparse": scipy.sparse.csc_array(np.eye(4)),
+        "z": np.exp(1j * np.arange(4)),
+        "flag": np.array([True, False]),
+        "records": np.array([(1.0, 2), (3.0, 4)], dtype=[("a", "f8"), ("b", "i4")]),
+    }
+    found = []
+    for values, how in ((plain, {}), (plain, {"format": "4"}), (rich, {}), (rich, {"do_compression": True})):
+        scipy.io.savemat(out := io.BytesIO(), values, **how)  # type: ignore[arg-type]
+        found.append(out.getvalue())
+    return found
+
+
+def hdf5_seeds() -> list[bytes]:
+    """As MATLAB 7.3 writes it, and with chunks, groups, a named type and a compound type."""
+    import h5py
+
+    found = []
+    for rich in (False, True):
+        with h5py.File(out := io.BytesIO(), "w", userblock_size=512) as file:
+            for name, value in columns().items():
+                chunks = {"chunks": (1, 16), "compression": "gzip", "shuffle": True} if rich else {}
+                file.create_dataset(name, data=value[None], **chunks)
+                file[name].attrs["MATLAB_class"] = np.bytes_("double")
+            if rich:
+                file["type"] = np.dtype("f8")
+                group = file.create_group("log")
+                group.attrs["MATLAB_class"] = np.bytes_("struct")
+                group.create_dataset("u", data=np.ones((1, 60)))
+                group.create_dataset("z", data=np.ones(3, dtype=[("real", "f8"), ("imag", "f8")]))
+                group.create_dataset("words", data=["one", "two"])
+                group["soft"] = h5py.SoftLink("/theta")
+        found.append(b"MATLAB 7.3 MAT-file".ljust(512) + out.getvalue()[512:])
+    return found
+
+
+def parquet_seeds() -> list[bytes]:
+    """Numbers; and text, lists, dates, whole numbers with gaps."""
+    import pyarrow
+    import pyarrow.parquet
+
+    plain = pyarrow.table(columns())
+    rich = plain.append_column("word", pyarrow.array(["a", "bc", "a"] * 20))
+    rich = rich.append_column("list", pyarrow.array([[1, 2], [], None] * 20))
+    rich = rich.append_column("gaps", pyarrow.array([1, None, 3] * 20))
+    rich = rich.append_column("when", pyarrow.array([0] * 60, pyarrow.timestamp("us")))
+    found = []
+    for table, how in ((plain, {}), (rich, {"compression": "gzip"}), (rich, {"compression": "none"})):
+        pyarrow.parquet.write_table(table, out := io.BytesIO(), **how)
+        found.append(out.getvalue())
+    return found
+
+
+def model_seeds() -> list[bytes]:
+    """A small joint, and one with effects, gates and a covariance."""
+    from rotflex_jax.effects import Coulomb
+    from rotflex_jax.joints import paper
+    from rotflex_jax.models.model import Model
+    from rotflex_jax.models.model_json import Saved, to_dict
+    from rotflex_jax.parameters import Estimate
+
+    joint = Model(paper())
+    more = joint + Coulomb(at="hub", level=0.01)
+    estimate = Estimate("hub.coulomb.level", 0.01, 0.001, (0.008, 0.012), "N m", True, "")
+    rich = Saved(more, (estimate,), np.array([[1e-6]]), ("hub.coulomb.level",), 0.002, 20)
+    return [json.dumps(to_dict(saved), indent=2).encode() for saved in (Saved(joint), rich)]
+
+
+SIZES = (0, 1, 7, 0x7F, 0x80, 0xFF, 0xFFFF, 10**6, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**63 - 1, 2**64 - 1)
+WORDS = (b"1e999", b"-1", b"nan", b"Infinity", b"9" * 400, b"null", b"true", b'"', b"[" * 3000, b"1_0", b"{}")
+WORDS += (b"\0", b"\xff\xfe", b",", b";", b"\n", b"x" * 140_000)
+
+
+def mutated(data: bytes, pick: random.Random, text: bool) -> bytes:
+    """One to three changes of a file."""
+    found = bytearray(data)
+    for _ in range(pick.choice((1, 1, 1, 2, 3))):
+        # Headers stand at the ends of a file and steer what is read.
+        reach = pick.choice((len(found), len(found), 400))
+        at = min(pick.randrange(reach + 1), max(len(found) - 1, 0))
+        at = len(found) - 1 - at if pick.random() < 0.25 else at
+        width = pick.choice((1, 2, 4, 8, 30, 200))
+        kind = pick.randrange(8 if text else 7)
+        if kind == 0 and found:
+            found[at] ^= 1 << pick.randrange(8)
+        elif kind == 1 and found:
+            found[at] = pick.choice((0, 1, 5, 9, 14, 15, 0x7F, 0x80, 0xFF, pick.randrange(256)))
+        elif kind == 2:
+            length, order = pick.choice((1, 2, 4, 8)), pick.choice(("little", "big"))
+            at -= at % length if pick.random() < 0.7 else 0
+            found[at : at + length] = (pick.choice(SIZES) % 256**length).to_bytes(length, order)  # type: ignore[arg-type]
+        elif kind == 3:
+            del found[at : None if pick.random() < 0.5 else at + width]
+        elif kind == 4:
+            found[at:at] = pick.randbytes(width)
+        elif kind == 5:
+            found[at:at] = found[at : at + width] * pick.choice((1, 2, 50))
+        elif kind == 6:
+            other = pick.randrange(len(found) + 1)
+            found[at : at + width] = found[other : other + width]
+        else:
+            end = at = min(at, len(found))
+            while at and found[at - 1] not in b",;:[{ \n":
+                at -= 1
+            while end < len(found) and found[end] not in b",;:]} \n":
+                end += 1
+            found[at:end] = pick.choice(WORDS)
+    return bytes(found)
+
+
+def mutated_npz(data: bytes, pick: random.Random, text: bool) -> bytes:
+    """Changes of the archive, or of an array in it, which its checksum then fits."""
+    if pick.random() < 0.4:
+        return mutated(data, pick, text)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        parts = {info.filename: archive.read(info) for info in archive.infolist()}
+    name = pick.choice(list(parts))
+    parts[name] = mutated(parts[name][:128], pick, pick.random() < 0.5) + parts[name][128:]
+    with zipfile.ZipFile(out := io.BytesIO(), "w", pick.choice((0, 8))) as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part)
+    return out.getvalue()
+
+
+def mutated_mat(data: bytes, pick: random.Random, text: bool) -> bytes:
+    """Changes of the file, or of a compressed variable in it, which its checksum then fits."""
+    if pick.random() < 0.4 or struct.unpack("<I", data[128:132])[0] != 15:
+        return mutated(data, pick, text)
+    found, at, parts = data[:128], 128, []
+    while at < len(data):
+        size = struct.unpack("<I", data[at + 4 : at + 8])[0]
+        parts.append(zlib.decompress(data[at + 8 : at + 8 + size]))
+        at += 8 + size
+    k = pick.randrange(len(parts))
+    parts[k] = mutated(parts[k], pick, text)
+    for part in parts:
+        packed = zlib.compress(part)
+        found += struct.pack("<II", 15, len(packed)) + packed
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """How files of a format are made and changed."""
+
+    ending: str
+    seeds: Callable[[], list[bytes]]
+    change: Callable[[bytes, random.Random, bool], bytes] = mutated
+    text: bool = False
+
+
+FORMATS = {
+    "csv": Format(".csv", csv_seeds, text=True),
+    "npz": Format(".npz", npz_seeds, mutated_npz),
+    "mat": Format(".mat", mat_seeds, mutated_mat),
+    "hdf5": Format(".mat", hdf5_seeds),
+    "parquet": Format(".parquet", parquet_seeds),
+    "model": Format(".json", model_seeds, text=True),
+}
+
+
+def inputs(name: str, start: int, count: int) -> Iterator[tuple[int, bytes]]:
+    """Changed files; each by its number alone, so that one can be made again."""
+    form = FORMATS[name]
+    seeds = form.seeds()
+    for k in range(start, count):
+        pick = random.Random(f"{name} {k}")
+        yield k, form.change(pick.choice(seeds), pick, form.text)
+
+
+def read(path: Path) -> Any:
+    """What a user would call."""
+    if path.suffix == ".json":
+        from rotflex_jax.models.model_json import read as read_model
+
+        return read_model(path)
+    from rotflex_jax.data.files import load
+
+    return load(path, accept=ALL_FAULTS, max_bytes=MAX_BYTES)
+
+
+def outcome(path: Path) -> str:
+    """How reading ends: read, refused, or the name of the fault."""
+    from rotflex_jax.errors import InputError
+
+    try:
+        read(path)
+        return "read"
+    except InputError as error:
+        said = str(error)
+        return "refused" if len(said) < 1500 and "\n" not in said else "fault: no sentence"
+    except BaseException as error:
+        where = error.__traceback__
+        while (
+            where is not None and where.tb_next is not None and "rotflex_jax" in str(where.tb_next.tb_frame)
+        ):
+            where = where.tb_next
+        return f"fault: {type(error).__name__} {str(error)[:80]!r} line {where.tb_lineno if where else 0}"
+
+
+def work(name: str, start: int, count: int, folder: Path) -> None:
+    """In a process of its own: reads the files one by one, and tells the outcome of each on stdout."""
+    path = folder / f"input{FORMATS[name].ending}"
+    for seed in FORMATS[name].seeds():  # imports all that is needed, before memory is limited
+        path.write_bytes(seed)
+        assert outcome(path) == "read", (name, outcome(path))
+    taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for k, data in inputs(name, start, count):
+        path.write_bytes(data)
+        print(k, "started", flush=True)
+        signal.alarm(SECONDS)  # ends the process, also where it hangs in a library
+        said = outcome(path)
+        signal.alarm(0)
+        print(k, said, flush=True)
+
+
+def run(name: str, count: int, folder: Path) -> list[tuple[int, str]]:
+    """Number and outcome of each file of a format."""
+    found: dict[int, str] = {}
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONWARNINGS": "ignore"}
+    while len(found) < count:
+        arguments = ["--worker", name, str(len(found)), str(count), str(folder)]
+        done = subprocess.run(
+            [sys.executable, __file__, *arguments],
+            capture_output=True,
+            text=True,
+            env=environment,
+            check=False,
+        )
+        before = len(found)
+        for line in done.stdout.splitlines():
+            number, _, said = line.partition(" ")
+            found[int(number)] = said
+        if done.returncode and len(found) == before:
+            raise RuntimeError(f"{name}: the process that reads ended at once: {done.stderr[-2000:]}")
+        if done.returncode:
+            name_of = signal.Signals(-done.returncode).name if done.returncode < 0 else str(done.returncode)
+            found[len(found) - 1] = f"fault: process ended by {name_of}"
+    return sorted(found.items())
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--count", type=int, default=2000, help="files of each format")
+    parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=list(FORMATS))
+    parser.add_argument("--write", nargs=3, metavar=("FORMAT", "NUMBER", "FILE"), help="make one file again")
+    parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if chosen.write:
+        name, number, file = chosen.write
+        Path(file).write_bytes(next(inputs(name, int(number), int(number) + 1))[1])
+        return 0
+    if chosen.worker:
+        name, start, count, folder = chosen.worker
+        work(name, int(start), int(count), Path(folder))
+        return 0
+    faults = 0
+    print(f"{'format':10}{'files':>8}{'read':>8}{'refused':>9}{'faults':>8}{'seconds':>9}")
+    for name in chosen.formats:
+        began = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            ends = run(name, chosen.count, Path(folder))
+        kinds = Counter(said.partition(":")[0] for _, said in ends)
+        faults += kinds["fault"]
+        took = time.perf_counter() - began
+        counts = f"{kinds['read']:8}{kinds['refused']:9}{kinds['fault']:8}"
+        print(f"{name:10}{len(ends):8}{counts}{took:9.0f}", flush=True)
+        for said, often in Counter(s for _, s in ends if s.startswith("fault")).most_common(12):
+            first = next(k for k, other in ends if other == said)
+            print(f"    {often} times, first {first}: {said}", flush=True)
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,206 @@
+"""The learning curve that theory predicts for LMS: mean weights, excess error, settling time."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float, Real
+
+from rotflex_jax.adaptive.moments import Moments, pack
+from rotflex_jax.adaptive.step_sizes import StepSizes, pack_sum, recursion, step_sizes
+from rotflex_jax.errors import InputError
+
+LONGEST_SETTLING = 1e8
+"""Settling times above this count as infinite [samples]."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LearningCurve:
+    """What to expect on average over many runs.
+
+    Attributes:
+        times: samples seen.
+        weights: mean weights.
+        excess: mean squared error beyond the smallest, in the units of the squared output.
+    """
+
+    times: Float[np.ndarray, " K"]
+    weights: Float[np.ndarray, "K P"]
+    excess: Float[np.ndarray, " K"]
+
+
+def settling_step_size(eigenvalue: float, samples: float, within: float = 0.05) -> float:
+    """Step size with which a mode has come within a share of its final value after a number of samples.
+
+        mu = ln(1 / within) / (samples eigenvalue)
+
+    Args:
+        eigenvalue: of R along the mode [regressor^2].
+        samples: how many.
+        within: remaining share; 0.05 gives ln 20.
+
+    Raises:
+        InputError: numbers that are not positive, or a share that is not below one.
+
+    >>> [round(settling_step_size(eigenvalue, 7000), 6) for eigenvalue in (1, 2, 7)]
+    [0.000428, 0.000214, 6.1e-05]
+    """
+    if not (eigenvalue > 0 and samples > 0 and 0 < within < 1):
+        raise InputError(
+            "A settling needs a positive eigenvalue and number of samples and a share between 0 and 1, but "
+            f"they are {eigenvalue:g}, {samples:g} and {within:g}; correct them."
+        )
+    return float(np.log(1 / within) / (samples * eigenvalue))
+
+
+def learning_curve(
+    moments: Moments,
+    mu: StepSizes,
+    weights: Float[np.ndarray, " P"],
+    times: Real[np.ndarray, " K"],
+    *,
+    noise: float = 0.0,
+    start: Float[np.ndarray, " P"] | None = None,
+) -> LearningCurve:
+    """Mean weights and excess error of LMS, exactly for independent samples.
+
+    Beyond some seventy regressors it takes long and much memory: the whole recursion is decomposed.
+
+    Args:
+        moments: of the regressors.
+        mu: step size, one or one per weight.
+        weights: best weights, which the mean converges to.
+        times: samples seen, in any order.
+        noise: smallest mean squared error J0.
+        start: first weights; zero if None.
+
+    Raises:
+        InputError: step sizes as in `analyse`.
+    """
+    exact, moving = recursion(moments, mu)
+    best, first = (
+        np.asarray(weights, float),
+        np.zeros(moments.size) if start is None else np.asarray(start, float),
+    )
+    t = np.asarray(times, dtype=float)
+    delta = (first - best)[moving] / exact.root
+    along = exact.vectors.T @ delta
+    decay = (1 - exact.values) ** t[:, None]
+    mean = np.tile(first, (len(t), 1))
+    still = delta - exact.vectors @ along  # directions without any signal stay where they are
+    mean[:, moving] = best[moving] + exact.root * (still + (decay * along) @ exact.vectors.T)
+    diagonal = 1 - pack_sum(exact.values)
+    rates, modes = np.linalg.eigh(np.diag(diagonal) + exact.dense())
+    begin = modes.T @ pack(np.outer(along, along))
+    drive = modes.T @ pack(np.diag(exact.values) * noise)
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable recursion overflows
+        power = rates ** t[:, None]
+        C = power * begin + (1 - power) / (1 - rates) * drive
+        excess = C @ (modes.T @ pack(np.diag(exact.values)))
+    return LearningCurve(t, mean, excess)
+
+
+def settling_samples(
+    moments: Moments,
+    mu: StepSizes,
+    weights: Float[np.ndarray, " P"],
+    coefficient: int,
+    *,
+    within: float = 0.05,
+    start: Float[np.ndarray, " P"] | None = None,
+) -> float:
+    """Samples after which the mean of one weight stays within a share of its final value.
+
+    Args:
+        moments: of the regressors.
+        mu: step size, one or one per weight.
+        weights: best weights; their size matters, as slow modes mix them.
+        coefficient: index of the weight, whose best value is not zero.
+        within: the share.
+        start: first weights; zero if None.
+
+    Returns:
+        The number of samples; infinite where it never settles.
+
+    Raises:
+        InputError: a best value of zero, of which no share can be taken.
+    """
+    exact, moving = recursion(moments, mu)
+    best = np.asarray(weights, float)
+    if best[coefficient] == 0:
+        raise InputError(
+            f"Weight {coefficient} has the best value 0, and no share of it can be taken; choose another one."
+        )
+    first = np.zeros(moments.size) if start is None else np.asarray(start, float)
+    if not moving[coefficient]:
+        return float("inf") if first[coefficient] != best[coefficient] else 0.0
+    row = int(np.sum(moving[:coefficient]))
+    delta = (first - best)[moving] / exact.root
+    along = exact.vectors.T @ delta
+    share = exact.root[row] * exact.vectors[row] * along / best[coefficient]
+    left = (exact.root[row] * delta[row] / best[coefficient]) - share.sum()
+
+    def outside(t: np.ndarray) -> np.ndarray:
+        return np.abs(left + (1 - exact.values) ** t[:, None] @ share) > within
+
+    if exact.values[-1] >= 2 or abs(left) > within:
+        return float("inf")
+    # After this time even the sum of all sizes is inside; before it look for the last time outside.
+    slowest = np.abs(1 - exact.values).max()
+    total = np.abs(share).sum()
+    end = np.log(max(total, 2 * within) / (within - abs(left))) / -np.log(slowest) + 2
+    if end > LONGEST_SETTLING:
+        return float("inf")
+    grid = np.unique(np.r_[0, np.geomspace(1, end, 4000).round(), np.ceil(end)])
+    bad = np.flatnonzero(outside(grid))
+    if not len(bad):
+        return 0.0
+    low, high = grid[bad[-1]], grid[bad[-1] + 1]
+    while high - low > 1:
+        middle = np.floor((low + high) / 2)
+        low, high = (middle, high) if outside(np.array([middle]))[0] else (low, middle)
+    return float(high)
+
+
+def settling_factor(
+    moments: Moments,
+    direction: StepSizes,
+    weights: Float[np.ndarray, " P"],
+    coefficient: int,
+    samples: float,
+    *,
+    scaled: Bool[np.ndarray, " P"] | None = None,
+    within: float = 0.05,
+) -> float:
+    """Factor on step sizes with which one weight settles after the given number of samples.
+
+    Args:
+        moments: of the regressors.
+        direction: step size, one or one per weight.
+        weights: best weights.
+        coefficient: index of the weight.
+        samples: when it is to be settled.
+        scaled: mask of the step sizes that the factor multiplies, for instance those of the
+            quadratic weights only; all of them if None.
+        within: the share.
+
+    Returns:
+        The smallest such factor; infinite where none settles that early. Compare with `mean_square_bound`.
+    """
+    base = step_sizes(moments, direction)
+    mask = np.ones(moments.size, dtype=bool) if scaled is None else np.asarray(scaled, dtype=bool)
+
+    def in_time(log_factor: float) -> bool:
+        mu = np.where(mask, base * np.exp(log_factor), base)
+        return settling_samples(moments, mu, weights, coefficient, within=within) <= samples
+
+    # Not monotone: beyond some size the mean overshoots. So the first factor from below is taken.
+    low = -12.0
+    while not in_time(low + 0.25):
+        low += 0.25
+        if low > 12:
+            return float("inf")
+    high = low + 0.25
+    while high - low > 1e-4:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if in_time(middle) else (middle, high)
+    return float(np.exp(high))

@@ -1,0 +1,244 @@
+"""Search for settings of a filter: on a grid, or by the gradient through the filter's loop."""
+
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rotflex_jax.adaptive.filter import AdaptiveFilter, count
+from rotflex_jax.adaptive.lms import LMS
+from rotflex_jax.adaptive.objectives import (
+    MOST_WEIGHTS_FOR_STABILITY,
+    Objective,
+    TuningData,
+    evaluate,
+    sample_moments,
+    tuning_data,
+    tuning_result,
+    values_at,
+)
+from rotflex_jax.adaptive.settings import (
+    FilterBuilder,
+    RangeTransform,
+    Tuned,
+    TuningPath,
+    build_filter,
+    starting_sets,
+)
+from rotflex_jax.adaptive.step_sizes import Margin
+from rotflex_jax.basis import Basis
+from rotflex_jax.errors import InputError
+from rotflex_jax.optimise.quasi_newton import Values, descend
+from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision, mesh_of
+
+
+def grid(
+    build: FilterBuilder,
+    axes: Mapping[str, Any],
+    basis: Basis,
+    recordings: Sequence[Recording],
+    channel: str,
+    *,
+    objective: Objective,
+    test: Sequence[Recording] = (),
+    devices: Sequence[Any] | None = None,
+) -> Tuned:
+    """The objective of `tune` at every combination of given settings.
+
+    For two settings an alternative to the gradient, which shows the objective everywhere. Not for four or
+    more: the number of combinations grows exponentially.
+
+    Args:
+        build: as in `tune`.
+        axes: numbers to try, by name of the setting.
+        basis: as in `tune`.
+        recordings: as in `tune`.
+        channel: as in `tune`.
+        objective: as in `tune`.
+        test: as in `tune`.
+        devices: that share the combinations; all of this process unless given. With
+            `jax.distributed`, `jax.devices()` are those of all processes, of which each makes this call.
+
+    Returns:
+        The best combination, with the values at all.
+
+    Raises:
+        InputError: as `tune`; no settings, or a filter that diverges with all of them.
+    """
+    tried = {name: np.atleast_1d(np.asarray(values, dtype=float)) for name, values in axes.items()}
+    if not tried or any(v.ndim != 1 or not v.size for v in tried.values()):
+        raise InputError(
+            "Argument `axes` must give numbers for each setting, but one has none; "
+            'give for instance {"mu": [0.01, 0.1]}.'
+        )
+    points = np.array(list(itertools.product(*tried.values())))
+    with double_precision():
+        data = tuning_data(basis, recordings, channel, objective)
+        mesh = mesh_of(devices)
+        run = values_at(
+            jnp.asarray(points), data, names=tuple(tried), build=build, objective=objective, mesh=mesh
+        )
+        values = np.asarray(run)
+    if not np.isfinite(values).any():
+        raise InputError("The filter diverges at every point of the grid; try smaller steps.")
+    best = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
+    return tuning_result(
+        build,
+        dict(zip(tried, points[best].tolist(), strict=True)),
+        basis,
+        recordings,
+        channel,
+        data,
+        objective=objective,
+        test=test,
+        value=float(values[best]),
+        evaluations=len(points),
+        axes=tried,
+        values=values.reshape([len(v) for v in tried.values()]),
+    )
+
+
+def tune(
+    build: FilterBuilder,
+    start: Mapping[str, float] | Sequence[Mapping[str, float]],
+    basis: Basis,
+    recordings: Sequence[Recording],
+    channel: str,
+    *,
+    objective: Objective,
+    test: Sequence[Recording] = (),
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    evaluations: int = 60,
+    margin: float = 0.0,
+) -> Tuned:
+    """Minimises an objective over settings of a filter, by its gradient through the filter's loop.
+
+        log objective(exp(x)) -> min over x,   forward derivatives through every step of the filter
+
+    Quasi-Newton steps of limited length from all starts at once. Where the filter diverges a step is
+    shortened. Any leaf of the filter can be tuned,
+    and poles of the basis as well; more than some ten settings make forward derivatives slow.
+
+    Not for a single recording, to whose noise the settings would be fitted: give several.
+
+    Args:
+        build: the filter of settings by name, such as `lambda s: LMS(s["mu"])`; JAX traces it. For poles
+            it returns the filter and a basis, such as `Volterra(bank.with_numbers(...))`.
+            The same function in another call compiles nothing again.
+        start: settings to begin with, or several sets of them.
+        basis: turns the input into regressors.
+        recordings: to tune on, of one length; the filter starts again on each.
+        channel: output to be followed.
+        objective: "final", "mean_error" or "last_half"; they ask for different settings.
+        test: other recordings, on which the result is evaluated by the same objective.
+        ranges: of settings by name; a range with an end moves along a logistic curve, every other
+            setting is positive and moves along its logarithm.
+        evaluations: most filters to run per start, each with all derivatives.
+        margin: keep at least this factor inside the mean-square bound of LMS, as a penalty; 0 for none.
+
+    Returns:
+        The best of all starts, with every path and a check of its stability.
+
+    Raises:
+        InputError: settings out of range, an unknown objective, recordings that do not go together, or
+            a filter that diverges from every start.
+    """
+    count("evaluations", evaluations)
+    starts = starting_sets(start)
+    names = tuple(starts[0])
+    curve = RangeTransform(names, tuple((ranges or {}).get(name, (0.0, float("inf"))) for name in names))
+    first = np.stack([curve.free(s) for s in starts])
+    with double_precision():
+        data = tuning_data(basis, recordings, channel, objective)
+        guard = _guard(margin, data, *build_filter(build, starts[0])) if margin else None
+
+        def values(points: Float[np.ndarray, "S n"]) -> Values:
+            return jax.device_get(
+                loss_and_slopes(
+                    jnp.asarray(points), data, guard, curve=curve, build=build, objective=objective
+                )
+            )
+
+        found = descend(values, first, evaluations)
+        paths = tuple(
+            TuningPath(
+                {
+                    name: np.array([float(curve.settings(jnp.asarray(x))[name]) for x in d.points])
+                    for name in names
+                },
+                np.exp(d.values),
+                d.evaluations,
+                d.status,
+            )
+            for d in found
+        )
+    reached = [p for p in paths if len(p.values)]
+    if not reached:
+        raise InputError(
+            f"The filter diverges from every one of {len(starts)} starts, such as {starts[0]}; "
+            "start from smaller steps."
+        )
+    best = min(reached, key=lambda p: p.values[-1])
+    return tuning_result(
+        build,
+        {name: float(points[-1]) for name, points in best.points.items()},
+        basis,
+        recordings,
+        channel,
+        data,
+        objective=objective,
+        test=test,
+        # With a margin the last value includes the penalty.
+        value=float(best.values[-1]) if guard is None else None,
+        evaluations=sum(p.evaluations for p in paths),
+        paths=paths,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("curve", "build", "objective"))
+def loss_and_slopes(
+    points: Float[Array, "S n"],
+    data: TuningData,
+    guard: Margin | None = None,
+    *,
+    curve: RangeTransform,
+    build: FilterBuilder,
+    objective: Objective,
+) -> tuple[Float[Array, " S"], Float[Array, "S n"]]:
+    """Log of the objective, and its derivatives with respect to the unconstrained coordinates.
+
+    Forward mode: as many tangents as settings, and nothing of the run is stored. Compiled once per `build`,
+    whatever the values are.
+    """
+
+    def loss(x: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        filter, changed = build_filter(build, curve.settings(x))
+        value = jnp.log(evaluate(data, objective, filter, changed))
+        if guard is not None:
+            value = value + guard.penalty(_step_sizes(filter))
+        return value, value
+
+    slopes, values = jax.vmap(jax.jacfwd(loss, has_aux=True))(points)
+    return values, slopes
+
+
+def _step_sizes(filter: AdaptiveFilter) -> Float[Array, "*P"]:
+    assert isinstance(filter, LMS)
+    return jnp.asarray(filter.mu)
+
+
+def _guard(margin: float, data: TuningData, filter: AdaptiveFilter, changed: Basis | None) -> Margin:
+    P = data.phi.shape[2]
+    if not margin > 0 or changed is not None or P > MOST_WEIGHTS_FOR_STABILITY or not isinstance(filter, LMS):
+        raise InputError(
+            "A margin is a positive factor that LMS can keep on a fixed basis of up to "
+            f"{MOST_WEIGHTS_FOR_STABILITY} regressors, but {margin:g} was given for "
+            f"{type(filter).__name__} on {P}; leave it out, or change filter or basis."
+        )
+    return Margin(sample_moments(data.phi), margin)

@@ -1,0 +1,138 @@
+"""Many recordings, each searched separately."""
+
+import inspect
+import os
+import pickle
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from rotflex_jax.batch import storage
+from rotflex_jax.batch.result import Fleet
+from rotflex_jax.batch.storage import BatchProgress, Source
+from rotflex_jax.batch.task import Record, Search, SearchTask, carry_out, places_of
+from rotflex_jax.batch.workers import in_processes, on_cluster, workers_here
+from rotflex_jax.data import load
+from rotflex_jax.discover import discover
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints.by_name import choose
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.linear import output_units
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+
+
+def fleet(
+    joint: Mechanism | Model,
+    recordings: Iterable[str | os.PathLike[str] | Recording],
+    *,
+    folder: str | os.PathLike[str],
+    scheduler: str | None = None,
+    workers: int | None = None,
+    split: float = 0.7,
+    search: Search = discover,
+    progress: Callable[[str], None] | None = None,
+    **reading: Any,
+) -> Fleet:
+    """Search many recordings, each separately, and summarise them.
+
+    Every recording is split, searched, and written to a file of its own as soon as it is finished. The
+    same call continues where an earlier one stopped, and repeats only what has changed: the recording, the
+    model, the share, how it is read, the version of the package. A recording that cannot be used is a row
+    with a reason; a process or machine that fails costs only the time it had spent.
+
+    Not for recordings of one machine in one state: `discover` on all of them together is more accurate than
+    many searches of one. In a script, call it below `if __name__ == "__main__":`, as in every program that
+    starts processes.
+
+    Args:
+        joint: The model that each search starts from.
+        recordings: Files, or recordings; of any lengths.
+        folder: Where to write `summary.html`, `summary.csv`, `recordings/NAME.json`, and
+            `models/NAME.json`, which `Model.load` reads.
+        scheduler: Address of a Dask scheduler, `tcp://HOST:8786`, whose workers can read the files under the
+            same paths and have one thread each; the processes of this machine if None.
+        workers: Processes of this machine; 0 for none but this one; by its cores and memory if None.
+        split: Share of each recording for training, the first part.
+        search: Function of `(model, train, test)`; `functools.partial(rf.discover, rounds=2)` for
+            instance.
+        progress: Called with a line of text for each recording.
+        reading: Arguments of `rotflex_jax.load` for the files, such as `degrees=True`.
+
+    Returns:
+        One row per recording, in the order given.
+
+    Raises:
+        InputError: No recording, one that is given twice, a share outside 0 to 1, an unknown argument, a
+            folder that cannot be written, a scheduler that does not answer.
+    """
+    model = joint if isinstance(joint, Model) else Model(joint)
+    sources = [r if isinstance(r, Recording) else Path(r) for r in recordings]
+    _check(sources, split, scheduler, workers)
+    for name in reading:
+        choose(name, inspect.signature(load).parameters, "argument of load")
+    places = places_of(model, search, far=scheduler is not None)
+    units = output_units(model.mechanism)
+    reading = {"outputs": {c: c for c in units}, "units": units, **reading}
+    task = SearchTask(Path(), reading, split, _pickled(model, search), places)
+    common = storage.digest_of_search(model, search, split, reading, places)
+    progress = progress or (lambda _: None)
+    batch = BatchProgress(sources, task, common, storage.created(folder), progress)
+    try:
+        with closing(_carried_out(batch.unfinished(), scheduler, workers)) as results:
+            for number, found in results:
+                batch.finish(number, found)
+    finally:  # also where the loop is interrupted
+        result = Fleet(batch.rows, len(sources), units, batch.folder, batch.elapsed)
+        result.write()
+        if len(batch.rows) < len(sources):
+            progress(
+                f"{len(batch.rows)} of {len(sources)} are finished; the same call goes on with the others"
+            )
+    return result
+
+
+def _carried_out(
+    jobs: Iterator[tuple[int, SearchTask]], scheduler: str | None, workers: int | None
+) -> Generator[tuple[int, Record]]:
+    if scheduler is not None:
+        return on_cluster(jobs, scheduler)
+    if workers == 0:
+        return ((number, carry_out(task)) for number, task in jobs)
+    return in_processes(jobs, workers or workers_here())
+
+
+def _pickled(model: Model, search: Search) -> bytes:
+    try:
+        return pickle.dumps((model, search))
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise InputError(
+            f"The model or the search cannot be sent to another process ({error}); let the search be a "
+            "function of a Python file, not one that was written inside another."
+        ) from None
+
+
+def _check(sources: Sequence[Source], split: float, scheduler: str | None, workers: int | None) -> None:
+    """Checks the arguments before any work."""
+    if not sources:
+        raise InputError("No recording was given, but a fleet needs one or more; give files or recordings.")
+    if not 0 < split < 1:
+        raise InputError(
+            f"Argument `split` is the share of each recording to learn from and must lie between 0 and 1, "
+            f"but is {split:g}; give for instance 0.7."
+        )
+    if workers is not None and (workers < 0 or scheduler is not None):
+        given = f"{workers} workers were given" + (" and a scheduler" if scheduler is not None else "")
+        raise InputError(
+            f"{given}, but workers are processes of this machine, 0 or more, and a scheduler has its own; "
+            "give one of the two."
+        )
+    seen = set()
+    for path in (s for s in sources if isinstance(s, Path)):
+        if not path.is_file():
+            fault = "is a folder" if path.is_dir() else "does not exist"
+            raise InputError(f"{path} {fault}, but a recording is one file; give the paths of the files.")
+        if path.resolve() in seen:
+            raise InputError(f"{path} was given twice, but a recording must not count twice; name it once.")
+        seen.add(path.resolve())

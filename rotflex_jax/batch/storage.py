@@ -1,0 +1,208 @@
+"""Results on disk: one file per recording, a digest of its inputs, and which recordings are finished."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rotflex_jax import __version__
+from rotflex_jax.batch.result import RecordingRow
+from rotflex_jax.batch.task import Record, Search, SearchTask, record
+from rotflex_jax.errors import InputError
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+from rotflex_jax.text.files import write_file
+
+RESULTS, MODELS = "recordings", "models"
+RESULT_SCHEMA = 1
+
+
+def digest_of_search(
+    model: Model, search: Search, share: float, reading: Mapping[str, Any], places: Iterable[str]
+) -> str:
+    """Digest of everything that the recordings have in common; the same in every process."""
+    m = model.mechanism
+    physics = (m.coordinates, m.ports, m.effects, m.outputs, sorted(m.trusted), m.units)
+    text = repr(
+        (__version__, physics, model.solver, model.gates, _named(search), share, sorted(reading.items()))
+    )
+    files = [Path(place).read_bytes() for place in places if place.endswith(".py")]
+    return _digest(text.encode(), *files)
+
+
+def digest_of_recording(source: Path | Recording, common: str) -> str:
+    """Digest of a recording and of its search.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    if isinstance(source, Recording):
+        labels = (source.Ts, source.channels, source.units, source.input_name, source.input_unit)
+        labels = (*labels, source.n_init, source.start, source.accept, sorted(source.resolution.items()))
+        arrays = (np.ascontiguousarray(a).tobytes() for a in (source.u, source.y))
+        return _digest(common.encode(), repr(labels).encode(), *arrays)
+    return _digest(common.encode(), source.read_bytes())
+
+
+def _digest(*parts: bytes) -> str:
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(len(part).to_bytes(8, "big") + part)
+    return found.hexdigest()
+
+
+def _named(search: Any) -> str:
+    """Name of a function, with its bound arguments."""
+    if isinstance(search, functools.partial):
+        return f"{_named(search.func)}{search.args!r}{sorted(search.keywords.items())!r}"
+    return f"{search.__module__}.{search.__qualname__}"
+
+
+def names_of(sources: Sequence[Path | Recording]) -> list[str]:
+    """A name for each recording, fit for a file: that of its own file where no other has it.
+
+    >>> names_of([Path("a/run.csv"), Path("b/run.csv"), Path("b/step.csv")])[2]
+    'step'
+    """
+    plain = [s.stem if isinstance(s, Path) else Path(s.source).stem or "recording" for s in sources]
+    plain = ["".join(c if c.isalnum() or c in "-_.+" else "_" for c in name) for name in plain]
+    count = Counter(plain)
+    return [
+        name if count[name] == 1 else f"{name}-{_short(source, number)}"
+        for number, (name, source) in enumerate(zip(plain, sources, strict=True), 1)
+    ]
+
+
+def _short(source: Path | Recording, number: int) -> str:
+    if isinstance(source, Recording):
+        return str(number)
+    return _digest(os.path.realpath(source).encode())[:8]
+
+
+def write(folder: Path, record: Record) -> None:
+    """Writes a result, and before it its model; each completely or not at all."""
+    record = {"schema": RESULT_SCHEMA, **record}
+    model, name = record.pop("model"), f"{record['name']}.json"
+    if model is not None:
+        write_file(folder / MODELS / name, model)
+    write_file(folder / RESULTS / name, json.dumps(record, indent=1) + "\n")
+
+
+def read(folder: Path, name: str, digest: str) -> Record | None:
+    """The result of the same search of the same recording; None where there is no valid one."""
+    try:
+        known = json.loads((folder / RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    same = isinstance(known, dict) and known.get("schema") == RESULT_SCHEMA and known.get("digest") == digest
+    return known if same and known.get("state") in ("done", "refused") else None
+
+
+def created(folder: str | os.PathLike[str]) -> Path:
+    """The folder of the results, created if needed.
+
+    Raises:
+        InputError: It cannot be.
+    """
+    try:
+        for part in (RESULTS, MODELS):
+            (Path(folder) / part).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder} cannot hold the results ({error.strerror or error}), but they need a folder of "
+            "their own; name another."
+        ) from None
+    return Path(folder)
+
+
+Source = Path | Recording
+
+
+class BatchProgress:
+    """Finished and unfinished recordings of a batch, with a row and a file for each finished one.
+
+    Args:
+        sources: Files or recordings.
+        task: Of each, but for its source.
+        common: Digest of what all have in common.
+        folder: Of the files.
+        progress: Called with a line of text for each that is finished.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[Source],
+        task: SearchTask,
+        common: str,
+        folder: Path,
+        progress: Callable[[str], None],
+    ) -> None:
+        self.sources, self.task, self.common, self.folder = sources, task, common, folder
+        self.progress = progress
+        self.names = names_of(sources)
+        self.start, self.new = time.perf_counter(), 0
+        self._digests: dict[int, str] = {}
+        self._rows: dict[int, RecordingRow] = {}
+
+    @property
+    def rows(self) -> tuple[RecordingRow, ...]:
+        """Of the finished recordings, in the order given."""
+        return tuple(self._rows[number] for number in sorted(self._rows))
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the start [s]."""
+        return time.perf_counter() - self.start
+
+    def unfinished(self) -> Iterator[tuple[int, SearchTask]]:
+        """Number and task of each that no earlier call has finished; files are read when they are needed."""
+        for number, source in enumerate(self.sources):
+            try:
+                self._digests[number] = digest_of_recording(source, self.common)
+            except OSError as error:
+                fault = f"{source} cannot be read ({error.strerror or error}); see that it can."
+                self.finish(number, record("broken", fault))
+                continue
+            known = read(self.folder, self.names[number], self._digests[number])
+            if known is None:
+                yield number, dataclasses.replace(self.task, source=source)
+            else:
+                # A file with the same content may have moved.
+                self._rows[number] = RecordingRow.of({**known, **self._labels(number)}, known=True)
+
+    def finish(self, number: int, found: Record) -> None:
+        """Stores a result."""
+        found = {**self._labels(number), "digest": self._digests.get(number, ""), **found}
+        write(self.folder, found)
+        row = self._rows[number] = RecordingRow.of(found)
+        self.new += 1
+        summary = row.reason or f"{row.verdict.replace('_', ' ')} {row.found}".strip()
+        rest = len(self.sources) - len(self._rows)
+        left = f"; about {_duration(self.elapsed / self.new * rest)} left" if rest else ""
+        self.progress(
+            f"{len(self._rows)} of {len(self.sources)}: {row.name}: {summary} ({row.seconds:.0f} s{left})"
+        )
+
+    def _labels(self, number: int) -> dict[str, str]:
+        source = self.sources[number]
+        origin = source.source if isinstance(source, Recording) else str(source)
+        return {"name": self.names[number], "source": origin}
+
+
+def _duration(seconds: float) -> str:
+    """A duration in a suitable unit.
+
+    >>> _duration(50), _duration(400), _duration(90000)
+    ('50 s', '7 min', '25 h')
+    """
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.0f} h"

@@ -1,0 +1,122 @@
+"""One recording of a fleet: the task that a worker receives, its execution and its result."""
+
+import contextlib
+import dataclasses
+import functools
+import pickle
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rotflex_jax.data import load
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints.by_name import imported
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import enable_fast_start
+
+Search = Callable[[Model, Recording, Recording], Any]
+Record = dict[str, Any]
+"""Plain JSON: `state` is `done`, `refused` (bad input) or `broken` (worth another try); with it go `reason`,
+`seconds`, `result`, and `model`, the text of its file."""
+
+# A search uses a whole core and much memory, so the threads of a worker search one after the other.
+_ONE_SEARCH = threading.Lock()
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchTask:
+    """One recording, and how it is searched.
+
+    Attributes:
+        source: A file, which every worker must be able to read, or the recording itself.
+        reading: Arguments of `rotflex_jax.load` for a file.
+        share: Share of the recording for training.
+        what: Pickled `(model, search)`; they can only be unpickled after the `places` are imported.
+        places: Python files or modules with effects of the user.
+    """
+
+    source: Path | Recording
+    reading: Mapping[str, Any]
+    share: float
+    what: bytes
+    places: tuple[str, ...] = ()
+
+
+def carry_out(task: SearchTask) -> Record:
+    """Searches one recording; every error becomes a sentence in the result."""
+    with _ONE_SEARCH:
+        start = time.perf_counter()
+        try:
+            found = record("done") | _searched(task)
+        except InputError as error:
+            found = record("refused", str(error))
+        except (Exception, SystemExit) as error:  # it must not stop the others
+            found = record("broken", f"{type(error).__name__}: {error}")
+        return found | {"seconds": time.perf_counter() - start}
+
+
+def record(state: str, reason: str = "") -> Record:
+    """The record of a recording without a result; the reason on one line."""
+    return {"state": state, "reason": " ".join(reason.split()), "seconds": 0.0, "result": None, "model": None}
+
+
+def prepared(task: SearchTask) -> Record:
+    """`carry_out` in a process whose settings are still the defaults."""
+    enable_fast_start()
+    return carry_out(task)
+
+
+def _searched(task: SearchTask) -> Any:
+    for place in task.places:
+        imported(place)
+    model, search = pickle.loads(task.what)
+    source = task.source
+    recording = source if isinstance(source, Recording) else load(source, **task.reading)
+    found = search(model, *recording.split(task.share))
+    return {"result": found.to_dict(), "model": _model(found)}
+
+
+def _model(found: Any) -> str | None:
+    """The file of the final model as text; None where a search has none, or none that can be read again."""
+    if not hasattr(found, "save"):
+        return None
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(InputError):
+        return found.save(Path(folder) / "model.json").read_text(encoding="utf-8")
+    return None
+
+
+def places_of(model: Model, search: Search, *, far: bool) -> tuple[str, ...]:
+    """Files and modules of the user that a worker needs, for effects that are searched or in the model.
+
+    Args:
+        model: The model.
+        search: Function of it.
+        far: Whether the workers are those of a cluster; those of this machine import the main program.
+
+    Raises:
+        InputError: The main program is among them, and the workers are far.
+    """
+    subject: Any = search
+    while isinstance(subject, functools.partial):
+        subject = subject.func
+    subjects: Iterable[Any] = (subject, *CATALOG.values(), *map(type, model.mechanism.effects))
+    names = {s.__module__: s.__qualname__ for s in subjects if s.__module__.split(".")[0] != "rotflex_jax"}
+    own = [names.pop(main) for main in ("__main__", "__mp_main__") if main in names]
+    if own and far:
+        raise InputError(
+            f"{own[0]} was written in the main program, where the workers of a cluster cannot find it; move "
+            "it to a Python file and import it."
+        )
+    return tuple(map(_place, names))
+
+
+def _place(module: str) -> str:
+    """A module of a package by its name, a file that stands alone by its path."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return module if "." in module or file is None else str(Path(file).resolve())

@@ -1,0 +1,239 @@
+"""The command line: `rotflex demo`, `check`, `discover`, `compare` and others.
+
+Exit status 0 on any verdict, 2 on bad input with one sentence on stderr. Everything heavy is
+imported inside the commands, so that `rotflex --help` answers at once.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.cli.batch import check_each, search_each
+from rotflex_jax.cli.data import check, data_app
+from rotflex_jax.cli.experiment import experiment
+from rotflex_jax.cli.models import export, simulate
+from rotflex_jax.cli.reproduce import reproduce
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints import by_name
+from rotflex_jax.text.files import write_file
+
+if TYPE_CHECKING:
+    from rotflex_jax.recording import Recording
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Find the physics a model of a rotary flexible joint is missing, from a recording of it.",
+)
+
+# The class of every mistake in the arguments; typer does not export it by name.
+_UsageError: Any = typer.BadParameter.__bases__[0]
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and leave with its exit status."""
+    try:
+        status = app(
+            args=None if arguments is None else list(arguments),
+            prog_name="rotflex",
+            standalone_mode=False,
+        )
+    except InputError as error:
+        _refuse(str(error))
+    except _UsageError as error:
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "rotflex"
+        fault = error.format_message().rstrip(".")
+        _refuse(f"{fault}; {command} --help lists what can be given.")
+    except OSError as error:
+        _refuse(f"{error.filename or 'A file'} cannot be used: {error.strerror or error}.")
+    except KeyboardInterrupt:
+        print("rotflex: stopped", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _refuse(sentence: str) -> NoReturn:
+    print("rotflex: " + " ".join(sentence.split()), file=sys.stderr)
+    sys.exit(2)
+
+
+@app.callback(invoke_without_command=True)
+def _start(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        from rotflex_jax import __version__
+
+        print(__version__)
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.JsonFile = None) -> None:
+    """Show the loop on a recording that comes with the package, up to its report."""
+    given.check_writable(json_file=json_file, folder=report)
+    from rotflex_jax.data.datasets import demo_recording
+
+    train, test = demo_recording().split(0.7)
+    _discover(by_name.joint("paper"), [train], [test], report, json_file)
+
+
+def discover(
+    files: given.Files,
+    joint: given.JointName = "paper",
+    held_out: given.HeldOut = None,
+    split: given.Share = None,
+    input_column: given.InputColumn = None,
+    output_columns: given.OutputColumns = None,
+    degrees: given.Degrees = False,
+    Ts: given.SamplingPeriod = None,
+    time_column: given.TimeColumn = None,
+    accept: given.Accept = None,
+    report: given.ReportFolder = None,
+    json_file: given.JsonFile = None,
+    save_model: given.ModelFile = None,
+    each: given.Each = False,
+    scheduler: given.Scheduler = None,
+    workers: given.Workers = None,
+) -> None:
+    """Find the effects that the model lacks, with evidence on data the fit never saw."""
+    check_each(
+        each, {"scheduler": scheduler, "workers": workers}, {"held-out": held_out, "save-model": save_model}
+    )
+    share = given.check_split(split, held_out or [])
+    given.check_distinct(files, held_out or [])
+    given.check_writable(json_file=json_file, folder=report)
+    given.check_writable(json_file=save_model)
+    model, options = by_name.model(joint), (degrees, Ts, time_column, accept)
+    columns = given.Columns(input_column, output_columns, *options, model.mechanism)
+    if each:
+        search_each(model, files, columns, share, report, json_file, scheduler, workers)
+        return
+    train, test = columns.load_parts(files, held_out or [], share)
+    _discover(model, train, test, report, json_file, save_model)
+
+
+def compare(
+    files: given.Files,
+    methods: given.Methods = None,
+    quick: given.Quick = False,
+    joint: given.JointName = "paper",
+    held_out: given.HeldOut = None,
+    split: given.Share = None,
+    input_column: given.InputColumn = None,
+    output_columns: given.OutputColumns = None,
+    degrees: given.Degrees = False,
+    Ts: given.SamplingPeriod = None,
+    time_column: given.TimeColumn = None,
+    accept: given.Accept = None,
+    report: given.ReportFolder = None,
+    json_file: given.JsonFile = None,
+) -> None:
+    """Compare methods on the same data by their free runs over held-out data."""
+    share = given.check_split(split, held_out or [])
+    given.check_distinct(files, held_out or [])
+    given.check_writable(json_file=json_file, folder=report)
+    if quick and methods is not None:
+        raise InputError(
+            "Options --quick and --methods were both given, but each says which methods to run; give one."
+        )
+    mechanism, names = by_name.joint(joint), methods if methods is None else methods.split(",")
+    from rotflex_jax.compare import QUICK
+    from rotflex_jax.compare.method import selected_methods
+
+    wanted = selected_methods(QUICK if quick else names)  # an unknown one is refused before any file is read
+    options = (degrees, Ts, time_column, accept)
+    columns = given.Columns(input_column, output_columns, *options, mechanism)
+    train, test = columns.load_parts(files, held_out or [], share)
+    terminal.print_findings([*train, *test])
+    from rotflex_jax.runtime.xla import enable_fast_start
+
+    enable_fast_start()
+    import rotflex_jax as rf
+
+    with terminal.progress("Comparing") as step:
+        result = rf.compare(train, wanted, mechanism=mechanism, test=test, progress=step)
+    _give(result, terminal.print_comparison, json_file)
+    _report(result, report, json_file)
+
+
+def effects(
+    as_json: given.AsJson = False,
+) -> None:
+    """List the effects that the search knows, with equations and parameters."""
+    from rotflex_jax.effects import CATALOG
+
+    descriptions = [kind.describe() for kind in CATALOG.values()]
+    if as_json:
+        print(json.dumps({"schema": 1, "effects": descriptions}, indent=2))
+    else:
+        terminal.print_effects(descriptions)
+
+
+def _discover(
+    mechanism: Any,
+    train: "list[Recording]",
+    test: "list[Recording]",
+    report: Path | None,
+    json_file: Path | None,
+    save_model: Path | None = None,
+) -> None:
+    terminal.print_findings([*train, *test])
+    from rotflex_jax.runtime.xla import enable_fast_start
+
+    enable_fast_start()
+    import rotflex_jax as rf
+
+    with terminal.progress("Searching for missing effects") as step:
+        result = rf.discover(mechanism, train, test, progress=step)
+    _give(result, terminal.print_discovery, json_file)
+    if save_model is not None:
+        result.save(save_model)
+    _report(result, report, json_file)
+
+
+def _give(result: Any, show: Callable[[Any], None], json_file: Path | None) -> None:
+    """A result as JSON on stdout, or for a person and as JSON in a file."""
+    if json_file != given.STDOUT:
+        show(result)
+    if json_file is None:
+        return
+    text = json.dumps(result.to_dict(), indent=2)
+    if json_file == given.STDOUT:
+        print(text, flush=True)
+    else:
+        write_file(json_file, text + "\n")
+
+
+def _report(result: Any, folder: Path | None, json_file: Path | None) -> None:
+    """Write the report, last of all: whatever fails in it costs nothing of a result given before.
+
+    Raises:
+        InputError: It could not be written, with the reason.
+    """
+    if folder is None:
+        return
+    try:
+        with terminal.progress("Writing the report"):
+            page = result.report(folder)
+    except Exception as error:
+        if isinstance(error, OSError):
+            reason = f"{error.filename or folder} cannot be used: {error.strerror or error}"
+        else:
+            reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"The report could not be written: {reason.rstrip('.')}.") from error
+    terminal.message(f"Report: {page}", error=json_file == given.STDOUT)
+
+
+# In the order in which a newcomer needs them.
+for _command in (demo, check, discover, compare, simulate, experiment, export, effects, reproduce):
+    app.command()(_command)
+app.add_typer(data_app, name="data")

@@ -1,0 +1,313 @@
+"""Every option of the command line with its help, and the checks that several commands share."""
+
+import dataclasses
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints.by_name import JOINTS
+
+if TYPE_CHECKING:
+    from rotflex_jax.recording import Recording
+
+
+STDOUT = Path("-")
+EXPORT_FORMS = ("c", "latex", "text", "statespace")
+
+Files = Annotated[
+    list[Path],
+    typer.Argument(metavar="FILE...", help="Recordings: .csv, .tsv, .mat, .npz, .parquet."),
+]
+JointName = Annotated[
+    str,
+    typer.Option(
+        "--joint",
+        "--model",
+        metavar="NAME",
+        help=f"Model to start from: {', '.join(JOINTS)}, parameters as paper:stiffness=1.2; your own as "
+        "FILE.py:NAME; or a saved MODEL.json.",
+    ),
+]
+InputColumn = Annotated[
+    str | None, typer.Option("--input", metavar="COLUMN", help="Column of the motor voltage in volts.")
+]
+OutputColumns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--output",
+        metavar="COLUMN",
+        help="Column of theta, and once more for that of alpha; or CHANNEL=COLUMN.",
+    ),
+]
+Degrees = Annotated[bool, typer.Option("--degrees", help="Angles in the files are in degrees.")]
+SamplingPeriod = Annotated[
+    float | None,
+    typer.Option("--Ts", metavar="SECONDS", help="Sampling period, where no column has the time."),
+]
+TimeColumn = Annotated[
+    str | None, typer.Option("--time", metavar="COLUMN", help="Column of the time in seconds.")
+]
+Accept = Annotated[
+    list[str] | None,
+    typer.Option("--accept", metavar="FAULT", help="Accept a named fault of the data, such as saturated."),
+]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - means stdout."),
+]
+ModelFile = Annotated[
+    Path | None,
+    typer.Option("--save-model", metavar="FILE", help="Write the fitted model as JSON for later use."),
+]
+ReportFolder = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FOLDER", help="Write a self-contained HTML report here."),
+]
+HeldOut = Annotated[
+    list[Path] | None,
+    typer.Option("--held-out", metavar="FILE", help="Recording held out for validation; may be repeated."),
+]
+Share = Annotated[
+    float | None,
+    typer.Option("--split", metavar="SHARE", help="Share of each FILE to fit, the rest is held out: 0.7."),
+]
+Each = Annotated[
+    bool,
+    typer.Option("--each", help="Search each FILE by itself, many at once; --report has the summary."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="With --each: Dask scheduler whose workers search."),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(metavar="COUNT", help="With --each: processes here; by cores and memory unless given."),
+]
+
+# rotflex compare
+Methods = Annotated[str | None, typer.Option(metavar="A,B", help="Methods to compare; all unless given.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Only methods without a long search.")]
+
+# rotflex effects
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+# rotflex data
+DataNames = Annotated[list[str], typer.Argument(metavar="NAME...", help="Names that `list` shows.")]
+
+# rotflex simulate
+OneFile = Annotated[Path, typer.Argument(metavar="FILE", help="Recording to simulate.")]
+AddedEffects = Annotated[
+    list[str] | None,
+    typer.Option(metavar="EFFECT@PORT", help="Add an effect: coulomb@hub or coulomb@hub:level=0.03."),
+]
+FittedBefore = Annotated[
+    list[Path] | None, typer.Option(metavar="FILE", help="Fit the model to this recording before.")
+]
+SimulationFile = Annotated[
+    Path | None, typer.Option(metavar="CSV", help="Write what was measured and simulated.")
+]
+
+# rotflex export
+ExportedModel = Annotated[
+    str,
+    typer.Argument(metavar="MODEL", help="File that --save-model has written, FILE.py:NAME, or a preset."),
+]
+ExportForm = Annotated[str, typer.Option("--to", metavar="FORM", help=f"One of {', '.join(EXPORT_FORMS)}.")]
+ExportFile = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE", help="Write here instead of to stdout.")
+]
+ExportPeriod = Annotated[
+    float | None,
+    typer.Option(
+        "--Ts",
+        metavar="SECONDS",
+        help="Sampling period of the C code (that of the model's data unless given) "
+        "or of a discrete state space (continuous unless given).",
+    ),
+]
+Prefix = Annotated[str, typer.Option(metavar="NAME", help="What the names in the C code begin with.")]
+OwnEffects = Annotated[
+    list[str] | None,
+    typer.Option("--with", metavar="FILE.py", help="Python file that registers effects of your own."),
+]
+
+# rotflex experiment
+AmbiguousFiles = Annotated[
+    list[Path],
+    typer.Option("--fit", metavar="FILE", help="Recording in which the two look alike; may be repeated."),
+]
+Between = Annotated[
+    tuple[str, str],
+    typer.Option("--between", metavar="EFFECT@PORT EFFECT@PORT", help="The two: delay@input lag@input."),
+]
+Voltage = Annotated[
+    float, typer.Option("--voltage", metavar="V", help="Largest voltage the amplifier gives.")
+]
+Slew = Annotated[float, typer.Option("--slew", metavar="V/S", help="Fastest change of the voltage.")]
+Travel = Annotated[float, typer.Option("--travel", metavar="DEG", help="Largest servo angle from the start.")]
+Deflection = Annotated[
+    float, typer.Option("--deflection", metavar="DEG", help="Largest deflection of the arm.")
+]
+Length = Annotated[float, typer.Option(metavar="SECONDS", help="Length of the experiment.")]
+RankOnly = Annotated[bool, typer.Option("--rank-only", help="Rank the standard inputs, design none.")]
+FoundBefore = Annotated[
+    list[str] | None,
+    typer.Option("--add", metavar="EFFECT@PORT", help="Effect that was found before; may be repeated."),
+]
+InputFile = Annotated[Path | None, typer.Option(metavar="CSV", help="Write the input: t,voltage.")]
+PlotFile = Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the input and what it shows.")]
+
+# rotflex reproduce
+PaperData = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--data",
+        metavar="FILE",
+        help="Recording to fit instead of a simulation, or the data set rotflex; may be repeated.",
+    ),
+]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting; --list names them; may be repeated."),
+]
+PageFolder = Annotated[
+    Path, typer.Option("--out", metavar="FOLDER", help="Write the figures and the page here.")
+]
+ListSettings = Annotated[bool, typer.Option("--list", help="List all settings with their reasons, and stop.")]
+Scenario = Annotated[str | None, typer.Option(metavar="NAME", help="Simulated machine: S0 to S7, S5s, S5p.")]
+Seed = Annotated[int | None, typer.Option(metavar="NUMBER", help="Of the random numbers.")]
+GreyBox = Annotated[
+    bool, typer.Option("--grey-box", help="Fit the equations with friction too; takes a minute.")
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """How to read a recording: the options that `discover` and `simulate` share."""
+
+    input: str | None
+    outputs: Sequence[str] | None
+    degrees: bool
+    Ts: float | None
+    time: str | None
+    accept: Sequence[str] | None
+    mechanism: Any = None  # whose channels are read where the options name none
+
+    def __post_init__(self) -> None:
+        if self.Ts is not None and self.time is not None:
+            raise InputError(
+                "--Ts and --time were both given, but the sampling period comes either from a "
+                "column or from a number; give one of the two."
+            )
+        if self.Ts is not None and not self.Ts > 0:
+            raise InputError(
+                f"--Ts was given {self.Ts:g}, but a sampling period is a positive number of "
+                "seconds; give for instance --Ts 0.002."
+            )
+
+    def load(self, file: Path) -> "Recording":
+        """The recording in a file."""
+        if not file.exists():
+            raise InputError(f"{file} does not exist; give the path of a recording.")
+        if file.is_dir():
+            raise InputError(f"{file} is a folder, but a recording is one file; name the file.")
+        from rotflex_jax.data import load
+
+        try:
+            return load(file, **self.reading())
+        except InputError as error:
+            raise InputError(as_options(str(error))) from None
+
+    def reading(self) -> dict[str, Any]:
+        """The same as arguments of `rotflex_jax.load`."""
+        from rotflex_jax.mechanism.linear import output_units
+
+        units = {} if self.mechanism is None else output_units(self.mechanism)
+        return {
+            "input": self.input,
+            "outputs": _channels(self.outputs or (), tuple(units)),
+            "units": units,
+            "degrees": self.degrees,
+            "Ts": self.Ts,
+            "time": self.time,
+            "accept": tuple(self.accept or ()),
+        }
+
+    def load_parts(
+        self, files: Sequence[Path], held_out: Sequence[Path], share: float
+    ) -> "tuple[list[Recording], list[Recording]]":
+        """Recordings to fit and held-out ones: files of their own, or the end of each file."""
+        train = [self.load(file) for file in files]
+        if held_out:
+            return train, [self.load(file) for file in held_out]
+        parts = [recording.split(share) for recording in train]
+        return [a for a, _ in parts], [b for _, b in parts]
+
+
+def _channels(outputs: Sequence[str], model: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
+    """`theta=servo` names the channel too; plain column names come in the order of the model's channels."""
+    if outputs and all("=" in text for text in outputs):
+        return dict(text.split("=", 1) for text in outputs)
+    if not outputs and model:
+        return dict(zip(model, model, strict=True))
+    named = model and len(outputs) == len(model)
+    return dict(zip(model, outputs, strict=True)) if named else outputs or None
+
+
+def as_options(sentence: str) -> str:
+    """A sentence about arguments of `rotflex_jax.load`, in terms of the options of the command line."""
+    sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
+    sentence = sentence.replace("degrees=True", "--degrees").replace("degrees=False", "no --degrees")
+    sentence = re.sub(r"\b(input|time|Ts)=(?=\d)", r"--\1 ", sentence)
+    sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
+    sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
+    return re.sub(r"Argument `(\w+)`", r"--\1", sentence)
+
+
+def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:
+    """Refuse a file that is given twice: the error on data that were fitted proves nothing."""
+    seen: dict[str, Path] = {}
+    for file in (*files, *held_out):
+        place = os.path.realpath(file)  # also where links go round in a circle
+        if place in seen:
+            raise InputError(
+                f"{file} was given twice, but a recording must not count twice nor be both fitted "
+                "and held out; name each file once."
+            )
+        seen[place] = file
+
+
+def check_split(split: float | None, held_out: Sequence[Path]) -> float:
+    """The share of each file to fit."""
+    if split is None:
+        return 0.7
+    if held_out:
+        raise InputError(
+            "--split and --held-out were both given, but the held-out data are either the end of "
+            "each FILE or files of their own; give one of the two."
+        )
+    if not 0 < split < 1:
+        raise InputError(
+            f"--split was given {split:g}, but it is the share of each FILE to fit and must "
+            "lie between 0 and 1; give for instance --split 0.7."
+        )
+    return split
+
+
+def check_writable(*, json_file: Path | None = None, folder: Path | None = None) -> None:
+    """Refuse a place that nothing can be written to, while nothing has been computed yet."""
+    if json_file not in (None, STDOUT):
+        if json_file.is_dir():
+            raise InputError(f"{json_file} is a folder, but a file is written; name the file.")
+        if not json_file.absolute().parent.is_dir():
+            raise InputError(
+                f"{json_file} cannot be written, since the folder {json_file.parent} does not "
+                "exist; create it or name another."
+            )
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file, but the report needs a folder; name another.")

@@ -1,0 +1,70 @@
+"""`rotflex discover --each`: every file by itself, many at once."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.errors import InputError
+from rotflex_jax.text.files import write_file
+
+SUMMARY_FOLDER = Path("rotflex-each")
+
+
+def check_each(each: bool, only: Mapping[str, Any], never: Mapping[str, Any]) -> None:
+    """Refuse options that go only with --each, or never."""
+    for name, value in (never if each else only).items():
+        if value is None or value == []:
+            continue
+        if each:
+            raise InputError(
+                f"--{name} and --each were both given, but with --each every FILE is split and gets a "
+                "model of its own; leave one of the two out."
+            )
+        raise InputError(
+            f"--{name} was given, but one search of all FILEs together runs in this process; add --each to "
+            "search each by itself."
+        )
+
+
+def search_each(
+    model: Any,
+    files: Sequence[Path],
+    columns: given.Columns,
+    share: float,
+    folder: Path | None,
+    json_file: Path | None,
+    scheduler: str | None,
+    workers: int | None,
+) -> None:
+    """Search every file, write the summary, show it."""
+    from rotflex_jax.batch import fleet
+    from rotflex_jax.runtime.xla import enable_fast_start
+
+    if workers == 0:
+        enable_fast_start()  # this process then does the work
+    with terminal.progress("Searching") as step:
+        result = fleet(
+            model,
+            files,
+            folder=folder or SUMMARY_FOLDER,
+            scheduler=scheduler,
+            workers=workers,
+            split=share,
+            progress=lambda line: step(given.as_options(line)),
+            **columns.reading(),
+        )
+    if len(result.failed) == len(files):
+        raise InputError(
+            f"No search of {len(files)} gave an answer; the first, {result.rows[0].name}: "
+            f"{given.as_options(result.rows[0].reason)}"
+        )
+    text = json.dumps(result.to_dict(), indent=2)
+    if json_file == given.STDOUT:
+        print(text)
+    else:
+        terminal.print_fleet(result, given.as_options)
+        if json_file is not None:
+            write_file(json_file, text + "\n")
+    terminal.message(f"Summary: {result.page}", error=json_file == given.STDOUT)

@@ -1,0 +1,79 @@
+"""`rotflex check`: quality of recordings; `rotflex data`: the public ones, listed and fetched."""
+
+import typer
+
+from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints import by_name
+
+# A shorter recording has too few reversals to fit and to validate on [s].
+SHORTEST_FOR_SEARCH = 5.0
+
+data_app = typer.Typer(help="Public recordings: list them, fetch them.")
+
+
+@data_app.callback(invoke_without_command=True)
+def _start(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@data_app.command("list")
+def data_list() -> None:
+    """List the public recordings: those that can be fetched, then those to get by hand."""
+    from rotflex_jax.data.datasets import list_datasets
+    from rotflex_jax.data.registry import BY_HAND
+
+    rows = [(d.name, d.about, d.units, d.licence, d.source) for d in list_datasets()]
+    terminal.print_rows(("name", "what", "units", "licence", "source"), rows)
+    print("\nTo get by hand, and to read with rf.load from what nonlinear_benchmarks gives:\n")
+    for d in BY_HAND.values():
+        print(f"{d.name}: {d.about}\n  {d.address}\n  nonlinear_benchmarks.{d.loader}")
+
+
+@data_app.command("fetch")
+def data_fetch(
+    names: given.DataNames,
+) -> None:
+    """Fetch public recordings into the user's cache folder, check their hash, print their paths."""
+    from rotflex_jax.data.datasets import DATASETS, fetch
+    from rotflex_jax.data.registry import BY_HAND
+
+    for name in names:
+        by_name.choose(name, (*DATASETS, *BY_HAND), "data set")
+    for name in names:
+        with terminal.progress(f"Fetching {name}"):
+            paths = fetch(name)
+        for path in paths:
+            print(path)
+
+
+def check(
+    files: given.Files,
+    joint: given.JointName = "paper",
+    input_column: given.InputColumn = None,
+    output_columns: given.OutputColumns = None,
+    degrees: given.Degrees = False,
+    Ts: given.SamplingPeriod = None,
+    time_column: given.TimeColumn = None,
+    accept: given.Accept = None,
+) -> None:
+    """Say what is in a recording and what is wrong with it; takes seconds."""
+    given.check_distinct(files, [])
+    model = by_name.model(joint)
+    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    from rotflex_jax.fit.signs import check_signs
+
+    for file in files:
+        recording = columns.load(file)
+        terminal.print_recording(recording)
+        if recording.duration < SHORTEST_FOR_SEARCH:
+            terminal.message(
+                f"note: {recording.duration:g} s are little for a search; ten to twenty with many reversals "
+                "are right."
+            )
+        try:
+            check_signs(model, [recording])
+        except InputError as error:
+            raise InputError(f"{file}: {error}") from None
+        terminal.message(f"The signs of {' and '.join(model.mechanism.channels)} are those of {joint}.")

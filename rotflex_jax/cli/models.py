@@ -1,0 +1,92 @@
+"""`rotflex simulate` and `rotflex export`: a model's free run, and a saved model for use elsewhere."""
+
+import json
+
+from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints import by_name
+from rotflex_jax.text.files import write_file
+
+
+def simulate(
+    file: given.OneFile,
+    joint: given.JointName = "paper",
+    add: given.AddedEffects = None,
+    fit: given.FittedBefore = None,
+    save: given.SimulationFile = None,
+    save_model: given.ModelFile = None,
+    input_column: given.InputColumn = None,
+    output_columns: given.OutputColumns = None,
+    degrees: given.Degrees = False,
+    Ts: given.SamplingPeriod = None,
+    time_column: given.TimeColumn = None,
+    accept: given.Accept = None,
+) -> None:
+    """Simulate a recording in free run and compare with what was measured."""
+    given.check_distinct([file], fit or [])
+    for target in (save, save_model):
+        given.check_writable(json_file=target)
+    model = by_name.model(joint, add or ())
+    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    recording = columns.load(file)
+    train = [columns.load(other) for other in fit or []]
+    terminal.print_findings([recording, *train])
+    from rotflex_jax.runtime.xla import enable_fast_start
+
+    enable_fast_start()
+    import rotflex_jax as rf
+    from rotflex_jax.export import Saved, save as save_to
+
+    saved = Saved(model, Ts=recording.Ts, n_init=recording.n_init)
+    if train:
+        with terminal.progress("Fitting"):
+            fitted = rf.fit(model, train)
+        model, first = fitted.model, train[0]
+        saved = Saved(model, fitted.parameters, fitted.covariance, fitted.free_names, first.Ts, first.n_init)
+    y, y_hat = model.measured(recording), model.simulate(recording)
+    rmse = rf.metrics.rmse(y, y_hat, recording.n_init).tolist()
+    units = {name: terminal.unit_of(recording, name) for name in model.mechanism.channels}
+    errors = dict(zip(units, rmse, strict=True))
+    console = terminal.output()
+    console.print(terminal.error_table([("RMS error of the free run", errors)], units))
+    explained = zip(units, rf.metrics.fit_percent(y, y_hat, recording.n_init), strict=True)
+    terminal.message(f"Fit, where 100 % is perfect: {', '.join(f'{c} {p:.1f} %' for c, p in explained)}")
+    if save is not None:
+        terminal.save_simulation(save, recording, dict(zip(units, y_hat.T, strict=True)))
+    if save_model is not None:
+        save_to(saved, save_model)
+
+
+def export(
+    model: given.ExportedModel,
+    to: given.ExportForm,
+    out: given.ExportFile = None,
+    Ts: given.ExportPeriod = None,
+    prefix: given.Prefix = "rotflex",
+    effects: given.OwnEffects = None,
+) -> None:
+    """Give a model as C code for a controller, as equations, or as state space."""
+    form = by_name.choose(to, given.EXPORT_FORMS, "form of export")
+    given.check_writable(json_file=out)
+    from rotflex_jax import export as forms
+    from rotflex_jax.joints.by_name import imported
+
+    for file in effects or []:
+        imported(file)
+    subject, period = by_name.model(model), Ts
+    if form == "c" and period is None and model.endswith(".json"):
+        period = forms.read(model).Ts
+    if form == "c" and period is None:
+        raise InputError(
+            f"{model} does not say how its data were sampled, but C code needs a sampling period; give --Ts."
+        )
+    if form == "c":
+        text = forms.to_c(subject, float(period or 0), prefix)
+    elif form == "statespace":
+        text = json.dumps(forms.state_space(subject, period).to_dict(), indent=2) + "\n"
+    else:
+        text = forms.latex(subject) if form == "latex" else forms.text(subject)
+    if out is None or out == given.STDOUT:
+        print(text, end="")
+    else:
+        write_file(out, text)

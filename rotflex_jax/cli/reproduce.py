@@ -1,0 +1,119 @@
+"""`rotflex reproduce`: the experiment of the paper, simulated or on recordings."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints import by_name
+from rotflex_jax.text.files import write_file
+
+
+def reproduce(
+    out: given.PageFolder = Path("rotflex-reproduce"),
+    data: given.PaperData = None,
+    scenario: given.Scenario = None,
+    seed: given.Seed = None,
+    grey_box: given.GreyBox = False,
+    changes: given.Changes = None,
+    listed: given.ListSettings = False,
+    joint: given.JointName = "paper",
+    held_out: given.HeldOut = None,
+    split: given.Share = None,
+    input_column: given.InputColumn = None,
+    output_columns: given.OutputColumns = None,
+    degrees: given.Degrees = False,
+    Ts: given.SamplingPeriod = None,
+    time_column: given.TimeColumn = None,
+    accept: given.Accept = None,
+    json_file: given.JsonFile = None,
+) -> None:
+    """Run the experiment of the paper this started from: its figures, its model, and better ones."""
+    from rotflex_jax.reproduce.settings import Settings
+
+    if listed:
+        _list(Settings)
+        return
+    named = {"scenario": scenario, "seed": seed, "grey_box": grey_box or None}
+    settings = Settings().replace(_pairs(changes or []) | {k: v for k, v in named.items() if v is not None})
+    share = given.check_split(split, held_out or [])
+    given.check_writable(json_file=json_file, folder=out)
+    mechanism = by_name.joint(joint)
+    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
+    parts = _recordings(columns, data or [], held_out or [], share)
+    if parts and joint == "paper" and data == ["rotflex"]:
+        mechanism = by_name.joint("quanser_2002")  # the laboratory's own constants
+    from rotflex_jax.runtime.xla import enable_fast_start
+
+    enable_fast_start()
+    from rotflex_jax.reproduce import reproduce as run
+    from rotflex_jax.reproduce.page import headings, table, write
+    from rotflex_jax.reproduce.wording import headline
+
+    with terminal.progress("Reproducing") as step:
+        result = run(settings, *parts, joint=mechanism if parts else None, progress=step)
+        step("figures and page")
+        page = write(result, out)
+    terminal.print_findings([recording for part in parts for recording in part])
+    quiet = json_file == given.STDOUT
+    if quiet:
+        print(json.dumps(result.to_dict(), indent=2))
+    else:
+        console = terminal.output()
+        console.print(headline(result), style="bold", markup=False)
+        console.print("\nSquared error over the variance of the output (NMSE)", style="bold")
+        terminal.print_rows(("model", "fitted", *headings(result)), table(result))
+        online = f"Online, while it adapted: {result.adaptation.online:.3g}, which is no error of a model."
+        console.print(online, markup=False)
+        if json_file is not None:
+            write_file(json_file, json.dumps(result.to_dict(), indent=2) + "\n")
+    terminal.message(f"Page: {page}", error=quiet)
+
+
+def _pairs(texts: list[str]) -> dict[str, str]:
+    pairs = {}
+    for text in texts:
+        name, separator, value = (part.strip() for part in text.partition("="))
+        if not separator or not value:
+            raise InputError(f"--set was given {text!r}, but needs a name and a value; write --set Ts=0.05.")
+        pairs[name] = value
+    return pairs
+
+
+def _recordings(
+    columns: given.Columns, data: list[str], held_out: list[Path], share: float
+) -> tuple[Any, ...]:
+    """Recordings to fit and held-out ones; nothing for a simulation."""
+    if not data:
+        if columns.Ts is not None:
+            raise InputError(
+                "--Ts was given without --data, but it is the sampling period of a file without a time "
+                f"column; write --set Ts={columns.Ts:g} for that of the experiment."
+            )
+        if held_out:
+            raise InputError(
+                "--held-out was given without --data, but a simulation makes its own held-out data; "
+                "give --data too, or leave it out."
+            )
+        return ()
+    if data == ["rotflex"] and not Path("rotflex").exists():
+        from rotflex_jax.data.datasets import load_dataset
+
+        first, second = load_dataset("rotflex")
+        return [first], [columns.load(file) for file in held_out] or [second]
+    files = [Path(file) for file in data]
+    given.check_distinct(files, held_out)
+    train, test = columns.load_parts(files, held_out, share)
+    return train, test
+
+
+def _list(settings: Any) -> None:
+    from rotflex_jax.reproduce.machine import machine_rows
+
+    rows = []
+    for row in settings.table() + machine_rows(settings()):
+        default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple) else row["default"]
+        default = f"{default:.6g}" if isinstance(default, float) else default
+        rows.append((row["name"], f"{default} {row['unit']}".strip(), row["source"], row["why"]))
+    terminal.print_rows(("setting", "default", "source", "why"), rows)

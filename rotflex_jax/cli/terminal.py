@@ -1,0 +1,203 @@
+"""What the command line shows to a person: progress on stderr, results on stdout."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Real
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from rotflex_jax.text.numbers import digits, readable
+
+# Rows of a long table that are shown.
+LISTED_RECORDINGS = 60
+
+
+def output() -> Console:
+    """The console for results. Made on use, so that it follows a redirected stdout."""
+    console = Console(highlight=False, soft_wrap=True)
+    # A file or a pipe has no width of its own; 80 columns would break the tables.
+    return console if console.is_terminal else Console(highlight=False, soft_wrap=True, width=160)
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Callable[[str], None]]:
+    """Show what long work is doing: a spinner on a terminal, one line per step elsewhere.
+
+    Args:
+        title: What is shown until the work reports its first step.
+
+    Yields:
+        The function to call with one short phrase per step.
+    """
+    console = Console(stderr=True, highlight=False)
+    if not console.is_terminal:
+        yield lambda step: console.print(step, markup=False, soft_wrap=True)
+        return
+    with console.status(title) as status:
+        yield lambda step: status.update(escape(step))
+
+
+def _errors(errors: Mapping[str, float], units: Mapping[str, str]) -> list[str]:
+    return [_readable(errors.get(name), unit) for name, unit in units.items()]
+
+
+def _readable(value: float | None, unit: str) -> str:
+    return digits(None if value is None else readable(value, unit)[0])
+
+
+def error_table(rows: Sequence[tuple[str, Mapping[str, float]]], units: Mapping[str, str]) -> Table:
+    """A table of errors per channel; `rows` are (label, channel -> error [unit])."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("")
+    for channel, unit in units.items():
+        table.add_column(escape(f"{channel} [{readable(1.0, unit)[1]}]"), justify="right")
+    for label, errors in rows:
+        table.add_row(escape(label), *_errors(errors, units))
+    return table
+
+
+def estimate_line(name: str, estimate: Any) -> str:
+    """One fitted parameter with its 95 % interval."""
+    text = f"{name} = {digits(estimate.value, 4)} {estimate.unit}".rstrip()
+    low, high = estimate.ci95
+    if math.isfinite(low) and math.isfinite(high):
+        text += f"   95 %: {digits(low, 4)} .. {digits(high, 4)}"
+    return text
+
+
+def print_discovery(result: Any) -> None:
+    """Verdict, rounds, errors on held-out data and where the model failed."""
+    console = output()
+    units = {name: unit_of(result.test[0], name) for name in result.baseline.held_out_rmse}
+    console.print(result.verdict.label.upper(), style="bold", markup=False)
+    console.print(result.sentence, markup=False)
+    for count, added in enumerate(result.rounds, start=1):
+        console.print(f"\nRound {count}: {added.sentence}", markup=False)
+        if added.equation:
+            console.print(f"  {added.equation}", markup=False)
+        for name, estimate in added.parameters.items():
+            console.print(f"  {estimate_line(name, estimate)}", markup=False)
+        if added.equivalent:
+            others = ", ".join(f"{effect} at {port}" for effect, port in added.equivalent)
+            console.print(f"  These data cannot distinguish it from: {others}.", markup=False)
+    stages = [("baseline", result.baseline)]
+    stages += [(f"+ {added.effect} at {added.port}", added.stage) for added in result.rounds]
+    floor = ("noise floor of the sensor", result.noise_floor)
+    console.print("\nRMS error of a free run over the held-out data", style="bold")
+    console.print(error_table([*((n, s.held_out_rmse) for n, s in stages), floor], units))
+    seconds = digits(result.baseline.window_seconds)
+    console.print(f"\nThe same, restarted every {seconds} s", style="bold")
+    rows = [*((name, stage.held_out_rmse_windows) for name, stage in stages), floor]
+    console.print(error_table(rows, units))
+    if result.where:
+        console.print("\nWhere the baseline failed", style="bold")
+        for place in result.where:
+            console.print(f"- {place.statement}", markup=False)
+    for note in result.notes:
+        console.print(f"Note: {note}", markup=False)
+
+
+def print_comparison(result: Any) -> None:
+    """Methods side by side, best first."""
+    console = output()
+    console.print("Free runs over the held-out data", style="bold")
+    console.print(str(result), markup=False)
+
+
+def print_fleet(result: Any, reworded: Callable[[str], str]) -> None:
+    """One line a recording, and the counts."""
+    good = [row for row in result.rows if row.verdict]
+    rows = [
+        (
+            row.name,
+            row.verdict.replace("_", " "),
+            row.found or "-",
+            *(
+                " to ".join(_errors(end, {channel: unit})[0] for end in (row.before, row.after))
+                for channel, unit in result.units.items()
+            ),
+            f"{row.seconds:.0f}",
+        )
+        for row in good[:LISTED_RECORDINGS]
+    ]
+    errors = [f"{channel} [{readable(1.0, unit)[1]}]" for channel, unit in result.units.items()]
+    print_rows(("recording", "verdict", "found", *errors, "s"), rows)
+    for row in result.failed[:LISTED_RECORDINGS]:
+        message(f"{row.name} failed: {reworded(row.reason)}")
+    if len(good) > LISTED_RECORDINGS or len(result.failed) > LISTED_RECORDINGS:
+        message(f"The rest of the list is in {result.folder / 'summary.csv'}.")
+    message(str(result))
+
+
+def print_findings(recordings: Sequence[Any]) -> None:
+    """Findings that a user should check before trusting a result, once each, on stderr."""
+    seen: set[tuple[str, str, str]] = set()
+    for recording in recordings:
+        for finding in recording.findings:
+            key = (recording.source, finding.channel, finding.kind)
+            if finding.severity != "note" and key not in seen:
+                seen.add(key)
+                where = f"{recording.source}: " if recording.source else ""
+                message(f"Look at {where}{finding.message}", error=True)
+
+
+def print_recording(recording: Any) -> None:
+    """What was measured: extent, ranges, steps of the sensors, and everything that was noticed."""
+    about = f"{recording.N} samples, {recording.duration:g} s at {1 / recording.Ts:g} Hz"
+    message(f"{recording.source}: {about}" if recording.source else about)
+    signals = [(recording.input_name, recording.input_unit, recording.u)]
+    signals += zip(recording.channels, recording.units, recording.y.T, strict=True)
+    rows = []
+    for name, unit, x in signals:
+        limits = [_readable(float(end), unit) for end in (x.min(), x.max())]
+        step = _readable(recording.resolution.get(name), unit)
+        rows.append((name, readable(1.0, unit)[1], *limits, step))
+    print_rows(("signal", "unit", "from", "to", "step"), rows)
+    for finding in recording.findings:
+        message(f"{finding.severity}: {finding}")
+
+
+def message(text: str, *, error: bool = False) -> None:
+    """One line for a person."""
+    Console(stderr=error, highlight=False).print(text, markup=False, soft_wrap=True)
+
+
+def unit_of(recording: Any, channel: str) -> str:
+    """Unit of a channel."""
+    return recording.units[recording.channels.index(channel)]
+
+
+def save_simulation(file: Path, recording: Any, simulated: Mapping[str, Real[np.ndarray, " N"]]) -> None:
+    """Write time, input, measured and simulated outputs as CSV, in the units of the recording."""
+    names = ["t", recording.input_name, *recording.channels, *(f"{c}_simulated" for c in simulated)]
+    columns = np.column_stack([recording.t, recording.u, recording.y, *simulated.values()])
+    np.savetxt(file, columns, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+
+
+def print_rows(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A plain table of texts."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in headings:
+        table.add_column(heading)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    output().print(table)
+
+
+def print_effects(descriptions: Sequence[Mapping[str, Any]]) -> None:
+    """The catalogue of effects as a table."""
+    rows = []
+    for effect in descriptions:
+        parameters = (
+            f"{name} [{spec['unit']}]" if spec["unit"] else name
+            for name, spec in effect["parameters"].items()
+        )
+        cells = (effect["name"], effect["kind"], ", ".join(effect["ports"]), effect["equation"])
+        rows.append((*cells, ", ".join(parameters)))
+    print_rows(("effect", "kind", "ports", "equation", "parameters"), rows)

@@ -1,0 +1,435 @@
+"""Linear state spaces: from subspaces, and fitted to free runs."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import scipy
+from jaxtyping import Complex, Float
+
+from rotflex_jax.compare.evaluation import require_one_sampling_period, split_for_validation, validation_cost
+from rotflex_jax.compare.method import Fitted, Progress
+from rotflex_jax.fit.linear import factor
+from rotflex_jax.models.linear_system import LinearSystem
+from rotflex_jax.models.model import Model
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
+from rotflex_jax.recording import Recording
+
+
+@dataclasses.dataclass(frozen=True)
+class Subspace:
+    """A linear state-space model by a subspace method that is right in closed loop too.
+
+    Order and length of the past are those with the best free run over the last part of the training
+    recordings. Not for coarse sensors at a high sampling rate alone: the regression minimises the
+    error of the next sample, and `LinearStateSpace` goes on from here to the free run.
+
+    Source: A. Chiuso, The role of vector autoregressive modeling in predictor-based subspace
+    identification, Automatica 43, 2007 (PBSIDopt).
+
+    Attributes:
+        orders: Numbers of states to choose from.
+        pasts: Samples of the past to choose from.
+        share: Share of each training recording to learn from; the rest decides.
+    """
+
+    name: str = "subspace"
+    title: str = "a linear state space, by a subspace method"
+    family: str = "linear"
+    orders: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8)
+    pasts: tuple[int, ...] = (8, 16, 32, 64)
+    share: float = 0.7
+
+    def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
+        """Takes no notice of the model."""
+        found, past = chosen_system(train, self.orders, self.pasts, self.share, say)
+        note = f"order {found.order}, past of {past} samples"
+        return Fitted(found, free_numbers(found), note, found.predict)
+
+
+def free_numbers(system: LinearSystem) -> int:
+    """Numbers of the behaviour from input to outputs, offsets included, whatever the coordinates."""
+    n, C = system.order, len(system.C)
+    return n * (C + 1) + 2 * C
+
+
+def chosen_system(
+    train: Sequence[Recording], orders: Sequence[int], pasts: Sequence[int], share: float, say: Progress
+) -> tuple[LinearSystem, int]:
+    """The system whose order and past are best in free run within the training recordings, and its past."""
+    require_one_sampling_period(train, "a sampled system")
+    first, last = split_for_validation(train, share)
+    best, least = (orders[0], pasts[0]), np.inf
+    for past in (p for p in pasts if p < min(r.N for r in first) // 8):
+        candidates = subspace(first, past, orders)
+        for n, system in candidates.items():
+            cost = validation_cost(system, last)
+            if cost < least:
+                best, least = (n, past), cost
+        say(f"past {past}: log error {least:.2f}")
+    n, past = best
+    return subspace(train, past, (n,))[n], past
+
+
+def subspace(recordings: Sequence[Recording], past: int, orders: Sequence[int]) -> dict[int, LinearSystem]:
+    """Systems of several orders from one decomposition, by order.
+
+        y[k] = sum over i of M_i z[k-i] + D [u[k], 1] + e[k],  z = (u, y),
+        M_i = C (A - K C)^(i-1) [B - K D, K]
+
+    The M_i of a long regression, stacked as an observability matrix times the past, have the states as
+    their strongest right singular vectors; with these the system is a linear regression.
+
+    Args:
+        recordings: All with the same sampling period.
+        past: Samples that the regression looks back.
+        orders: Numbers of states; those beyond what the data carry are left out.
+    """
+    mean, size = _sizes(recordings)
+    Z, Y, U, ends = [], [], [], []
+    for r in recordings:
+        z = (np.column_stack([r.u, r.y]).astype(float) - mean) / size
+        lags = np.lib.stride_tricks.sliding_window_view(z, past, axis=0)[:-1]  # (N - p, 1 + C, p)
+        Z.append(np.swapaxes(lags, 1, 2)[:, ::-1].reshape(len(z) - past, -1))  # newest first
+        Y.append(z[past:, 1:])
+        U.append(np.column_stack([z[past:, 0], np.ones(len(z) - past)]))
+        ends.append(len(z) - past)
+    Ys = np.vstack(Y)
+    C, P = Ys.shape[1], Z[0].shape[1]
+    # All that follows needs only the triangular factor of the rows, which is small.
+    R = factor(np.hstack([np.vstack(Z), np.vstack(U), Ys]))
+    M = np.linalg.lstsq(R[:, : P + 2], R[:, P + 2 :], rcond=1e-10)[0][:P].T.reshape(C, past, 1 + C)
+    # Rows of block i predict i samples ahead from what is known now: the newest i lags have left.
+    stacked = np.zeros((past, C, past, 1 + C))
+    for i in range(past):
+        stacked[i, :, : past - i] = M[:, i:]
+    stacked = stacked.reshape(past * C, past * (1 + C))
+    RZ = R[:P, :P]
+    _, s, V = np.linalg.svd(stacked @ RZ.T, full_matrices=False)
+    states = np.linalg.lstsq(RZ, np.eye(P), rcond=1e-12)[0]
+    found = {}
+    for n in (n for n in orders if n <= min(len(s), past * C) and s[n - 1] > 1e-12 * s[0]):
+        T = (states @ V[:n].T) * np.sqrt(s[:n])
+        found[n] = _system([z @ T for z in Z], Y, U, mean, size, recordings[0].Ts)
+    return found
+
+
+def _system(
+    X: list[np.ndarray],
+    Y: list[np.ndarray],
+    U: list[np.ndarray],
+    mean: np.ndarray,
+    size: np.ndarray,
+    Ts: float,
+) -> LinearSystem:
+    """The system with given states, by two regressions; in the units of the data."""
+    n = X[0].shape[1]
+    x, y, u = np.vstack(X), np.vstack(Y), np.vstack(U)
+    CD = _regression(np.hstack([x, u]), y)
+    C, D = CD[:, :n], CD[:, n:]
+    e = [yi - np.hstack([xi, ui]) @ CD.T for xi, yi, ui in zip(X, Y, U, strict=True)]
+    now = np.vstack([np.hstack([xi, ui, ei])[:-1] for xi, ui, ei in zip(X, U, e, strict=True)])
+    nxt = np.vstack([xi[1:] for xi in X])
+    ABK = _regression(now, nxt)
+    A, B, K = ABK[:, :n], ABK[:, n : n + 2], ABK[:, n + 2 :]
+    su, sy = size[0], size[1:]
+    # Back from numbers about their means and of size one.
+    B = np.column_stack([B[:, 0] / su, B[:, 1] - B[:, 0] * mean[0] / su])
+    D = np.column_stack([D[:, 0] / su, D[:, 1] - D[:, 0] * mean[0] / su]) * sy[:, None]
+    D[:, 1] += mean[1:]
+    return LinearSystem(A, B, C * sy[:, None], D, K / sy, Ts)
+
+
+def _regression(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Matrix W with y = W x, row by row."""
+    R = factor(np.hstack([x, y]))
+    P = x.shape[1]
+    return np.linalg.lstsq(R[:, :P], R[:, P:], rcond=None)[0].T
+
+
+def _sizes(recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the input and the outputs."""
+    z = np.vstack([np.column_stack([r.u, r.y]) for r in recordings]).astype(float)
+    size = z.std(axis=0)
+    return z.mean(axis=0), np.where(size > 0, size, 1.0)
+
+
+# A pole closer to one than this cannot be distinguished from an integrator by any recording.
+LEAST_DECAY = 1e-9
+# Largest step of the logarithms of decay and angle of a pole.
+LARGEST_POLE_STEP = 1.0
+# A step that changes the sum over channels of log mean e^2 by less is not taken.
+LOG_COST_TOLERANCE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Modes:
+    """A sum of modes and an offset.
+
+        x_i+ = p_i x_i + u,  x_i[0] = xi_ir in recording r,    y_c = offset_c + sum over i of Re(g_ci x_i)
+
+    Attributes:
+        p: Poles (n,), one of each pair.
+        g: Residues (C, n), real where the pole is.
+        offset: (C,).
+        xi: First states (R, n), real where the pole is.
+    """
+
+    p: Complex[np.ndarray, " n"]
+    g: Complex[np.ndarray, "C n"]
+    offset: Float[np.ndarray, " C"]
+    xi: Complex[np.ndarray, "R n"]
+
+    @classmethod
+    def begun(cls, poles: Sequence[complex], recordings: Sequence[Recording]) -> "Modes":
+        """Residues and first states for given poles, by least squares one after the other."""
+        p = np.array(poles, complex)
+        n, R, C = len(p), len(recordings), recordings[0].y.shape[1]
+        y = np.concatenate([r.y for r in recordings]).astype(float)
+        empty = cls(p, np.zeros((C, n), complex), np.zeros(C), np.zeros((R, n), complex))
+        forced, free = empty._forced(recordings), empty._free(recordings)
+        columns = [_pair(forced), np.ones((len(y), 1)), _by_recording(_pair(free), recordings)]
+        W = _least_norm(np.hstack(columns), y)
+        g = _complex(W[: 2 * n].T, p)
+        # With the residues known, one first state serves all channels.
+        e = y - np.stack([(forced @ g_c).real for g_c in g], axis=1) - W[2 * n]
+        size = np.maximum(y.std(axis=0), 1e-300)
+        rows = [_by_recording(_pair(free * g_c), recordings) / s for g_c, s in zip(g, size, strict=True)]
+        xi = _least_norm(np.vstack(rows), (e / size).T.reshape(-1, 1))[:, 0].reshape(R, 2 * n)
+        return dataclasses.replace(empty, g=g, offset=W[2 * n], xi=_complex(xi, p))
+
+    def fitted(self, recordings: Sequence[Recording], max_steps: int) -> "Modes":
+        """The modes with the least `sum over channels of N/2 log mean e^2` of free runs."""
+        n = len(self.p)
+
+        def cost(modes: Modes) -> float:
+            with np.errstate(all="ignore"):
+                return _log_cost(modes._errors(recordings))
+
+        def linearised(modes: Modes) -> NormalEquations:
+            # Errors in units of their own size have the gradient of the logarithm.
+            e = modes._errors(recordings)
+            size = np.sqrt(np.mean(e**2, axis=0)) + 1e-300
+            J = -modes._slopes(recordings) / size[:, None]
+            equations = NormalEquations.of(J.reshape(-1, J.shape[2]), (e / size).ravel())
+            return equations._replace(costs=np.array([_log_cost(e)]))
+
+        limit = np.full(2 * n * (1 + len(self.g) + len(self.xi)) + len(self.g), np.inf)
+        limit[: 2 * n] = LARGEST_POLE_STEP
+        rules = Rules(enough=LOG_COST_TOLERANCE / 2 * sum(r.N for r in recordings))
+        return minimise(
+            linearised, self, rules, limit=limit, cost=cost, move=Modes._moved, max_steps=max_steps
+        ).x
+
+    def system(self, Ts: float) -> LinearSystem:
+        """The same as a state space with real numbers."""
+        real = np.imag(self.p) == 0
+        blocks = [
+            np.array([[p.real]]) if r else np.array([[p.real, -p.imag], [p.imag, p.real]])
+            for p, r in zip(self.p, real, strict=True)
+        ]
+        B = np.concatenate([[1.0] if r else [1.0, 0.0] for r in real])
+        C = np.column_stack(
+            [c for g, r in zip(self.g.T, real, strict=True) for c in ([g.real] if r else [g.real, -g.imag])]
+        )
+        zero = np.zeros_like(self.offset)
+        return LinearSystem(
+            _block_diagonal(*blocks),
+            np.column_stack([B, np.zeros(len(B))]),
+            C,
+            np.column_stack([zero, self.offset]),
+            np.zeros((len(B), len(C))),
+            Ts,
+        )
+
+    def _forced(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
+        return np.vstack([_filtered(self.p, r.u.astype(complex)[:, None]) for r in recordings])
+
+    def _free(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
+        return np.vstack(
+            [
+                np.stack([scipy.signal.lfilter([1], [1, -p], np.eye(1, r.N)[0]) for p in self.p], axis=1)
+                for r in recordings
+            ]
+        )
+
+    def _states(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
+        each = np.repeat(self.xi, [r.N for r in recordings], axis=0)
+        return self._forced(recordings) + each * self._free(recordings)
+
+    def _errors(self, recordings: Sequence[Recording]) -> Float[np.ndarray, "N C"]:
+        y = np.concatenate([r.y for r in recordings]).astype(float)
+        return y - self.offset - np.real(self._states(recordings) @ self.g.T)
+
+    def _slopes(self, recordings: Sequence[Recording]) -> Float[np.ndarray, "N C P"]:
+        """Of the outputs by decay and angle of the poles, residues, offsets, first states."""
+        x, free = self._states(recordings), self._free(recordings)
+        ends = np.cumsum([r.N for r in recordings])[:-1]
+        by_pole = np.vstack([_filtered(self.p, part) for part in np.split(x, ends)])
+        decay, angle = -np.log(np.abs(self.p)), np.angle(self.p)
+        C, n, N = len(self.g), len(self.p), len(x)
+        columns = []
+        for c in range(C):
+            slope = by_pole * self.g[c] * self.p
+            poles = np.concatenate([(slope * -decay).real, (slope * 1j * angle).real], axis=1)
+            residues, offsets = np.zeros((N, 2 * n * C)), np.zeros((N, C))
+            residues[:, 2 * n * c : 2 * n * (c + 1)] = _pair(x)
+            offsets[:, c] = 1.0
+            starts = _by_recording(_pair(free * self.g[c]), recordings)
+            columns.append(np.hstack([poles, residues, offsets, starts]))
+        return np.stack(columns, axis=1)
+
+    def _moved(self, move: Float[np.ndarray, " P"]) -> "Modes":
+        C, n, R = len(self.g), len(self.p), len(self.xi)
+        a, b, g, offset, xi = np.split(move, np.cumsum([n, n, 2 * n * C, C]))
+        decay = -np.log(np.abs(self.p)) * np.exp(a)
+        angle = np.angle(self.p)
+        turned = np.where(np.imag(self.p) == 0, angle, np.clip(angle * np.exp(b), 1e-9, np.pi - 1e-9))
+        p = np.exp(-np.maximum(decay, LEAST_DECAY) + 1j * turned)
+        p = np.where(np.imag(self.p) == 0, np.sign(np.real(self.p)) * np.abs(p), p)
+        return Modes(
+            p,
+            self.g + _complex(g.reshape(C, 2 * n), self.p),
+            self.offset + offset,
+            self.xi + _complex(xi.reshape(R, 2 * n), self.p),
+        )
+
+
+def _filtered(p: np.ndarray, u: np.ndarray) -> Complex[np.ndarray, "N n"]:
+    u = np.broadcast_to(u, (len(u), len(p)))
+    return np.stack(
+        [scipy.signal.lfilter([0, 1], [1, -pole], x) for pole, x in zip(p, u.T, strict=True)], axis=1
+    )
+
+
+def _pair(x: Complex[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    """Re(w x) for w = w_re + i w_im, as columns for w_re and w_im."""
+    return np.concatenate([np.real(x), -np.imag(x)], axis=1)
+
+
+def _complex(w: Float[np.ndarray, "K m"], p: np.ndarray) -> Complex[np.ndarray, "K n"]:
+    re, im = np.split(w, 2, axis=1)
+    return re + 1j * np.where(np.imag(p) == 0, 0.0, im)
+
+
+def _block_diagonal(*blocks: np.ndarray) -> np.ndarray:
+    return np.asarray(scipy.linalg.block_diag(*blocks))
+
+
+def _by_recording(x: np.ndarray, recordings: Sequence[Recording]) -> np.ndarray:
+    """Columns of their own for each recording."""
+    return _block_diagonal(*np.split(x, np.cumsum([r.N for r in recordings])[:-1]))
+
+
+def _least_norm(phi: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Least squares by way of the squares, columns of one size; the search goes on from here."""
+    size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+    phi = phi / size
+    H = phi.T @ phi
+    return np.linalg.lstsq(H, phi.T @ y, rcond=1e-10)[0] / size[:, None]
+
+
+def _log_cost(e: np.ndarray) -> float:
+    cost = len(e) / 2 * float(np.sum(np.log(np.mean(e**2, axis=0) + 1e-300)))
+    return cost if np.isfinite(cost) else np.inf
+
+
+# Samples of each recording that the gain of the predictor is chosen on.
+GAIN_SAMPLES = 2000
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearStateSpace:
+    """A linear state space whose free run is fitted, begun at the poles of a subspace estimate.
+
+    The best that a linear model with so many states can do in free run, whatever its physics. Not
+    where friction sticks for long: the poles then are a mean of two regimes.
+
+    Source: L. Ljung, System Identification, 2nd ed., 1999, section 7.3 (output error).
+
+    Attributes:
+        orders: Numbers of states to choose from, by the free run over the last part.
+        pasts: Samples of the past that the subspace estimate may use.
+        share: Share of each training recording to learn from; the rest decides.
+    """
+
+    name: str = "state_space"
+    title: str = "a linear state space, fitted to free runs"
+    family: str = "linear"
+    orders: tuple[int, ...] = (2, 3, 4, 6)
+    pasts: tuple[int, ...] = (16, 64)
+    share: float = 0.7
+
+    def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
+        """Takes no notice of the model."""
+        require_one_sampling_period(train, "a sampled system")
+        first, last = split_for_validation(train, self.share)
+        begun: dict[int, tuple[float, LinearSystem]] = {}
+        for past in (p for p in self.pasts if p < min(r.N for r in first) // 8):
+            for n, system in subspace(first, past, self.orders).items():
+                cost = validation_cost(system, first)
+                if n not in begun or cost < begun[n][0]:
+                    begun[n] = (cost, system)
+        fitted: dict[int, tuple[float, LinearSystem]] = {}
+        for n, (_, start) in sorted(begun.items()):
+            system = refined(start, first)
+            fitted[n] = (validation_cost(system, last), system)
+            say(f"order {n}: log error {fitted[n][0]:.2f}")
+        if not fitted:
+            raise RuntimeError("no subspace estimate could be made, the recordings are too short")
+        best = min(fitted, key=lambda n: fitted[n][0])
+        final = with_gain(refined(fitted[best][1], train), train)
+        return Fitted(final, free_numbers(final), f"order {best}", final.predict)
+
+
+def refined(system: LinearSystem, recordings: Sequence[Recording], max_steps: int = 80) -> LinearSystem:
+    """The system with the least squared error of free runs, in modal coordinates.
+
+        minimise  sum over channels of N log sum (y_c - y_hat_c)^2
+
+    over poles, residues, offsets and first states. With one input a mode is `x+ = p x + u`, whose
+    derivative by its pole is the same filter once more, so that a step costs a few filters.
+
+    Args:
+        system: Its poles are the start.
+        recordings: All with its sampling period.
+        max_steps: Most runs that are tried.
+    """
+    return Modes.begun(_distinct(system.poles), recordings).fitted(recordings, max_steps).system(system.Ts)
+
+
+def with_gain(system: LinearSystem, recordings: Sequence[Recording]) -> LinearSystem:
+    """The system with the gain of a Kalman filter for a disturbed input, the best one step ahead."""
+    recordings = [r.slice(0, min(r.N, GAIN_SAMPLES)) for r in recordings]
+    y = [np.diff(r.y.astype(float), 2, axis=0) for r in recordings]
+    noise = np.diag(np.maximum(np.concatenate(y).var(axis=0) / 6, 1e-300))  # white noise, differenced twice
+    push = system.B[:, :1] * np.sqrt(np.mean([float(np.var(r.u)) for r in recordings]))
+    best, least = system, np.inf
+    for q in np.logspace(-8, 2, 6):
+        try:
+            P = scipy.linalg.solve_discrete_are(
+                system.A.T, system.C.T, q * push @ push.T + 1e-14 * np.eye(system.order), noise
+            )
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        K = system.A @ P @ system.C.T @ np.linalg.inv(system.C @ P @ system.C.T + noise)
+        candidate = dataclasses.replace(system, K=K)
+        e = np.concatenate([(r.y - candidate.predict(r))[r.n_init :] for r in recordings])
+        cost = float(np.mean(np.log(np.mean(e**2, axis=0) + 1e-300)))
+        if cost < least:
+            best, least = candidate, cost
+    return best
+
+
+def _distinct(poles: np.ndarray) -> list[complex]:
+    """One pole of each mode, inside of the unit circle and no two alike."""
+    kept: list[complex] = []
+    for p in sorted(poles.tolist(), key=lambda p: (abs(p), p.imag)):
+        p = complex(p) if abs(p.imag) > 1e-9 else complex(p.real)
+        if p.imag < 0:
+            continue
+        p *= min(max(abs(p), 0.05), 1 - 1e-6) / max(abs(p), 1e-9)
+        while any(abs(p - other) < 1e-4 for other in kept):
+            p *= 1 - 1e-3
+        kept.append(p)
+    return kept

@@ -1,0 +1,182 @@
+"""The comparison: every method learns from the same recordings and is evaluated on the same test data."""
+
+import dataclasses
+import time
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from rotflex_jax import joints
+from rotflex_jax.compare.evaluation import (
+    divergence_reason,
+    error_metrics,
+    errors_by_horizon,
+    free_runs,
+    one_step_predictions,
+    simulation_time,
+    windowed_errors,
+)
+from rotflex_jax.compare.method import Method, Progress, selected_methods
+from rotflex_jax.compare.table import Comparison, Row
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit.dataset import sensor_noise
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+from rotflex_jax.recording.quality import ACCEPTABLE
+from rotflex_jax.runtime.xla import one_thread
+
+
+@one_thread
+def compare(
+    recordings: Recording | Sequence[Recording],
+    methods: Iterable[str | Method] | None = None,
+    *,
+    mechanism: Mechanism | Model | None = None,
+    test: Recording | Sequence[Recording] | None = None,
+    fraction: float | None = None,
+    window_seconds: float = 2.0,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Every method on the same data, evaluated by its free run over test data.
+
+    All learn from the same training part and are evaluated on the same test part, of which they get the
+    input and the first `n_init` samples of the outputs: the rest is hidden before they simulate. A
+    method that fails or diverges is a row that says so. The error of predictions one step ahead is
+    reported where a method has a predictor, and never used to rank: the last sample alone predicts the
+    next one well.
+
+    Args:
+        recordings: One or several.
+        methods: Names of registered methods, or objects that are methods; all registered if None,
+            `rotflex_jax.compare.QUICK` are those without a long search.
+        mechanism: Physics of the methods that start from it; `joints.paper()` if None.
+        test: Test recordings; without them, the end of each recording.
+        fraction: Share of each recording to learn from, where `test` is not given [-]; 0.7 if None.
+        window_seconds: Length of the short free runs [s].
+        progress: Called with a line of text now and then.
+
+    Returns:
+        Comparison, best method first.
+
+    Raises:
+        InputError: An unknown method, no recording, `test` together with `fraction`, or a recording
+            without the channels of the mechanism.
+    """
+    start, say = time.perf_counter(), progress or (lambda _: None)
+    listed = selected_methods(methods)
+    mechanism = joints.paper() if mechanism is None else mechanism
+    model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
+    train, tested = (
+        tuple(_with_model_channels(r, model) for r in part)
+        for part in _training_and_test(_as_tuple(recordings), test, fraction)
+    )
+    rows = []
+    for method in listed:
+        say(f"{method.name}: learning")
+        rows.append(_row(method, model, train, tested, window_seconds, say))
+    noise = sensor_noise((*train, *tested), model)
+    return Comparison(
+        # Methods that failed stay in the order in which they were given.
+        rows=tuple(sorted(rows, key=lambda row: row.score)),
+        train=train,
+        test=tested,
+        noise_floor=dict(zip(model.mechanism.channels, noise.tolist(), strict=True)),
+        window_seconds=window_seconds,
+        elapsed_s=time.perf_counter() - start,
+    )
+
+
+def _row(
+    method: Method,
+    model: Model,
+    train: tuple[Recording, ...],
+    test: tuple[Recording, ...],
+    seconds: float,
+    say: Progress,
+) -> Row:
+    row = Row(method.name, method.title, family=getattr(method, "family", "other"))
+    start = time.perf_counter()
+    # Whatever goes wrong in one method must not cost the others their rows.
+    try:
+        fitted = method.fit(model, train, lambda text: say(f"{method.name}: {text}"))
+        row = dataclasses.replace(
+            row,
+            note=fitted.note,
+            parameters=fitted.parameters,
+            fit_seconds=time.perf_counter() - start,
+            simulator=fitted.simulator,
+        )
+        runs = free_runs(fitted.simulator, test)
+        ahead = (
+            {}
+            if fitted.predict is None
+            else error_metrics(test, one_step_predictions(fitted.predict, test))["rmse"]
+        )
+        reason = divergence_reason(runs, test, _ranges((*train, *test)))
+        return dataclasses.replace(
+            row,
+            status="diverged" if reason else "ok",
+            reason=reason,
+            **error_metrics(test, runs),
+            rmse_windows=windowed_errors(fitted.simulator, test, seconds),
+            rmse_one_step=ahead,
+            horizon=errors_by_horizon(fitted.simulator, test, seconds),
+            simulate_seconds=simulation_time(fitted.simulator, test),
+            simulated=runs,
+        )
+    except Exception as error:
+        reason = " ".join(str(error).split()) or "no reason given"
+        named = reason if isinstance(error, InputError) else f"{type(error).__name__}: {reason}"
+        return dataclasses.replace(row, status="failed", reason=named)
+
+
+def _as_tuple(recordings: Recording | Sequence[Recording]) -> tuple[Recording, ...]:
+    listed = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+    if not listed:
+        raise InputError("No recording was given, but at least one is needed; pass a Recording.")
+    return listed
+
+
+def _training_and_test(
+    recordings: tuple[Recording, ...],
+    test: Recording | Sequence[Recording] | None,
+    fraction: float | None,
+) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:
+    """Training and test recordings."""
+    if test is None:
+        parts = [r.split(0.7 if fraction is None else fraction) for r in recordings]
+        return tuple(a for a, _ in parts), tuple(b for _, b in parts)
+    if fraction is not None:
+        raise InputError(
+            "Arguments `test` and `fraction` were both given, but the test data are either "
+            "recordings of their own or the end of each; give one of the two."
+        )
+    tested = _as_tuple(test)
+    if any(r is s for r in recordings for s in tested):
+        raise InputError(
+            "The same recording was given to learn from and as test data, but an error on "
+            "training data proves nothing; leave `test` out to use the end of the recording."
+        )
+    return recordings, tested
+
+
+def _with_model_channels(recording: Recording, model: Model) -> Recording:
+    """The recording with the model's channels alone, in its order: the same for every method."""
+    wanted = model.mechanism.channels
+    if recording.channels == wanted:
+        return recording
+    y = model.measured(recording)
+    return dataclasses.replace(
+        recording,
+        y=y,
+        channels=wanted,
+        units=tuple(recording.units[recording.channels.index(c)] for c in wanted),
+        resolution={c: recording.resolution[c] for c in wanted},
+        accept=ACCEPTABLE,
+    )
+
+
+def _ranges(recordings: Sequence[Recording]) -> np.ndarray:
+    """Range of each channel in all recordings (C,)."""
+    return np.max([np.ptp(r.y, axis=0) for r in recordings], axis=0)

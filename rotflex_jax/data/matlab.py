@@ -1,0 +1,271 @@
+"""MATLAB files up to version 7.2.
+
+SciPy's reader trusts the sizes and types that it finds, and a damaged file can end the interpreter; here
+each is compared with the bytes that are there before it is used.
+
+Source:
+    The MathWorks, MAT-File Format, 2023.
+"""
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rotflex_jax.data.tables import check_size
+
+DEEPEST_NESTING = 50
+"""Structures and cells within one another."""
+
+MOST_PARTS = 1_000_000
+"""Arrays in structures and cells, of one file."""
+
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15  # types of elements
+_CELL, _STRUCT, _OBJECT, _CHAR, _FIRST_NUMBER, _LAST_NUMBER = 1, 2, 3, 4, 6, 15  # classes of arrays
+_VERSION_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
+
+SKIPPED = object()
+"""Stands for what is no signal: sparse matrices, objects, functions."""
+
+
+def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
+    """The variables: arrays without axes of length 1, text, structures as dictionaries.
+
+    Args:
+        data: content of the file.
+        label: what an error calls it.
+        max_bytes: size of what is unpacked [bytes].
+
+    Raises:
+        ValueError: what the file says of itself does not agree.
+        InputError: it unpacks to more than `max_bytes`.
+    """
+    if 0 in data[:4]:
+        return _version_4(data)
+    mark = data[126:128]
+    if mark not in (b"IM", b"MI") or data[124:126] not in (b"\x00\x01", b"\x01\x00"):
+        raise ValueError("it does not begin as one")
+    order = "<" if mark == b"IM" else ">"
+    file = _Elements(data, order)
+    found: dict[str, Any] = {}
+    at, unpacked = 128, len(data)
+    while at < len(data):
+        kind, start, end, _ = file.element(at, len(data))
+        part = file
+        if kind == _COMPRESSED:
+            content = _unpack(data[start:end], label, unpacked, max_bytes)
+            unpacked += len(content)
+            part = _Elements(content, order, file.parts)
+            kind, first, last, _ = part.element(0, len(content))
+        else:
+            first, last = start, end
+        if kind != _MATRIX:
+            raise ValueError(f"an element of type {kind} stands where a variable should")
+        name, value = part.array(first, last, 0)
+        file.parts = part.parts
+        at = end
+        if value is SKIPPED or not name:  # without a name: data of MATLAB's own
+            continue
+        if name in found:
+            raise ValueError(f"it has two variables {name!r}")
+        found[name] = value
+    return found
+
+
+def _unpack(data: bytes, label: str, before: int, max_bytes: int) -> bytes:
+    stream = zlib.decompressobj()
+    try:
+        content = stream.decompress(data, max(max_bytes - before, 0) + 1)
+    except zlib.error as error:
+        raise ValueError(str(error)) from error
+    check_size(label, before + len(content), max_bytes)
+    if not stream.eof:
+        raise ValueError("a compressed variable is incomplete")
+    return content
+
+
+@dataclass
+class _Elements:
+    """Elements of data: a type, a size, and as many bytes.
+
+    Args:
+        data: bytes.
+        order: `<` or `>`.
+        parts: arrays in structures and cells so far.
+    """
+
+    data: bytes
+    order: str
+    parts: int = 0
+
+    def element(self, at: int, end: int) -> tuple[int, int, int, int]:
+        """Type, start and end of the content, and where the next element begins."""
+        if at + 8 > end:
+            raise ValueError(f"it ends at byte {at}, inside a variable")
+        kind, size = struct.unpack_from(f"{self.order}II", self.data, at)
+        if kind >> 16:  # up to four bytes, which stand in place of the size
+            kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+            if size > 4:
+                raise ValueError(f"a short element at byte {at} claims {size} bytes")
+            return kind, start, start + size, at + 8
+        start = at + 8
+        if start + size > end:
+            raise ValueError(f"{size} bytes are claimed at byte {at}, but {end - start} are there")
+        return kind, start, start + size, start + size + -size % 8
+
+    def numbers(self, at: int, end: int, kinds: tuple[int, ...] = ()) -> tuple[np.ndarray, int]:
+        """The numbers of an element, and where the next one begins."""
+        kind, start, stop, after = self.element(at, end)
+        if kind not in _NUMBERS or (kinds and kind not in kinds):
+            raise ValueError(f"an element of type {kind} stands where numbers should, at byte {at}")
+        dtype = np.dtype(self.order + _NUMBERS[kind])
+        if (stop - start) % dtype.itemsize:
+            raise ValueError(f"{stop - start} bytes at byte {at} are no whole count of {dtype.name}")
+        values = np.frombuffer(self.data, dtype, (stop - start) // dtype.itemsize, start)
+        return values.astype(dtype.newbyteorder("=")), after
+
+    def text(self, at: int, end: int) -> tuple[str, int]:
+        """A name, and where the next element begins."""
+        kind, start, stop, after = self.element(at, end)
+        if kind not in (1, 16):
+            raise ValueError(f"an element of type {kind} stands where a name should, at byte {at}")
+        return self.data[start:stop].decode("latin-1"), after
+
+    def array(self, at: int, end: int, depth: int) -> tuple[str, Any]:
+        """Name and value of the content of a matrix element."""
+        if at == end:  # an empty part of a structure or cell
+            return "", np.array([])
+        self.parts += 1
+        if depth > DEEPEST_NESTING or self.parts > MOST_PARTS:
+            raise ValueError("its structures are too deep or too many for a recording")
+        flags, at = self.numbers(at, end, (_UINT32,))
+        if len(flags) != 2:
+            raise ValueError("a variable lacks its flags")
+        kind, is_complex = int(flags[0]) & 0xFF, bool(flags[0] & 0x800)
+        if not (kind in (_CELL, _STRUCT, _OBJECT, _CHAR) or _FIRST_NUMBER <= kind <= _LAST_NUMBER):
+            return "", SKIPPED
+        sizes, at = self.numbers(at, end, (_INT32, _UINT32))
+        shape = [int(n) for n in sizes]
+        if not 2 <= len(shape) <= 32 or min(shape) < 0:
+            raise ValueError(f"a variable has the shape {tuple(shape)[:8]}")
+        name, at = self.text(at, end)
+        if kind == _CELL:
+            return name, self.cells(at, end, shape, depth)
+        if kind == _OBJECT:
+            _, at = self.text(at, end)  # its class; the rest is as in a structure
+        if kind in (_STRUCT, _OBJECT):
+            return name, self.structures(at, end, shape, depth)
+        if kind == _CHAR:
+            return name, self.characters(at, end, shape)
+        values, at = self.numbers(at, end)
+        if is_complex:
+            imaginary, at = self.numbers(at, end)
+            if len(imaginary) != len(values):
+                raise ValueError(f"the variable {name!r} has not as many real as imaginary parts")
+            values = values + 1j * imaginary
+        if len(values) != math.prod(shape):
+            raise ValueError(f"the variable {name!r} of shape {tuple(shape)} has {len(values)} numbers")
+        return name, _squeezed(values, shape)
+
+    def parts_of(self, at: int, end: int, count: int, depth: int) -> list[Any]:
+        """So many arrays, one behind the other."""
+        if 8 * count > end - at:  # each has at least a type and a size
+            raise ValueError(f"{count} parts are claimed at byte {at}, but {end - at} bytes are there")
+        found = []
+        for _ in range(count):
+            kind, start, stop, at = self.element(at, end)
+            if kind != _MATRIX:
+                raise ValueError(f"an element of type {kind} stands where an array should")
+            found.append(self.array(start, stop, depth + 1)[1])
+        return found
+
+    def cells(self, at: int, end: int, shape: list[int], depth: int) -> Any:
+        """Values in an array of objects."""
+        values = self.parts_of(at, end, math.prod(shape), depth)
+        cells = np.empty(len(values), dtype=object)
+        for k, value in enumerate(values):
+            cells[k] = None if value is SKIPPED else value
+        return _squeezed(cells, shape)
+
+    def structures(self, at: int, end: int, shape: list[int], depth: int) -> Any:
+        """A dictionary, or a list of them."""
+        lengths, at = self.numbers(at, end, (_INT32,))
+        if len(lengths) != 1 or lengths[0] < 1:
+            raise ValueError("a structure has names without length")
+        names, at = self.numbers(at, end, (1,))
+        raw, length = names.tobytes(), int(lengths[0])
+        if len(raw) % length:
+            raise ValueError("a structure has incomplete names")
+        keys = [raw[k : k + length].split(b"\0")[0].decode("latin-1") for k in range(0, len(raw), length)]
+        if len(set(keys)) < len(keys):
+            raise ValueError("a structure has two fields of one name")
+        count = math.prod(shape)
+        if not keys:
+            return {} if count == 1 else []
+        values = self.parts_of(at, end, count * len(keys), depth)
+        rows = [values[k : k + len(keys)] for k in range(0, len(values), len(keys))]
+        found = [{k: v for k, v in zip(keys, row, strict=True) if v is not SKIPPED} for row in rows]
+        return found[0] if count == 1 else found
+
+    def characters(self, at: int, end: int, shape: list[int]) -> Any:
+        """Text, or an array of it."""
+        kind, start, stop, _ = self.element(at, end)
+        if kind not in _ENCODINGS:
+            raise ValueError(f"an element of type {kind} stands where text should, at byte {at}")
+        wide = {"<": "-le", ">": "-be"}[self.order] if _ENCODINGS[kind][:6] in ("utf-16", "utf-32") else ""
+        text = self.data[start:stop].decode(_ENCODINGS[kind] + wide, errors="replace")
+        rows = math.prod(shape[:-1])
+        if rows == 1:
+            return text
+        if len(text) != math.prod(shape):
+            raise ValueError(f"text of shape {tuple(shape)} has {len(text)} characters")
+        return _squeezed(np.array(["".join(text[k::rows]) for k in range(rows)]), shape[:-1])
+
+
+def _squeezed(values: np.ndarray, shape: list[int]) -> Any:
+    """Without axes of length 1; a single number is no array. MATLAB stores column by column."""
+    if not values.size:
+        return values
+    found = values.reshape(shape, order="F").squeeze()
+    return found if found.ndim else found.item()
+
+
+def _version_4(data: bytes) -> dict[str, Any]:
+    """Full matrices and text of the format before 1996."""
+    order = "<" if 0 <= struct.unpack_from("<i", data.ljust(4, b"\0"))[0] <= 5000 else ">"
+    found: dict[str, Any] = {}
+    at = 0
+    while at < len(data):
+        if at + 20 > len(data):
+            raise ValueError(f"it ends at byte {at}, inside a variable")
+        code, rows, width, is_complex, length = struct.unpack_from(f"{order}5i", data, at)
+        precision, kind = code // 10 % 10, code % 10
+        if not 0 <= code < 5000 or code // 100 % 10 or precision > 5 or kind > 2 or is_complex not in (0, 1):
+            raise ValueError(f"no variable begins at byte {at}")
+        if min(rows, width) < 0 or length < 1:
+            raise ValueError(f"a variable of {rows} times {width} numbers is claimed at byte {at}")
+        start = at + 20 + length
+        dtype = np.dtype(order + _VERSION_4[precision])
+        size = rows * width * dtype.itemsize * (1 + is_complex)
+        if start + size > len(data):
+            raise ValueError(f"{size} bytes are claimed at byte {at}, but {len(data) - start} are there")
+        name = data[at + 20 : start].split(b"\0")[0].decode("latin-1")
+        values = np.frombuffer(data, dtype, rows * width * (1 + is_complex), start)
+        values = values.astype(dtype.newbyteorder("="))
+        if is_complex:
+            values = values[: rows * width] + 1j * values[rows * width :]
+        at = start + size
+        if name in found:
+            raise ValueError(f"it has two variables {name!r}")
+        if kind == 0:
+            found[name] = _squeezed(values, [rows, width])
+        elif kind == 1:
+            letters = np.array([chr(int(c) & 0xFF) for c in np.real(values)]).reshape(rows, width, order="F")
+            text = ["".join(row) for row in letters]
+            found[name] = text[0] if rows == 1 else np.array(text)
+    return found

@@ -1,0 +1,253 @@
+"""Tables of named columns, and delimited text as a table."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from rotflex_jax.errors import InputError
+
+
+@dataclass(frozen=True)
+class Table:
+    """Named columns.
+
+    Args:
+        label: its name in an error.
+        columns: by name; column k of a matrix is `name[k]`.
+        where: what a row is called.
+        first: number of the first row.
+        units: by name, where the file has a line of them.
+        cut: what may be missing at the end, in a sentence; empty where nothing is.
+    """
+
+    label: str
+    columns: Mapping[str, Shaped[np.ndarray, " _"]]
+    where: str = "row"
+    first: int = 1
+    units: Mapping[str, str] = field(default_factory=dict)
+    cut: str = ""
+
+    def column(self, name: str, what: str) -> Shaped[np.ndarray, " N"]:
+        """One column.
+
+        Args:
+            name: its name.
+            what: the argument by which a user could name another.
+
+        Raises:
+            InputError: there is none; the error lists those that are there.
+        """
+        if isinstance(name, str) and name in self.columns:
+            return self.columns[name]
+        if isinstance(name, str) and set(parts := name.split(",")) < set(self.columns):
+            raise self._lacks(f"column {name!r}", f"name {' and '.join(parts)} one by one with {what}")
+        raise self._lacks(f"column {name!r}", f"name the right one with {what}")
+
+    def check(self, wanted: Sequence[tuple[str, str]]) -> None:
+        """Refuse at once all columns that are not there, where they are more than one.
+
+        Args:
+            wanted: columns, each with the argument by which a user could name another.
+
+        Raises:
+            InputError: several are missing; the error lists those that are there.
+        """
+        missing = [(n, what) for n, what in wanted if isinstance(n, str) and n not in self.columns]
+        if len(missing) > 1:
+            names = ", ".join(repr(n) for n, _ in missing)
+            arguments = list(dict.fromkeys(what for _, what in missing))
+            listed = ", ".join(arguments[:-1]) + " and " * (len(arguments) > 1) + arguments[-1]
+            raise self._lacks(f"columns {names}", f"name the right ones with {listed}")
+
+    def _lacks(self, what: str, then: str) -> InputError:
+        longer = [key for key, values in self.columns.items() if len(values) > 1]
+        there = longer or list(self.columns)  # settings of one value are not worth offering
+        names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
+        return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
+
+
+def distinct(names: Sequence[str], label: str) -> Sequence[str]:
+    """The names, if no two are equal.
+
+    Raises:
+        InputError: two are.
+    """
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InputError(
+                f"{label} has more than one column {name!r}, so that it is open which is meant; "
+                "rename or remove one."
+            )
+        seen.add(name)
+    return names
+
+
+MAX_BYTES = 2_000_000_000
+"""Size of a file, and of what it unpacks to, beyond which it is hardly one recording [bytes]."""
+
+
+def check_size(label: str, size: int, max_bytes: int, what: str = "unpacks to at least") -> None:
+    """Refuse what is larger than one recording can be.
+
+    Args:
+        label: what an error calls it.
+        size: how large it is, or becomes [bytes].
+        max_bytes: what is accepted [bytes].
+        what: verb before the size.
+
+    Raises:
+        InputError: it is larger.
+    """
+    if size > max_bytes:
+        raise InputError(
+            f"{label} {what} {size / 1e9:.3g} GB, more than the {max_bytes / 1e9:.3g} GB of any likely "
+            "recording; check it, give a larger max_bytes, or pass accept=('huge',)."
+        )
+
+
+def unreadable(path: Path, what: str, error: Exception) -> InputError:
+    """The error for a file that is not what its ending says."""
+    reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return InputError(
+        f"{path.name} cannot be read as {what} ({reason[:120]}); it may be damaged: export it again."
+    )
+
+
+def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
+    """The columns of a text file in UTF-8 with a header.
+
+    The delimiter is a tab, semicolon, bar or comma, the first of these in the header, otherwise
+    spaces; a comma beside another delimiter is a decimal comma. Remarks with # or % may stand on
+    top, the last of them may be the header. A line of units may follow it.
+
+    Raises:
+        InputError: no text, other text than UTF-8, no header, no samples, a line with more or fewer cells
+            than names, or one that is cut.
+    """
+    text = _decoded(path, max_bytes)
+    lines = text.splitlines()
+    start = _header(lines)
+    if start is None:
+        raise InputError(f"{path.name} has no text in it; export the recording again.")
+    delimiter = next((mark for mark in "\t;|," if mark in lines[start]), None)
+    names = [name.strip() for name in _cells(lines[start].lstrip("#% "), delimiter)]
+    if _are_numbers(names):
+        raise InputError(
+            f"{path.name} has no header, its line {start + 1} holds numbers; "
+            "put the names of the columns there, such as t,voltage,theta,alpha."
+        )
+    distinct(names, path.name)
+    rows = lines[start + 1 :]
+    while rows and not rows[-1].strip():
+        rows.pop()
+    if not rows:
+        raise InputError(f"{path.name} has a header, but no samples; export the recording again.")
+    if delimiter != ",":
+        rows = [row.replace(",", ".") for row in rows]
+    first = start + 2  # as an editor counts
+    units = _units(rows, names, delimiter)
+    if units:
+        rows, first = rows[1:], first + 1
+    columns = _columns(rows, names, delimiter, path.name, first)
+    cut = _cut(rows, delimiter, path.name, first) if text[-1] in "0123456789." else ""
+    return Table(path.name, columns, "line", first, units, cut)
+
+
+def _decoded(path: Path, max_bytes: int) -> str:
+    data = path.read_bytes()
+    check_size(path.name, len(data), max_bytes, "has")
+    try:
+        if data[:2] in (b"\xff\xfe", b"\xfe\xff") or 0 in data[:2]:
+            raise ValueError("it looks like UTF-16, to be saved as UTF-8")
+        text = data.decode("utf-8-sig")
+        if "\0" in text:
+            raise ValueError(f"it has a zero byte in line {text[: text.index(chr(0))].count(chr(10)) + 1}")
+    except ValueError as error:
+        raise unreadable(path, "text in UTF-8", error) from error
+    return text
+
+
+def _cut(rows: list[str], delimiter: str | None, label: str, first: int) -> str:
+    """The doubt about a last number that no line end follows.
+
+    Raises:
+        InputError: all other numbers of the column have as many decimals, and exponents of as many digits,
+            but the last one has not: it is certainly cut.
+    """
+    last = rows[-1].rsplit(delimiter, 1)[-1].strip()
+    others = {_form(row.rsplit(delimiter, 1)[-1].strip()) for row in rows[:-1]}
+    if len(rows) > 10 and len(others) == 1 and others != {_form(last)}:
+        decimals, exponent = next(iter(others))
+        if decimals >= 3 or exponent:
+            raise InputError(
+                f"{label} ends inside line {first + len(rows) - 1}, with {last!r} where the lines above have "
+                f"{decimals} decimals; remove that line, or export it again."
+            )
+    return f"No line end follows the last number, {last}, which may be cut; see that it is whole."
+
+
+def _form(cell: str) -> tuple[int, int]:
+    """Number of decimals and of digits of the exponent.
+
+    >>> _form("-1.250e-05"), _form("12")
+    ((3, 2), (0, 0))
+    """
+    mantissa, _, exponent = cell.lower().strip('"').partition("e")
+    return len(mantissa.partition(".")[2]), len(exponent.lstrip("+-"))
+
+
+def _header(lines: list[str]) -> int | None:
+    """The index of the line with the names."""
+    filled = [k for k, line in enumerate(lines) if line.strip(" \t,;#%")]
+    for before, k in zip([None, *filled], filled, strict=False):
+        if not lines[k].startswith(("#", "%")):
+            # Below remarks come the names, or the numbers that the last remark has named.
+            numbers = _are_numbers(lines[k].replace(",", " ").replace(";", " ").split())
+            return before if numbers and before is not None else k
+    return filled[-1] if filled else None
+
+
+def _units(rows: list[str], names: list[str], delimiter: str | None) -> dict[str, str]:
+    """The units, where the line below the names holds no number and the next one nothing else."""
+    cells = _cells(rows[0], delimiter)
+    if len(cells) != len(names) or len(rows) < 2 or not _are_numbers(_cells(rows[1], delimiter)):
+        return {}
+    if not "".join(cells).strip() or any(_are_numbers([cell]) for cell in cells):
+        return {}
+    return dict(zip(names, cells, strict=True))
+
+
+def _columns(
+    rows: list[str], names: list[str], delimiter: str | None, label: str, first: int
+) -> dict[str, Shaped[np.ndarray, " N"]]:
+    try:
+        numbers = np.loadtxt(rows, delimiter=delimiter, ndmin=2, comments=None, quotechar='"')
+    except ValueError:
+        numbers = np.empty((0, 0))
+    if numbers.shape == (len(rows), len(names)):
+        return dict(zip(names, numbers.T, strict=True))
+    # Slower, cell by cell: text stays text, so that the error can name its place.
+    cells = [_cells(row, delimiter) for row in rows]
+    for k, row in enumerate(cells):
+        if len(row) != len(names):
+            raise InputError(
+                f"{label} has {len(row)} cells in line {first + k}, but {len(names)} names in "
+                f"its header ({', '.join(names)}); correct the file, or export it again."
+            )
+    return {name: np.array([row[k] for row in cells]) for k, name in enumerate(names)}
+
+
+def _cells(line: str, delimiter: str | None) -> list[str]:
+    return line.split() if delimiter is None else next(csv.reader([line], delimiter=delimiter), [])
+
+
+def _are_numbers(cells: list[str]) -> bool:
+    try:
+        return bool([float(cell) for cell in cells])
+    except ValueError:
+        return False

@@ -1,0 +1,153 @@
+"""The result of `discover`: what was found, and what can be done with it."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rotflex_jax.discover.explanation import Explanation, remaining_failures
+from rotflex_jax.discover.latent_comparison import LatentTorqueComparison, compare_latent_torques
+from rotflex_jax.discover.learned_torque import LearnedTorqueResult, learn_torque
+from rotflex_jax.discover.proposal import proposed
+from rotflex_jax.discover.result import NEXT, SearchResult
+from rotflex_jax.discover.tables import (
+    channel_headings,
+    channel_units,
+    error_rows,
+    noise_row,
+    outcomes,
+    stage_labels,
+)
+from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.effects.labels import effect_label, sentence
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment import Experiment
+from rotflex_jax.models.model_json import Saved, save
+from rotflex_jax.text.markup import bullets, card, folded, paragraph, picture, table
+from rotflex_jax.text.numbers import equation, plain_number, readable, unit_text, value_and_interval
+from rotflex_jax.text.svg import staircase
+from rotflex_jax.text.templates import as_json, write_files
+
+# Candidates of the ranking that a notebook lists.
+LISTED_CANDIDATES = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Discovery(SearchResult):
+    """What a search found, with its report, the torques that are missing, and the next experiment."""
+
+    def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
+        """Torques that the baseline and the final model lack, on a fitted and a held-out recording."""
+        longest = [max(group, key=lambda r: r.N) for group in (self.train, self.test)]
+        return compare_latent_torques(self.baseline, self.final if self.rounds else None, longest, progress)
+
+    def learned_torque(
+        self, at: str = "hub", progress: Callable[[str], None] | None = None
+    ) -> LearnedTorqueResult:
+        """A smooth map of position and speed learned on top of the final model, for what is unexplained.
+
+        Args:
+            at: Port of the torque.
+            progress: Called with a line of text at each stage.
+        """
+        seconds = self.baseline.window_seconds
+        return learn_torque(self.model, self.train, self.test, at, window_seconds=seconds, progress=progress)
+
+    def explanation(self, learned: bool | None = None) -> Explanation:
+        """Everything that a report needs beyond the search itself; takes about a minute.
+
+        Args:
+            learned: Whether to learn a torque at the port where most is left; where the verdict is
+                `unexplained` if None.
+        """
+        latent, torque = self.latent_torque(), None
+        if self.verdict == Verdict.UNEXPLAINED if learned is None else learned:
+            gains = (latent.after or latent.before).gain_nats
+            try:
+                torque = self.learned_torque(max(gains, key=lambda port: gains[port]))
+            except InputError:  # no sensor tells how that port moves
+                torque = None
+        return Explanation(latent, torque, remaining_failures(self))
+
+    def save(self, path: str | Path) -> Path:
+        """Write the final model as JSON, with its estimates; `Model.load` reads the model."""
+        seen = self.train[0]
+        return save(Saved(self.model, self.final.estimates, Ts=seen.Ts, n_init=seen.n_init), path)
+
+    def next_experiment(self, **changes: Any) -> Experiment | None:
+        """Design the input that distinguishes the first effect found from its equal; None where it has none.
+
+        The model, its noise and the machine's limits are those of the recordings: no more voltage, slew or
+        deflection than they hold.
+
+        Args:
+            changes: Other arguments of `rotflex_jax.next_experiment`, its `limits` for instance.
+        """
+        return proposed(self, **changes)
+
+    def report(self, folder: str | Path, *, learned: bool | None = None) -> Path:
+        """Write `report.html` (self-contained) and `result.json` into a folder; returns the HTML path.
+
+        Where the verdict is ambiguous, the input to play next lies beside them as a file.
+
+        Args:
+            folder: Where to write.
+            learned: Whether to learn a torque for what is left, which takes about as long as a round; where
+                the verdict is `unexplained` if None.
+        """
+        from rotflex_jax.report import write_report  # the layer above, on request
+
+        folder = Path(folder)
+        # First of all, so that whatever fails below costs nothing of the result.
+        write_files(folder, {"result.json": as_json(self.to_dict())})
+        page = write_report(self, folder, self.explanation(learned))
+        if self.proposal is not None:
+            self.proposal.save_csv(folder / NEXT)
+        return page
+
+    def _repr_html_(self) -> str:
+        """Verdict, errors of each model, what each round found, and where the baseline failed."""
+        scale = {c: readable(1.0, unit) for c, unit in channel_units(self).items()}
+        heading = {c: f"{c} [{read}]" for c, (_, read) in scale.items()}
+        errors = {
+            heading[c]: [f * s.held_out_rmse_windows[c] for s in self.stages] for c, (f, _) in scale.items()
+        }
+        floor = {heading[c]: f * self.noise_floor.get(c, 0.0) for c, (f, _) in scale.items()}
+        rounds, parameters = [], []
+        for k, added in enumerate(self.rounds, 1):
+            alike = ", ".join(effect_label(*pair) for pair in added.equivalent)
+            doubt = f"not distinguished from {alike}" if alike else ""
+            rounds.append((str(k), effect_label(added.effect, added.port), equation(added.equation), doubt))
+            parameters += [
+                (f"{added.port}.{added.effect}.{n}", unit_text(e.unit), *value_and_interval(e))
+                for n, e in added.parameters.items()
+            ]
+        seconds = f"{self.baseline.window_seconds:g} s"
+        headings = channel_headings(self)
+        rows = [(r.label, *(c.value for c in (*r.windows, *r.whole))) for r in error_rows(self)]
+        rows.append(("sensor noise", *noise_row(self), *noise_row(self)))
+        ranked = [
+            (effect_label(r.effect, r.port), outcome.value, plain_number(r.score))
+            for r, outcome in outcomes(self)[:LISTED_CANDIDATES]
+        ]
+        return card(
+            self.verdict.shown.headline,
+            paragraph(sentence(self.sentence)),
+            picture(
+                staircase(stage_labels(self), errors, floor),
+                f"Held-out error over {seconds} of each model, with the noise of the sensor.",
+            ),
+            table(("", "effect", "equation", ""), rounds, words=4),
+            table(("parameter", "unit", "value", "95 %"), parameters, words=2),
+            table(
+                (
+                    "held-out rms error",
+                    *(f"{h}, {seconds}" for h in headings),
+                    *(f"{h}, one run" for h in headings),
+                ),
+                rows,
+            ),
+            folded("Where the baseline failed", bullets(sentence(w.statement) for w in self.where)),
+            folded("Ranking before any was added", table(("candidate", "", "score [nat]"), ranked, words=2)),
+            bullets(self.notes),
+        )

@@ -1,0 +1,295 @@
+"""Where the error of a model lies: when, how fast, at which speeds and deflections, after which events."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Real
+
+from rotflex_jax.discover.conditions import ConditionSet, condition_sets, missing_acceleration
+from rotflex_jax.discover.result import Where
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit.inference import correlation_length
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.metrics import window_starts
+from rotflex_jax.recording import Recording
+from rotflex_jax.text.numbers import as_read
+
+TIME_SEGMENTS = 20
+# Edges of frequency bands [Hz], decades of these.
+BAND_EDGES = (1.0, 2.0, 5.0)
+NOISE_DRAWS = 999
+
+
+class ErrorShare(NamedTuple):
+    """A statement, and the share of the error that an even spread would have there."""
+
+    where: Where
+    expected: float
+
+    @property
+    def share(self) -> float:
+        """Share of the squared error."""
+        return self.where.share
+
+
+def relative_entropy(
+    share: float | Float[np.ndarray, "..."], expected: float | Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
+    """Divergence of a share above the expected one from it [nat]; 0 for one below.
+
+    s log(s/p) + (1-s) log((1-s)/(1-p))
+
+    >>> float(relative_entropy(0.2, 0.2)), round(float(relative_entropy(0.78, 0.21)), 3)
+    (0.0, 0.742)
+    """
+    s = np.clip(share, 1e-12, 1 - 1e-12)
+    p = np.clip(expected, 1e-12, 1 - 1e-12)
+    return np.where(s > p, s * np.log(s / p) + (1 - s) * np.log((1 - s) / (1 - p)), 0.0)
+
+
+def in_conditions(
+    channel: str, energies: Mapping[str, Float[np.ndarray, " N"] | None], conditions: ConditionSet
+) -> ErrorShare:
+    """The condition of a set that stands out most, its p-value over all circular shifts."""
+    expected = conditions.masks.mean(axis=1)
+    spectrum = np.conj(np.fft.rfft(conditions.masks, axis=1))
+    N = conditions.masks.shape[1]
+    best: tuple[float, str, int, float] | None = None
+    highest = np.zeros(N)
+    for verb, energy in energies.items():
+        if energy is None:
+            continue
+        shares = np.fft.irfft(spectrum * np.fft.rfft(energy / energy.sum()), N, axis=1)
+        divergence = relative_entropy(shares, expected[:, None])
+        highest = np.maximum(highest, divergence.max(axis=0))
+        k = int(divergence[:, 0].argmax())
+        if best is None or divergence[k, 0] > best[0]:
+            best = float(divergence[k, 0]), verb, k, float(shares[k, 0])
+    assert best is not None  # the error itself is always among the energies
+    largest, verb, k, share = best
+    # The identity is one of the shifts, so that p is never zero.
+    p_value = float(np.mean(highest >= largest * (1 - 1e-9)))
+    energy = energies[verb]
+    profile = np.bincount(conditions.bins, energy, len(conditions.edges) - 1)
+    statement = (
+        f"{percent(share)} of the {channel} error {verb} {conditions.phrases[k]}, "
+        f"where the machine spends {percent(expected[k])} of the time."
+    )
+    usual = np.bincount(conditions.bins, minlength=len(profile)) / N
+    profile /= profile.sum()
+    kind, edges = conditions.kind, conditions.edges
+    where = Where(statement, share, p_value, kind, channel, edges, profile, usual, conditions.unit)
+    return ErrorShare(where, float(expected[k]))
+
+
+def in_time(channel: str, error: Float[np.ndarray, " N"], recording: Recording) -> ErrorShare:
+    """The stretch of time that holds more than its share of the error.
+
+    The range of the cumulated deviation from the mean, over the standard deviation that its autocorrelation
+    explains, follows the distribution of Kuiper's statistic where the error stays the same.
+    """
+    energy = error**2
+    N = len(energy)
+    deviation = energy - energy.mean()
+    walk = np.concatenate([[0.0], np.cumsum(deviation)])
+    # The lags come from the error itself: a lasting change of its size is no correlation.
+    lags = correlation_length(error[:, None])
+    r = np.fft.irfft(np.abs(np.fft.rfft(deviation, 2 * N)) ** 2)[: lags + 1]
+    long_run = float(r[0] + 2 * np.sum((1 - np.arange(1, lags + 1) / (lags + 1)) * r[1:]))
+    v = np.ptp(walk) / np.sqrt(max(long_run, 1e-12 * float(r[0]), 1e-300))
+    j = np.arange(1, 100)
+    tail = 2 * np.sum((4 * j**2 * v**2 - 1) * np.exp(-2 * j**2 * v**2))
+    p_value = float(np.clip(tail, 0.0, 1.0)) if v > 0.4 else 1.0
+    # The error gathers where the walk climbs; round the ends that is two pieces: one is reported.
+    low, high = int(walk.argmin()), int(walk.argmax())
+    if low > high:
+        low, high = max(((0, high), (low, N)), key=lambda part: walk[part[1]] - walk[part[0]])
+    # A few samples at an end are no piece of their own.
+    low, high = (0 if low < N / 100 else low), (N if high > 0.99 * N else high)
+    share, expected = float(energy[low:high].sum() / energy.sum()), (high - low) / N
+    start, end = (recording.start + recording.Ts * k for k in (low, high))
+    when = f"between {start:.1f} s and {end:.1f} s"
+    when = f"before {end:.1f} s" if low == 0 else f"after {start:.1f} s" if high == N else when
+    bins = np.minimum(np.arange(N) * TIME_SEGMENTS // N, TIME_SEGMENTS - 1)
+    edges = recording.start + recording.Ts * N * np.linspace(0, 1, TIME_SEGMENTS + 1)
+    profile = np.bincount(bins, energy, TIME_SEGMENTS) / energy.sum()
+    usual = np.bincount(bins, minlength=TIME_SEGMENTS) / N
+    statement = (
+        f"{percent(share)} of the {channel} error lies {when}, which is {percent(expected)} of the recording."
+    )
+    where = Where(statement, share, p_value, "time", channel, edges, profile, usual, "s")
+    return ErrorShare(where, expected)
+
+
+def in_frequency(channel: str, error: Float[np.ndarray, " N"], recording: Recording, unit: str) -> ErrorShare:
+    """The band, of all runs of neighbouring ones, that differs most from white noise."""
+    N = len(error)
+    power = np.abs(np.fft.rfft(error)) ** 2
+    weight = np.full(len(power), 2.0)  # squares of a real and an imaginary part
+    weight[0] = 1.0
+    if N % 2 == 0:
+        weight[-1] = 1.0
+    f = np.fft.rfftfreq(N, recording.Ts)
+    decades = [m * 10.0**k for k in range(-3, 6) for m in BAND_EDGES]
+    inner = [edge for edge in decades if 4 * f[1] <= edge < f[-1]]
+    # The first band is the constant part alone.
+    edges = np.array([0.0, 0.5 * f[1], *inner, f[-1]])
+    band = np.minimum(np.searchsorted(edges, f, side="right") - 1, len(edges) - 2)
+    profile = np.bincount(band, weight * power, len(edges) - 1)
+    freedom = np.bincount(band, weight, len(edges) - 1)
+    profile, usual = profile / profile.sum(), freedom / freedom.sum()
+    runs = [(0, 1)] + [(a, b) for a in range(1, len(usual)) for b in range(a + 1, len(usual) + 1)]
+    first, last = np.array(runs).T
+
+    def divergence(shares: np.ndarray) -> np.ndarray:
+        ends = np.insert(np.cumsum(shares, axis=-1), 0, 0.0, axis=-1)
+        total = np.insert(np.cumsum(usual), 0, 0.0)
+        return relative_entropy(ends[..., last] - ends[..., first], total[last] - total[first])
+
+    noise = np.random.default_rng(0).gamma(freedom / 2, size=(NOISE_DRAWS, len(freedom)))
+    highest = divergence(noise / noise.sum(axis=1, keepdims=True)).max(axis=1)
+    each = divergence(profile)
+    best = int(each.argmax())
+    low, high = runs[best]
+    share, expected = float(profile[low:high].sum()), float(usual[low:high].sum())
+    p_value = (1 + int(np.sum(highest >= each[best]))) / (1 + NOISE_DRAWS)
+    if low == 0:
+        offset, read = as_read(float(error.mean()), unit)
+        what = f"is a constant offset of {offset:.2g} {read}".rstrip()
+    else:
+        below, above = f"{edges[low]:g} Hz", f"{edges[high]:.4g} Hz"
+        what = f"lies below {above}" if low == 1 else f"lies between {edges[low]:g} and {above}"
+        what = f"lies above {below}" if high == len(usual) else what
+    statement = (
+        f"{percent(share)} of the {channel} error {what}, "
+        f"where white sensor noise would have {percent(expected)} of its power."
+    )
+    where = Where(statement, share, p_value, "frequency", channel, edges, profile, usual, "Hz")
+    return ErrorShare(where, expected)
+
+
+def percent(share: float) -> str:
+    """A share for a sentence.
+
+    >>> percent(0.784), percent(0.0042), percent(0.998), percent(1.0)
+    ('78 %', '0.4 %', '99.8 %', 'all')
+    """
+    p = 100 * float(share)
+    if p >= 99.5:
+        return f"{p:.1f} %" if p < 99.95 else "all"
+    return f"{p:.0f} %" if p >= 1 else f"{max(p, 0.1):.1f} %"
+
+
+SIGNIFICANCE = 0.05
+# A share must exceed the expected one by this much and by this factor to be worth a sentence.
+MIN_EXCESS, MIN_RATIO = 0.08, 1.3
+
+
+def locate(
+    recording: Recording,
+    residual: Real[np.ndarray, "..."],
+    channels: Sequence[str],
+    noise: Mapping[str, float] | Sequence[float] | Real[np.ndarray, " C"],
+    mechanism: Mechanism | None = None,
+    *,
+    window_seconds: float | None = None,
+) -> tuple[Where, ...]:
+    """Where the error of a model is larger than elsewhere, in sentences with their evidence.
+
+        share of a condition = sum of e^2 over its samples / sum of e^2
+
+    Each condition (such as "within 80 ms after the hub reverses") is measured by the divergence of its
+    share, `s log(s/p) + (1-s) log((1-s)/(1-p))` with `p` the share of the samples, and compared with
+    the same under all circular shifts of the error against the motion, which keep the correlation
+    of either in time. The best condition on a quantity is compared with the best of every shift, which
+    corrects for having tried several; quantities are compared by the rule of Benjamini and Hochberg.
+
+    A free run carries an error on long after it was made. Speed, deflection and reversals are
+    therefore also compared with the acceleration of the error, which shows where it *arises*.
+    Frequencies are compared with white sensor noise, time with an error that stays the same.
+
+    Not for a few correlation lengths of data: there shifts prove nothing, and nothing is found.
+
+    Args:
+        recording: What was measured.
+        residual: Measured minus simulated outputs (N, C), of windowed free runs for instance.
+        channels: Name of each column.
+        noise: Standard deviation of the sensor noise by channel, or in the order of `channels`.
+        mechanism: Says which port a channel measures; by its name if None.
+        window_seconds: Length of the windows after which the free run started again [s]; None for
+            one run. The jumps there are no error of the physics.
+
+    Returns:
+        Significant statements, the most informative first and frequencies last, since no real error is
+        white; one statement that nothing stands out if there is none.
+
+    Raises:
+        InputError: Shapes that do not fit, or values that are not finite.
+
+    Source: Westfall and Young 1993 (largest statistic over several); Lo 1991 (time); Benjamini and
+        Hochberg 1995.
+    """
+    e = np.asarray(residual, dtype=float)
+    e = e[:, None] if e.ndim == 1 else e
+    if e.shape != (recording.N, len(channels)) or not np.isfinite(e).all():
+        raise InputError(
+            f"Argument `residual` must have a finite number for each of the {recording.N} samples "
+            f"and {len(channels)} channels, but has the shape {e.shape} with "
+            f"{np.sum(~np.isfinite(e))} of them not finite; give measured minus simulated outputs."
+        )
+    if not isinstance(noise, Mapping):
+        noise = dict(zip(channels, np.asarray(noise, float).tolist(), strict=True))
+    sets = condition_sets(recording, channels, noise, mechanism)
+    found: list[ErrorShare] = []
+    for channel, error in zip(channels, e.T, strict=True):
+        if np.sum(error**2) <= 0.0:
+            continue
+        unit = recording.units[recording.channels.index(channel)]
+        found.append(in_time(channel, error, recording))
+        found.append(in_frequency(channel, error, recording, unit))
+        energies = {"lies": error**2, "arises": _acceleration_energy(error, recording, window_seconds)}
+        found += [in_conditions(channel, energies, conditions) for conditions in sets]
+    notable = [
+        f for f in _significant(found) if f.share >= max(f.expected + MIN_EXCESS, MIN_RATIO * f.expected)
+    ]
+    notable.sort(key=lambda f: (f.where.kind == "frequency", -float(relative_entropy(f.share, f.expected))))
+    return tuple(f.where for f in notable) or (_nothing_stands_out(e, channels, noise),)
+
+
+def _acceleration_energy(
+    error: np.ndarray, recording: Recording, window_seconds: float | None
+) -> np.ndarray | None:
+    """Squared acceleration of an error (N,): where it is made, wherever it is carried to."""
+    starts = [] if window_seconds is None else window_starts(recording, window_seconds)[0].tolist()
+    acceleration, seen = missing_acceleration(error, recording, starts)
+    squared = acceleration**2
+    if not np.sum(squared[seen]) > 0.0:
+        return None
+    # Where it is unknown, the average counts.
+    return np.where(seen, squared, squared[seen].mean())
+
+
+def _significant(found: Sequence[ErrorShare]) -> list[ErrorShare]:
+    """Those that remain when the number of comparisons is corrected for (Benjamini and Hochberg)."""
+    ranked = sorted(found, key=lambda f: f.where.p_value)
+    passed = [k for k, f in enumerate(ranked, 1) if f.where.p_value <= SIGNIFICANCE * k / len(ranked)]
+    return ranked[: max(passed, default=0)]
+
+
+def _nothing_stands_out(e: np.ndarray, channels: Sequence[str], noise: Mapping[str, float]) -> Where:
+    """What is said where nothing stands out."""
+    rms = dict(zip(channels, np.sqrt(np.mean(e**2, axis=0)).tolist(), strict=True))
+    small = all(rms[c] <= 1.3 * noise.get(c, 0.0) for c in channels)
+    return Where(
+        "The error is spread evenly: no time, frequency, speed or deflection stands out"
+        + (", and it is no larger than the noise of the sensors." if small else "."),
+        1.0,
+        1.0,
+        "time",
+        ", ".join(channels),
+        np.zeros(0),
+        np.zeros(0),
+        np.zeros(0),
+        "s",
+    )

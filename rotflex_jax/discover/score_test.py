@@ -1,0 +1,340 @@
+"""Which effect would explain the innovations best, before any refit.
+
+Every candidate is in the super-model with its amplitude at zero. The slope of the innovations along
+the amplitude, whitened, less its projection on everything the baseline can still move, says how much
+likelihood the effect would gain to first order (Rao's score statistic). Where a small amplitude does
+nothing yet (play that is smaller than what a tooth covers in a moment), the change of the innovations
+from a run at full size takes the place of the slope.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, restrict
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ReducedModel, SuperModel
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.fit.dataset import StackedRecordings
+from rotflex_jax.fit.problem import each_recording
+from rotflex_jax.mechanism import Mechanism, Solver
+from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.sensitivities import (
+    RecordingSamples,
+    RunParameters,
+    inactive_sensitivities,
+    predictor_jacobians,
+)
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import double_precision
+
+
+@persistent_jit(static=2)
+def _run_slopes(
+    structure: Mechanism, solver: Solver, parameter_set: ParameterSet, data: StackedRecordings
+) -> jax.Array:
+    def one(values: Any, x0: Any, K: Any, *samples: Any) -> Any:
+        return predictor_jacobians(
+            structure, solver, RunParameters(values, parameter_set.gates, x0, K), RecordingSamples(*samples)
+        )
+
+    return each_recording(one, (0,) * 7)(parameter_set.values, parameter_set.x0, parameter_set.K, *data)
+
+
+@persistent_jit(static=2)
+def _inactive_slopes(
+    structure: Mechanism,
+    solver: Solver,
+    parameter_set: ParameterSet,
+    present: jax.Array,
+    A: jax.Array,
+    directions: Directions,
+    data: StackedRecordings,
+) -> jax.Array:
+    def one(values: Any, x0: Any, K: Any, A: Any, dvalues: Any, *samples: Any) -> Any:
+        rest = jnp.asarray(rest_state(structure, np.float64))
+        numbers = RunParameters(values, parameter_set.gates, rest.at[present].set(x0), K)
+        slopes = (present, A, dvalues, directions.gates)
+        return inactive_sensitivities(structure, solver, numbers, RecordingSamples(*samples), *slopes)
+
+    J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0), out_axes=1)(
+        parameter_set.values, parameter_set.x0, parameter_set.K, A, directions.values, *data
+    )
+    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+
+
+class InactiveCandidates(NamedTuple):
+    """Candidates that are probed together.
+
+    Attributes:
+        family: Candidates that the program has; none of them with a threshold.
+        parameter_set: The hypothesis with some of them put in, at zero amplitude or with a closed gate.
+        directions: Along these.
+    """
+
+    family: Sequence[Candidate]
+    parameter_set: ParameterSet
+    directions: Directions
+
+
+def candidate_sensitivities(
+    predictor: BatchedPredictor, current: ParameterSet, batches: Sequence[InactiveCandidates]
+) -> Float[np.ndarray, "B D R N C"]:
+    """Slopes of innovations along candidates that are not active.
+
+    Args:
+        predictor: Runs hypotheses.
+        current: The hypothesis as it is.
+        batches: What to probe.
+    """
+    s = predictor.supermodel
+    active = s.active(current.gates)
+    with double_precision():
+        structure, inputs = active.mechanism.structure, restrict(current, active)
+        A = _run_slopes(structure, predictor.solver, inputs, predictor.on_device())
+
+    def run(job: tuple[ReducedModel, InactiveCandidates]) -> np.ndarray:
+        model, (_, parameter_set, d) = job
+        along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
+        with double_precision():
+            present = jnp.array([model.states.index(i) for i in active.states])
+            structure, inputs = model.mechanism.structure, restrict(parameter_set, model)
+            solver, data = predictor.solver, predictor.on_device()
+            return np.asarray(_inactive_slopes(structure, solver, inputs, present, A, along, data))
+
+    jobs = [(s.with_family(current.gates, b.family), b) for b in batches]
+    return np.stack(predictor.run_jobs(run, jobs, lambda job: ("probes", active.effects, job[0].effects)))
+
+
+# An effect that can gain this much (chi-square) is found about every other time: both the training and
+# the validation data must have their share of it.
+DETECTABLE_CHI2 = 40.0
+# Directions per pass.
+PROBES_PER_BATCH = 8
+# An effect with a threshold acts at its size: this share of it at most.
+MAX_THRESHOLD_AMPLITUDE = 1.5
+# Shapes beside the best one at which a refit may start.
+EXTRA_SHAPES = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """A candidate's score.
+
+    Attributes:
+        start: Where a refit should start, with the log-likelihood gained to first order.
+        nats: The same gain, less half a log N per parameter it needs [nat].
+        excited: Whether an effect of plausible size would have been visible.
+        orthogonal_fraction: Norm of the projected slope over the norm of the slope.
+        detection_limit: Factor of the plausible size that would just have been visible.
+    """
+
+    start: CandidateStart
+    nats: float
+    excited: bool
+    orthogonal_fraction: float
+    detection_limit: float
+
+    @property
+    def location(self) -> EffectLocation:
+        """Effect and port."""
+        return self.start.location
+
+
+@dataclasses.dataclass(frozen=True)
+class _Probe:
+    """One direction of the test: candidate, alternative, member of the alternative."""
+
+    candidate: Candidate
+    shape: int
+    member: int
+
+
+def _packed(candidates: list[Candidate]) -> list[list[_Probe]]:
+    """Probes that share a parameter set: as many as it has directions, of each candidate one shape only."""
+    batches: list[list[_Probe]] = []
+    for c in candidates:
+        for shape, group in enumerate(c.probes):
+            own = [_Probe(c, shape, member) for member in range(len(group))]
+            with_space = [b for b in batches if len(b) + len(own) <= PROBES_PER_BATCH]
+            if suitable := [b for b in with_space if all(p.candidate is not c for p in b)]:
+                suitable[0].extend(own)
+            else:
+                batches.append(own)
+    return batches
+
+
+def _with_probes(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> ParameterSet:
+    """The hypothesis with candidates on at zero amplitude, or off where they have no amplitude."""
+    values, gates = h.values(s), s.gates(h.locations)
+    for p in probes:
+        c = p.candidate
+        for k, i in enumerate(c.parameters):
+            values[:, i] = 0.0 if c.amplitudes[k] else c.probes[p.shape][0][k]
+        gates[c.effect] = 1.0 if any(c.amplitudes) else 0.0
+    return ParameterSet(values, h.x0, gates, h.K)
+
+
+def _directions(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> Directions:
+    """Directions of probes: along amplitudes by their values, along effects without any by the gate."""
+    D, (R, m), P, E = PROBES_PER_BATCH, h.x0.shape, len(h.z), len(s.mechanism.effects)
+    d = Directions(np.zeros((D, R, P)), np.zeros((D, m)), np.zeros((D, E)))
+    for row, p in enumerate(probes):
+        c = p.candidate
+        if not any(c.amplitudes):
+            d.gates[row, c.effect] = 1.0
+            continue
+        for k, i in enumerate(c.parameters):
+            if c.amplitudes[k]:
+                d.values[row, :, i] = c.probes[p.shape][p.member][k]
+    return d
+
+
+def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
+    """Scores of all candidates that are not yet in the hypothesis, best first."""
+    s, seen = problem.supermodel, problem.seen
+    candidates = [c for c in s.candidates.values() if c.location not in h.locations]
+    if not candidates:
+        return []
+    families = s.families([c for c in candidates if not c.threshold])
+    batches = [(family, probes) for family in families for probes in _packed(family)]
+    e, J = problem.slopes([h])
+    w = h.whitener(e[0], seen)
+    nuisance = _expanded(h, h.whitener(J[0, : h.moved], seen))
+    jobs = [
+        InactiveCandidates(family, _with_probes(s, h, probes), _directions(s, h, probes))
+        for family, probes in batches
+    ]
+    slopes = candidate_sensitivities(problem.predictor, h.parameter_set(s), jobs) if jobs else ()
+    Q = np.linalg.qr(nuisance.T / np.maximum(np.linalg.norm(nuisance, axis=1), 1e-300))[0]
+    r = w.ravel()
+    r = r - Q @ (Q.T @ r)
+    columns: dict[tuple[EffectLocation, int], list[np.ndarray]] = {}
+    for (_, probes), J in zip(batches, slopes, strict=True):
+        W = h.whitener(J[: len(probes)], seen).reshape(len(probes), -1)
+        for p, column in zip(probes, W, strict=True):
+            columns.setdefault((p.candidate.location, p.shape), []).append(column)
+    for key, change in _changes(problem, h, e[0], [c for c in candidates if c.threshold]):
+        columns[key] = [h.whitener(change, seen).ravel()]
+    headroom = float(np.exp(h.whitener.log_det / (2 * e.shape[-1])) / np.exp(np.mean(np.log(problem.noise))))
+    projection = _Projection(Q, r, columns, problem.measured_values, max(headroom, 1.0))
+    return sorted((_score(c, projection) for c in candidates), key=lambda found: -found.nats)
+
+
+def _changes(
+    problem: LikelihoodProblem, h: Hypothesis, e: np.ndarray, candidates: list[Candidate]
+) -> Iterator[tuple[tuple[EffectLocation, int], np.ndarray]]:
+    """For every shape of a candidate with a threshold, what it changes in the innovations (R, N, C)."""
+    s, keys, parameter_sets = problem.supermodel, [], []
+    for c in candidates:
+        locations = (*h.locations, c.location)
+        for shape, (member,) in enumerate(c.probes):
+            values = h.values(s)
+            values[:, c.parameters] = member
+            keys.append((c.location, shape))
+            x0 = h.initial_state_for(s, locations)
+            parameter_sets.append(ParameterSet(values, x0, s.gates(locations), h.K))
+    if parameter_sets:
+        yield from zip(keys, problem.predictor.innovations(parameter_sets) - e, strict=True)
+
+
+def _expanded(h: Hypothesis, W: np.ndarray) -> np.ndarray:
+    """Nuisance directions as rows (D', R N C); local ones once per recording."""
+    shared, R = len(h.free), W.shape[1]
+    rows = [W[k].ravel() for k in range(shared)]
+    for k in range(shared, h.moved):
+        for r in range(R):
+            one = np.zeros_like(W[k])
+            one[r] = W[k, r]
+            rows.append(one.ravel())
+    return np.array(rows)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Projection:
+    """The innovations less what the hypothesis can still explain, and the slopes of all candidates.
+
+    Attributes:
+        Q: Orthonormal basis of what the hypothesis can still move.
+        r: Whitened innovations less their projection on Q.
+        columns: (location, shape) -> whitened slopes, one per probe.
+        samples: How many values were measured.
+        headroom: Innovations over sensor noise: how much smaller they would be if the model were right.
+    """
+
+    Q: Float[np.ndarray, "M D"]
+    r: Float[np.ndarray, " M"]
+    columns: dict[tuple[EffectLocation, int], list[Float[np.ndarray, " M"]]]
+    samples: float
+    headroom: float
+
+
+def _score(c: Candidate, projection: _Projection) -> Score:
+    """The best shape of a candidate, with starts at the next best ones."""
+    shapes = [_score_of_shape(c, shape, projection) for shape in range(len(c.probes))]
+    best, *rest = sorted(shapes, key=lambda s: -s.nats)
+    others = tuple(s.start.values for s in rest[:EXTRA_SHAPES] if s.start.expected_gain > 0)
+    return dataclasses.replace(best, start=dataclasses.replace(best.start, others=others))
+
+
+def _score_of_shape(c: Candidate, shape: int, projection: _Projection) -> Score:
+    group = np.array(c.probes[shape], float)
+    J = np.array(projection.columns[(c.location, shape)]).T
+    values = group[0].copy()
+    if not np.all(np.isfinite(J)):
+        start = CandidateStart(c.location, values, expected_gain=-np.inf)
+        return Score(start, -np.inf, False, 0.0, np.inf)
+    full = np.linalg.norm(J, axis=0)
+    J = J - projection.Q @ (projection.Q.T @ J)
+    left = np.linalg.norm(J, axis=0)
+    a = _amplitudes(J, projection.r, c)
+    a = np.minimum(a, MAX_THRESHOLD_AMPLITUDE) if c.threshold else a
+    explained = J @ a
+    gain = float(-explained @ projection.r - 0.5 * explained @ explained)
+    df = max(int(np.count_nonzero(a)), 1) + (1 if len(c.probes) > 1 else 0)
+    if any(c.amplitudes):
+        values = np.where(c.amplitudes, a @ group, values)
+    strongest = max(float(left.max()) * projection.headroom, 1e-300)
+    return Score(
+        CandidateStart(c.location, values, expected_gain=gain),
+        gain - 0.5 * df * float(np.log(projection.samples)),
+        excited=strongest**2 > DETECTABLE_CHI2,
+        orthogonal_fraction=float((left / np.maximum(full, 1e-300)).max()),
+        detection_limit=float(np.sqrt(DETECTABLE_CHI2) / strongest),
+    )
+
+
+def _amplitudes(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:
+    """Amplitudes that lower |r + J a| most, none of them negative where only positive ones exist."""
+    keep = np.linalg.norm(J, axis=0) > 1e-9 * max(float(np.linalg.norm(r)), 1e-300)
+    a = np.zeros(J.shape[1])
+    while keep.any():
+        found = np.linalg.lstsq(J[:, keep], -r, rcond=1e-8)[0]
+        if not c.one_sided or np.all(found >= 0):
+            a[keep] = found
+            break
+        drop = np.flatnonzero(keep)[np.argmin(found)]
+        keep[drop] = False
+    return a
+
+
+def promising(listed: list[Score], most: int) -> list[Score]:
+    """Scores worth a refit, best first.
+
+    A richer effect that gains nothing to first order over the simpler one it contains (a friction that
+    is the same both ways, say) would only be refitted to the same model.
+    """
+    gains = {s.location: s.start.expected_gain for s in listed}
+    worth = []
+    for s in (s for s in listed if s.nats > 0):
+        contained = (EffectLocation(name, s.location.port) for name in CATALOG[s.location.effect].contains)
+        simpler = [gains[c] for c in contained if c in gains]
+        if all(s.start.expected_gain > g + 1.0 for g in simpler):
+            worth.append(s)
+    return worth[:most]

@@ -1,0 +1,166 @@
+"""The likelihood of validation data decides, and it may decide for a set of effects.
+
+Two candidates whose validation log-likelihoods differ by less than their scatter over half-second blocks
+are reported together; a richer effect must beat the simpler one that it contains beyond doubt.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, in_blocks, validate
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.fit.dataset import StackedRecordings
+
+# An effect must gain this on validation data [nat], beyond this many standard deviations of the block gains,
+# and this on the training data after half a log N per parameter, beyond as many standard deviations.
+HELD_OUT_NATS, HELD_OUT_Z, TRAIN_NATS, TRAIN_Z = 5.0, 1.5, 8.0, 2.0
+# Mean log error of free runs over short windows: near the sensor noise it may rise by no more than the
+# first, elsewhere it must fall by the second.
+WINDOWS_WORSE, WINDOWS_BETTER = 0.02, 0.01
+# Two effects are distinguished by this many standard deviations of their paired block differences, or by free
+# runs over short windows whose errors differ by more than this (mean log ratio).
+SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
+
+
+def paired_gain(a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"]) -> tuple[float, float]:
+    """By how many nats blocks `a` exceed blocks `b`, and how many standard deviations that is."""
+    d = a - b
+    spread = float(np.std(d, ddof=1) * np.sqrt(len(d))) if len(d) > 1 else np.inf
+    return float(d.sum()), float(d.sum()) / max(spread, 1e-12)
+
+
+def describe(candidate: ValidatedHypothesis, current: ValidatedHypothesis, data: StackedRecordings) -> str:
+    """One line: what a candidate gained."""
+    nats, z = paired_gain(candidate.blocks, current.blocks)
+    train, train_z = _training_gain(candidate, current, data)
+    ratio = float(np.exp(_log_error_ratio(candidate, current)))
+    return (
+        f"{candidate.location}: {nats:.0f} nats on validation data (z {z:.1f}), {train:.0f} "
+        f"on training data (z {train_z:.1f}), {error_ratio(ratio)}"
+    )
+
+
+def error_ratio(ratio: float) -> str:
+    """How a free-run error compares with the one before.
+
+    >>> error_ratio(1.87), error_ratio(0.534)
+    ('free-run error 1.9 times as large', 'free-run error 0.53 times as large')
+    """
+    return f"free-run error {ratio:.2g} times as large"
+
+
+def _training_gain(
+    a: ValidatedHypothesis, b: ValidatedHypothesis, data: StackedRecordings
+) -> tuple[float, float]:
+    return paired_gain(in_blocks(a.hypothesis.densities, data), in_blocks(b.hypothesis.densities, data))
+
+
+def _log_error_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
+    """Mean log ratio of the errors of short free runs; negative where `a` is better."""
+    return float(np.mean(np.log(a.window_rmse / b.window_rmse)))
+
+
+def admissible(
+    candidate: ValidatedHypothesis,
+    current: ValidatedHypothesis,
+    data: StackedRecordings,
+    noise: Float[np.ndarray, " C"],
+) -> bool:
+    """Whether what a candidate adds is there beyond doubt.
+
+    Args:
+        candidate: The richer hypothesis.
+        current: Without what it adds.
+        data: Training recordings.
+        noise: Standard deviation of the sensor noise of each channel.
+    """
+    nats, z = paired_gain(candidate.blocks, current.blocks)
+    train, train_z = _training_gain(candidate, current, data)
+    measured = float(np.sum(data.seen)) * data.y.shape[-1]
+    needed = TRAIN_NATS + 0.5 * candidate.parameter_count * float(np.log(measured))
+    # Likelihood is about the next samples, a user's free runs are about many: both must agree. Far from the
+    # sensor noise, an effect that leaves free runs as they were is flexibility, not a discovery.
+    far = bool(np.any(current.window_rmse > 2 * noise))
+    limit = -WINDOWS_BETTER if far else WINDOWS_WORSE
+    enough = nats > HELD_OUT_NATS and z > HELD_OUT_Z and train > needed and train_z > TRAIN_Z
+    return enough and _log_error_ratio(candidate, current) < limit
+
+
+def choose(
+    candidates: list[ValidatedHypothesis],
+    current: ValidatedHypothesis,
+    data: StackedRecordings,
+    noise: Float[np.ndarray, " C"],
+) -> tuple[ValidatedHypothesis | None, list[ValidatedHypothesis]]:
+    """The best admissible candidate and those not distinguished from it; arguments as in `admissible`.
+
+    A rival need not pass every test that the winner passed: where the effect is small, which of the two
+    passes is chance. It is enough that it gains something and that nothing distinguishes it from the winner.
+    """
+    able = [t for t in candidates if admissible(t, current, data, noise)]
+    if not able:
+        return None, []
+    winner = max(able, key=lambda t: t.log_likelihood)
+    simpler = [t for t in able if _contained(t, winner) and not _clearly_better(winner, t, current)]
+    if simpler:
+        winner = max(simpler, key=lambda t: t.log_likelihood)
+    rivals = [
+        t for t in candidates if t is not winner and not _contained(winner, t) and not _contained(t, winner)
+    ]
+    gains = [
+        t
+        for t in rivals
+        if t.log_likelihood > current.log_likelihood and _training_gain(t, current, data)[0] > 0
+    ]
+    return winner, [t for t in gains if not distinguished(winner, t, data)]
+
+
+def validate_from_best_states(
+    validation: ValidationSet, candidates: list[ValidatedHypothesis]
+) -> list[ValidatedHypothesis]:
+    """Candidates; a simpler effect may also start in the first states of a richer one that does better.
+
+    The search for these states may end in different minima, which must not decide between effects.
+    """
+    out = []
+    for t in candidates:
+        richer = [r for r in candidates if _contained(t, r) and r.log_likelihood > t.log_likelihood]
+        if richer:
+            best = max(richer, key=lambda r: r.log_likelihood)
+            again = validate(validation, t.hypothesis, best)
+            again = dataclasses.replace(again, location=t.location, parameter_count=t.parameter_count)
+            t = max(t, again, key=lambda x: x.log_likelihood)
+        out.append(t)
+    return out
+
+
+def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis, data: StackedRecordings) -> bool:
+    """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
+    if _log_error_ratio(rival, winner) > WINDOWS_APART:
+        return True
+    a, b = (np.concatenate([t.blocks, in_blocks(t.hypothesis.densities, data)]) for t in (winner, rival))
+    return paired_gain(a, b)[1] >= SEPARATE_Z
+
+
+def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
+    """Whether `large` has the effect of `small` as a special case."""
+    a, b = small.location, large.location
+    assert a and b
+    return a.port == b.port and a.effect in CATALOG[b.effect].contains
+
+
+def _clearly_better(
+    rich: ValidatedHypothesis, simple: ValidatedHypothesis, current: ValidatedHypothesis
+) -> bool:
+    """Whether the richer effect is worth its extra parameters on validation and on training data."""
+    nats, z = paired_gain(rich.blocks, simple.blocks)
+    train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
+    share = nats / max(paired_gain(rich.blocks, current.blocks)[0], 1e-9)
+    return nats > 10 and z > 2.5 and train > 20 and share > 0.003
+
+
+def runs_clearly_better(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> bool:
+    """Whether errors `a` of short free runs are clearly smaller than errors `b`."""
+    return float(np.mean(np.log(a / b))) < -WINDOWS_BETTER

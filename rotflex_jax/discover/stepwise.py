@@ -1,0 +1,400 @@
+"""The stepwise search: fit the baseline, add, remove, swap and merge effects, assign calibrations."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from rotflex_jax.discover.hypothesis import (
+    CandidateStart,
+    Hypothesis,
+    embed_initial_state,
+    is_physical,
+    replacing,
+    with_candidate,
+    with_effect,
+    without,
+)
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.refit import levenberg_marquardt, refit
+from rotflex_jax.discover.selection import (
+    TRAIN_NATS,
+    TRAIN_Z,
+    WINDOWS_BETTER,
+    distinguished,
+    paired_gain,
+    runs_clearly_better,
+)
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, in_blocks, validate
+from rotflex_jax.discover.whitening import Whitener
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.mechanism.assembly import Layout
+
+
+def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
+    """The user's model with calibrations, fitted from a short, a middle and an endless prediction horizon."""
+    s, noise, first = problem.supermodel, problem.noise, problem.dataset.first_states
+    R, C = len(first), len(s.mechanism.channels)
+    z = s.transform.unconstrain(s.mechanism.values)
+    for i in s.local:
+        z[i] = 0.0
+    start = Hypothesis(
+        locations=s.calibrations,
+        free=tuple(s.baseline_free),
+        local=tuple(s.local),
+        z=z,
+        local_z=np.zeros((R, len(s.local))),
+        x0=embed_initial_state(s, s.calibrations, first),
+        K=np.zeros((R, Layout.of(s.mechanism.structure).size, C)),
+        process_noise={},
+        whitener=Whitener(np.eye(1, 1).repeat(C, 0), np.diag(1 / noise)),
+    )
+    least, most = problem.process_noise_range
+    intensities = (most, np.sqrt(least * most), least)
+    # A distant start is safe only with a short horizon: all paths begin with one.
+    near = problem.with_process_noise(start, dict.fromkeys(problem.ports, 100 * most))
+    near = refit(problem, [near], alternations=0)[0]
+    paths = [problem.with_process_noise(near, dict.fromkeys(problem.ports, q)) for q in intensities]
+    return max(refit(problem, paths, wide=True), key=lambda h: h.log_likelihood)
+
+
+# Steps tried of each shape of a candidate before the best one is chosen.
+SHAPE_CHOICE_STEPS = 6
+# Shares of the amplitude that the score test suggests at which a refit may start.
+AMPLITUDE_SHARES = (1.0, 0.4, 0.1, 0.02)
+# A refit that gains less than this share of what the score test expects has not converged to the effect.
+STUCK_SHARE = 0.5
+
+
+def refit_candidates(
+    problem: LikelihoodProblem, current: Hypothesis, starts: Sequence[CandidateStart]
+) -> list[Hypothesis]:
+    """The current model with each candidate added and refitted.
+
+    First order overshoots where an effect is strongly nonlinear, so a refit starts at the likeliest of
+    several shares of the amplitude, and at the shape with which a few steps gain most. One that ends far
+    below what the score test expects starts again from a small amplitude of every shape. An effect with
+    memory takes the place of the simpler one that it contains: two in parallel would be a third effect.
+    """
+    s = problem.supermodel
+    shapes = [
+        (i, dataclasses.replace(c, values=x)) for i, c in enumerate(starts) for x in (c.values, *c.others)
+    ]
+    grown = [[with_candidate(s, current, c, share) for share in AMPLITUDE_SHARES] for _, c in shapes]
+    likely = problem.log_likelihoods([h for row in grown for h in row]).reshape(len(grown), -1)
+    likeliest = [row[int(np.argmax(ll))] for row, ll in zip(grown, likely, strict=True)]
+    refitted = refit(problem, _best_shapes(problem, [i for i, _ in shapes], likeliest))
+    gains = [h.log_likelihood - current.log_likelihood for h in refitted]
+    stuck = {i for i, gain in enumerate(gains) if gain < STUCK_SHARE * max(starts[i].expected_gain, 0.0)}
+    again = [(i, row[-1]) for (i, _), row in zip(shapes, grown, strict=True) if i in stuck]
+    refitted = _refit_from(problem, refitted, again)
+    # An effect that contains another one is never worse: where a refit is, it starts again from that one.
+    below = [
+        (i, replacing(s, refitted[j], [b.location], a, AMPLITUDE_SHARES[-1]))
+        for i, a in enumerate(starts)
+        for j, b in enumerate(starts)
+        if a.location.port == b.location.port
+        and b.location.effect in CATALOG[a.location.effect].contains
+        and refitted[i].log_likelihood < refitted[j].log_likelihood
+    ]
+    return _refit_from(problem, refitted, below)
+
+
+def _refit_from(
+    problem: LikelihoodProblem, refitted: list[Hypothesis], starts: list[tuple[int, Hypothesis]]
+) -> list[Hypothesis]:
+    """Refits, some also from other starts (index of the candidate, start); the likelier one is kept."""
+    best = list(refitted)
+    fitted = refit(problem, [h for _, h in starts]) if starts else []
+    for (i, _), h in zip(starts, fitted, strict=True):
+        best[i] = max(best[i], h, key=lambda x: x.log_likelihood)
+    return best
+
+
+def _best_shapes(
+    problem: LikelihoodProblem, candidates: list[int], starts: list[Hypothesis]
+) -> list[Hypothesis]:
+    """For each candidate the start with which a short fit gains most; `candidates` has that of each start."""
+    several = [k for k, i in enumerate(candidates) if candidates.count(i) > 1]
+    current = list(starts)
+    if several:
+        fitted = levenberg_marquardt(problem, [current[k] for k in several], max_steps=SHAPE_CHOICE_STEPS)
+        for k, h in zip(several, fitted, strict=True):
+            current[k] = h
+    best = {}
+    for i, h in zip(candidates, current, strict=True):
+        if i not in best or h.log_likelihood > best[i].log_likelihood:
+            best[i] = h
+    return [best[i] for i in sorted(best)]
+
+
+def eliminate(
+    problem: LikelihoodProblem, h: Hypothesis, added: list[EffectLocation]
+) -> tuple[Hypothesis, dict[EffectLocation, float]]:
+    """Drop, one at a time, effects without which the model is as good.
+
+    The effect added last has just shown that it is needed; earlier ones may have become needless, and
+    calibrations have shown nothing yet.
+
+    Returns:
+        The model with what is needed, and what each effect that was tested gains [nat].
+    """
+    s = problem.supermodel
+    while tested := [p for p in h.locations if p not in added[-1:]]:
+        rivals = refit(problem, [without(s, h, p) for p in tested], alternations=1)
+        worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
+        count = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in s.calibrations else 1) for p in worth}
+        needed = {p: TRAIN_NATS + 0.5 * count[p] * np.log(problem.measured_values) for p in worth}
+        surplus = {p: worth[p] - needed[p] for p in worth}
+        for p, r in zip(tested, rivals, strict=True):
+            if p in s.calibrations:
+                continue
+            # An effect that gains in a few moments of the recording only is not needed.
+            blocks = (in_blocks(x.densities, problem.dataset.data) for x in (h, r))
+            if paired_gain(*blocks)[1] < TRAIN_Z:
+                surplus[p] = min(surplus[p], -1.0)
+        weakest = min(surplus, key=lambda p: surplus[p])
+        if surplus[weakest] >= 0:
+            return h, worth
+        h = rivals[tested.index(weakest)]
+    return h, {}
+
+
+def remaining_rivals(
+    problem: LikelihoodProblem,
+    validation: ValidationSet,
+    final: Hypothesis,
+    rivals: dict[EffectLocation, list[EffectLocation]],
+    found: list[EffectLocation],
+) -> dict[EffectLocation, list[EffectLocation]]:
+    """Rivals that the final model, with one of them in the place of a found effect, cannot exclude.
+
+    What looked alike in a round may be distinguished once the other effects are in the model; a rival that
+    was itself found in another round is no rival.
+    """
+    s = problem.supermodel
+    remaining = {p: [r for r in rivals[p] if r not in found] for p in found}
+    pairs = [(p, r) for p in found for r in remaining[p]]
+    if not pairs or len(found) == 1:
+        return remaining
+    swapped = []
+    for p, r in pairs:
+        start = CandidateStart(r, np.array(s.candidates[r].probes[0]).max(axis=0))
+        swapped.append(with_effect(s, without(s, final, p), start, 0.4))
+    best = validate(validation, final)
+    validated = [validate(validation, h) for h in refit(problem, swapped)]
+    data = problem.dataset.data
+    alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(best, t, data)}
+    return {p: [r for r in remaining[p] if (p, r) in alike] for p in found}
+
+
+def nested_models(
+    problem: LikelihoodProblem,
+    final: Hypothesis,
+    order: Sequence[EffectLocation],
+    own: Sequence[EffectLocation],
+    passed: Sequence[Hypothesis],
+) -> list[Hypothesis]:
+    """The baseline alone, then with one more effect at a time, each refitted; the final model last.
+
+    A model that the search has passed, calibrations apart, starts from there. Calibrations that belong
+    to recordings (`own`) are in every model.
+    """
+    s, below = problem.supermodel, []
+    calibrations = set(s.calibrations)
+    for k in range(len(order)):
+        wanted = {*order[:k], *own}
+        known = [h for h in passed if wanted - calibrations == set(h.locations) - calibrations]
+        h = known[0] if known and wanted <= set(known[0].locations) else final
+        for location in set(h.locations) - wanted:
+            h = without(s, h, location)
+        below.append(h)
+    return [*(refit(problem, below, wide=True, alternations=2) if below else []), final]
+
+
+# What one effect may lose against several, beyond the penalty for its fewer parameters [nat].
+MERGE_LOSS_NATS = 2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class MergedEffects:
+    """Several effects that are one effect as well.
+
+    Attributes:
+        final: The hypothesis with the one effect.
+        effect: The one effect.
+        simpler: The effect that it contains.
+        replaced: All that it stands for.
+        same_count: Whether it needs as many parameters as they, so that the data do not prefer the one.
+    """
+
+    final: Hypothesis
+    effect: EffectLocation
+    simpler: EffectLocation
+    replaced: tuple[EffectLocation, ...]
+    same_count: bool
+
+    @property
+    def note(self) -> str:
+        """The merge in a sentence, for the reader of the result."""
+        several = " and ".join(map(titled, self.replaced))
+        count = "as many parameters" if self.same_count else "more parameters"
+        return (
+            f"{several} together are the same as {titled(self.effect)}, with {count} "
+            "and more effects; the one effect is reported."
+        )
+
+
+def titled(location: EffectLocation) -> str:
+    """An effect and its port in words."""
+    return f"{CATALOG[location.effect].title} at {location.port}"
+
+
+def merge_effects(
+    problem: LikelihoodProblem,
+    validation: ValidationSet,
+    final: Hypothesis,
+    order: Sequence[EffectLocation],
+) -> MergedEffects | None:
+    """The one effect that does without the machine's calibrations what the final model does with them.
+
+    A constant torque is a voltage offset at the hub and a shifted deflection at the joint, and an
+    asymmetric friction is a symmetric one and a constant torque: calibrations, which are in every model,
+    take its asymmetry away before a search can ask for it. Fewer effects that explain as much are the
+    better answer.
+
+    Args:
+        problem: With the training recordings.
+        validation: The validation recordings.
+        final: The final model.
+        order: Its effects and the calibrations that belong to the machine.
+    """
+    s = problem.supermodel
+    calibrations = [p for p in order if p in s.calibrations]
+    pairs = [
+        (simple, rich)
+        for simple in order
+        if simple not in calibrations
+        for rich in s.candidates
+        if calibrations and rich.port == simple.port
+        if simple.effect in CATALOG[rich.effect].contains and rich not in order
+        if CATALOG[rich.effect].state_part != "memory"
+    ]
+    if not pairs:
+        return None
+    starts = []
+    for simple, rich in pairs:
+        bare = final
+        level = max(final.mean_values(s)[s.parameter_indices(simple)])
+        for location in (simple, *calibrations):
+            bare = without(s, bare, location)
+        c = s.candidates[rich]
+        values = np.where(c.amplitudes, level, np.array(c.probes[0][0]))
+        starts.append(with_effect(s, bare, CandidateStart(rich, values), 1.0))
+    fitted = refit(problem, starts, alternations=1)
+    (simple, rich), one = max(zip(pairs, fitted, strict=True), key=lambda pair: pair[1].log_likelihood)
+    before = len(s.parameter_indices(simple)) + len(final.x0) * len(calibrations)
+    saved = before - len(s.parameter_indices(rich))
+    allowed = MERGE_LOSS_NATS + 0.5 * saved * np.log(problem.measured_values)
+    if saved < 0 or one.log_likelihood < final.log_likelihood - allowed or not is_physical(s, one, rich):
+        return None
+    kept = [rich if p == simple else p for p in order if p not in calibrations]
+    errors = validation.short_run_errors(validate(validation, one).with_trained_calibrations, kept)
+    several = validation.short_run_errors(validate(validation, final).with_trained_calibrations, order)
+    if float(np.mean(np.log(errors / several))) > WINDOWS_BETTER:
+        return None
+    return MergedEffects(one, rich, simple, (simple, *calibrations), saved == 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class AssignedCalibrations:
+    """Where the calibrations of a final model belong.
+
+    Attributes:
+        final: The final model.
+        order: Effects and calibrations of the machine, in order.
+        own: Calibrations that belong to the training recordings alone.
+        notes: A remark for the reader where calibrations were left out altogether.
+    """
+
+    final: Hypothesis
+    order: list[EffectLocation]
+    own: list[EffectLocation]
+    notes: tuple[str, ...]
+
+
+def assign_calibrations(
+    problem: LikelihoodProblem, validation: ValidationSet, final: Hypothesis, order: list[EffectLocation]
+) -> AssignedCalibrations:
+    """Decide whether the calibrations of a final model are the machine's, the recordings' or needless."""
+    calibrations = [p for p in order if p in problem.supermodel.calibrations]
+    validated = validate(validation, final)
+    order, own = _split_calibrations(validation, validated, order)
+    bare = _better_without(problem, validation, validated, order)
+    if bare is None:
+        return AssignedCalibrations(final, order, own, ())
+    note = (
+        f"The training data ask for {' and '.join(map(titled, calibrations))}, but held-out runs are better "
+        "with a model fitted without; left out."
+    )
+    return AssignedCalibrations(bare, [p for p in order if p in bare.locations], [], (note,))
+
+
+def _split_calibrations(
+    validation: ValidationSet, final: ValidatedHypothesis, order: list[EffectLocation]
+) -> tuple[list[EffectLocation], list[EffectLocation]]:
+    """Effects of the machine, and calibrations that belong to the training recordings alone.
+
+    A calibration is one of the machine if its trained value makes validation runs clearly better.
+    """
+    kept, own, trained = list(order), [], final.with_trained_calibrations
+    for location in [p for p in order if p in validation.problem.supermodel.calibrations]:
+        with_it = validation.short_run_errors(trained, kept)
+        less = validation.short_run_errors(trained, [p for p in kept if p != location])
+        if float(np.mean(np.log(with_it / less))) > -WINDOWS_BETTER:
+            kept.remove(location)
+            own.append(location)
+    return kept, own
+
+
+def _better_without(
+    problem: LikelihoodProblem,
+    validation: ValidationSet,
+    final: ValidatedHypothesis,
+    order: Sequence[EffectLocation],
+) -> Hypothesis | None:
+    """The final model fitted without calibrations, where that runs better on the validation recordings.
+
+    Training recordings may ask for offsets that the validation recordings do not share; parameters fitted
+    beside such offsets are then further off than those fitted as if there were none.
+    """
+    bare, s = final.hypothesis, problem.supermodel
+    calibrations = set(bare.locations) & set(s.calibrations)
+    if not calibrations:
+        return None
+    for location in calibrations:
+        bare = without(s, bare, location)
+    bare = refit(problem, [bare])[0]
+    with_them = validation.short_run_errors(final.with_trained_calibrations, order)
+    locations = [p for p in order if p in bare.locations]
+    alone = validation.short_run_errors(validate(validation, bare).with_trained_calibrations, locations)
+    return bare if runs_clearly_better(alone, with_them) else None
+
+
+def calibration_notes(
+    s: SuperModel, final: ValidatedHypothesis, own: Sequence[EffectLocation]
+) -> tuple[str, ...]:
+    """What differs between recordings, in sentences."""
+    out = []
+    for location in own:
+        for i in s.parameter_indices(location):
+            unit = s.mechanism.parameter_specifications[i].unit
+            columns = (h.values(s)[:, i] for h in (final.hypothesis, final.adapted))
+            trained, adapted = (", ".join(f"{v:+.3g} {unit}" for v in column) for column in columns)
+            out.append(
+                f"{titled(location)} belongs to each recording, not to the machine: "
+                f"{trained} in the training data, {adapted} in the held-out data; it was fitted, "
+                f"but not carried over."
+            )
+    return tuple(out)

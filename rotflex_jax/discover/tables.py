@@ -1,0 +1,154 @@
+"""What a card, a terminal and a report list of a search: errors, parameters, outcomes, labels."""
+
+import dataclasses
+import math
+from enum import StrEnum
+
+from rotflex_jax.discover.result import NEAR_FLOOR, Ranked, SearchResult, Stage
+from rotflex_jax.effects.labels import effect_label
+from rotflex_jax.text.numbers import plain_number, ratio, readable, unit_text, value_and_interval
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorCell:
+    """One error: the number, its multiple of the noise, and whether it has reached the noise."""
+
+    value: str
+    multiple: str
+    reached: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorRow:
+    """Errors of one stage: over windows and over the whole run, one cell per channel."""
+
+    label: str
+    windows: tuple[ErrorCell, ...]
+    whole: tuple[ErrorCell, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterRow:
+    """One parameter in all stages: (value, interval) each, None where the stage lacks it."""
+
+    name: str
+    meaning: str
+    unit: str
+    held: bool
+    stages: tuple[tuple[str, str] | None, ...]
+    note: str
+
+
+def stage_labels(discovery: SearchResult) -> tuple[str, ...]:
+    """A short name for each stage."""
+    added = (f"+ {effect_label(r.effect, r.port)}" for r in discovery.rounds)
+    return ("baseline", *added)
+
+
+def error_rows(discovery: SearchResult) -> tuple[ErrorRow, ...]:
+    """Held-out errors of every stage."""
+    by_channel = channel_units(discovery)
+
+    def cells(errors: dict[str, float]) -> tuple[ErrorCell, ...]:
+        return tuple(_cell(errors[c], unit, discovery.noise_floor.get(c)) for c, unit in by_channel.items())
+
+    return tuple(
+        ErrorRow(label, cells(s.held_out_rmse_windows), cells(s.held_out_rmse))
+        for label, s in zip(stage_labels(discovery), discovery.stages, strict=True)
+    )
+
+
+def _cell(value: float, unit: str, floor: float | None) -> ErrorCell:
+    times = ratio(value, floor)
+    text = "" if math.isnan(times) else f"{times:.2f}" if times < 10 else f"{times:.0f}"
+    return ErrorCell(plain_number(readable(value, unit)[0]), text, times < NEAR_FLOOR)
+
+
+def noise_row(discovery: SearchResult) -> tuple[str, ...]:
+    """Noise floor of each channel."""
+    floor = discovery.noise_floor
+    return tuple(
+        plain_number(readable(floor[c], unit)[0] if c in floor else None)
+        for c, unit in channel_units(discovery).items()
+    )
+
+
+def channel_headings(discovery: SearchResult) -> tuple[str, ...]:
+    """Each channel with the unit it is read in."""
+    return tuple(f"{c} [{readable(0.0, unit)[1]}]" for c, unit in channel_units(discovery).items())
+
+
+def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
+    """Parameters of the final model, then those of earlier stages that it lacks; held ones last."""
+    stages = [{e.name: e for e in s.estimates} for s in discovery.stages]
+    names = list(dict.fromkeys(n for s in reversed(stages) for n in s))
+    meanings = _meanings(discovery.stages)
+    rows = []
+    for name in names:
+        last = next(s[name] for s in reversed(stages) if name in s)
+        each = tuple(value_and_interval(s[name]) if name in s else None for s in stages)
+        rows.append(
+            ParameterRow(name, meanings.get(name, ""), unit_text(last.unit), not last.free, each, last.note)
+        )
+    return tuple(sorted(rows, key=lambda r: r.held))
+
+
+def _meanings(stages: tuple[Stage, ...]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for stage in stages:
+        m = stage.model.mechanism
+        pairs = zip(m.parameter_names, m.parameter_specifications, strict=True)
+        found |= {name: spec.meaning for name, spec in pairs}
+    return found
+
+
+def channel_units(discovery: SearchResult) -> dict[str, str]:
+    """Channel of the model -> its unit."""
+    first = discovery.test[0]
+    return {c: first.units[first.channels.index(c)] for c in discovery.baseline.held_out_rmse_windows}
+
+
+def noise_ratios(discovery: SearchResult) -> dict[str, float]:
+    """Held-out error over windows of the final model, in multiples of the noise, by channel."""
+    errors = discovery.final.held_out_rmse_windows
+    return {c: ratio(v, discovery.noise_floor.get(c)) for c, v in errors.items()}
+
+
+def ambiguous_rounds(discovery: SearchResult) -> list[tuple[str, str]]:
+    """Label of each effect that has equals, and the labels of these."""
+    return [
+        (effect_label(r.effect, r.port), " or ".join(effect_label(*pair) for pair in r.equivalent))
+        for r in discovery.rounds
+        if r.equivalent
+    ]
+
+
+def next_steps(discovery: SearchResult) -> list[str]:
+    """What to do now, in plain words."""
+    hidden = sum(not r.excited for r in discovery.ranking)
+    return discovery.verdict.next_steps(ambiguous_rounds(discovery), hidden, len(discovery.ranking))
+
+
+class Outcome(StrEnum):
+    """How a candidate stands at the end of a search."""
+
+    FOUND = "found"
+    ALIKE = "cannot be distinguished from what was found"
+    NOT_ADDED = "not added"
+    NOT_EXCITED = "not excited"
+
+
+def outcomes(discovery: SearchResult) -> list[tuple[Ranked, Outcome]]:
+    """Every candidate with its outcome, in the order of the ranking."""
+    found = {(r.effect, r.port) for r in discovery.rounds}
+    alike = {pair for r in discovery.rounds for pair in r.equivalent}
+
+    def outcome(r: Ranked) -> Outcome:
+        pair = (r.effect, r.port)
+        if pair in found:
+            return Outcome.FOUND
+        if pair in alike:
+            return Outcome.ALIKE
+        return Outcome.NOT_ADDED if r.excited else Outcome.NOT_EXCITED
+
+    return [(r, outcome(r)) for r in discovery.ranking]

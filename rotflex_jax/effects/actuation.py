@@ -1,0 +1,279 @@
+"""Effects on the voltage before the motor: dead zone, saturation, offset, drift, delay, first-order lag."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rotflex_jax.effects.base import Actuation, Period, Probe, Scale, register
+from rotflex_jax.parameters import parameter
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class DeadZone(Actuation):
+    """A dead zone of the amplifier: small voltages have no effect, larger ones are reduced by its width.
+
+        v -> v - positive if v > positive, v + negative if v < -negative, 0 between
+
+    Not for a motor that fails to start because of friction: that is Coulomb friction at the hub,
+    which acts in motion too. A two-level input cannot show a dead zone.
+
+    Args:
+        at: Always `input`.
+        positive: Width above zero [V].
+        negative: Width below zero [V].
+
+    Source: Tao and Kokotović 1994.
+    """
+
+    name: ClassVar[str] = "dead_zone"
+    title: ClassVar[str] = "dead zone of the input"
+    equation: ClassVar[str] = "v -> v - positive if v > positive, v + negative if v < -negative, 0 between"
+    amplitudes: ClassVar[tuple[str, ...]] = ("positive", "negative")
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    stage: ClassVar[int] = 2
+
+    positive: float = parameter(0.1, unit="V", lower=0.0, meaning="width above zero")
+    negative: float = parameter(0.1, unit="V", lower=0.0, meaning="width below zero")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] at the motor."""
+        below = jnp.where(voltage < -self.negative, voltage + self.negative, 0.0)
+        return jnp.where(voltage > self.positive, voltage - self.positive, below)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two directions, one on each side."""
+        width = 0.05 * scale.voltage
+        return [[{"positive": width, "negative": 0.0}, {"positive": 0.0, "negative": width}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"voltages between {-self.negative:.3g} V and {self.positive:.3g} V have no effect"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Saturation(Actuation):
+    """Saturation of the amplifier, symmetric.
+
+        v -> min(max(v, -limit), limit)
+
+    Inactive only at an infinite limit, so it has no amplitude; a limit above the largest recorded
+    voltage has no effect. Not for a voltage that was recorded behind the limit.
+
+    Args:
+        at: Always `input`.
+        limit: Largest voltage [V].
+
+    Source: Quanser, SRV02 user manual, 2011 (5 V through the cable of gain 1).
+    """
+
+    name: ClassVar[str] = "saturation"
+    title: ClassVar[str] = "saturation of the input"
+    equation: ClassVar[str] = "v -> min(max(v, -limit), limit)"
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    stage: ClassVar[int] = 0
+
+    limit: float = parameter(5.0, unit="V", lower=0.0, meaning="largest voltage")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] at the motor."""
+        # Not `clip`, which splits the derivative between the two branches on the limit itself.
+        above = jnp.where(voltage > self.limit, self.limit, voltage)
+        return jnp.where(voltage < -self.limit, -self.limit, above)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction at each of four limits."""
+        return [[{"limit": share * scale.voltage}] for share in (0.9, 0.7, 0.5, 0.3)]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the amplifier gives no more than {self.limit:.3g} V either way"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class VoltageOffset(Actuation):
+    """A constant offset of the amplifier.
+
+        v -> v + offset
+
+    Without other nonlinearities it is the same as a constant torque at the motor's port, and it
+    drifts: a recording may need an offset of its own.
+
+    Args:
+        at: Always `input`.
+        offset: Voltage added [V].
+
+    Source: Any amplifier's data sheet, input offset.
+    """
+
+    name: ClassVar[str] = "voltage_offset"
+    title: ClassVar[str] = "constant offset of the voltage"
+    equation: ClassVar[str] = "v -> v + offset"
+    amplitudes: ClassVar[tuple[str, ...]] = ("offset",)
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    stage: ClassVar[int] = 1
+
+    offset: float = parameter(0.0, unit="V", typical=0.05, meaning="voltage added")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] with the offset."""
+        return voltage + self.offset
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"offset": 0.05 * scale.voltage}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the motor sees {self.offset:+.3g} V more than was commanded"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class VoltageDrift(Actuation):
+    """An offset that grows linearly from the first sample on: an amplifier or a bearing that warms up.
+
+        v -> v + rate t
+
+    It needs a constant offset beside it for the initial value. It belongs to a recording rather than to a
+    machine: not for predictions of another run. Time counts from the first sample of the recording that a
+    model is given, so a part of another recording (`split`, `slice`) and a window of a fit
+    (`window_seconds`) start at zero again: fit it to whole recordings, and add `rate * part.start` to the
+    voltage of a later part. Windows of one simulation (`simulate_windows`) share their recording's time.
+
+    Args:
+        at: Always `input`.
+        rate: Change of the offset with time [V/s].
+
+    Source: Any amplifier's data sheet, drift of the input offset.
+    """
+
+    name: ClassVar[str] = "voltage_drift"
+    title: ClassVar[str] = "offset of the voltage that drifts"
+    equation: ClassVar[str] = "v -> v + rate * t"
+    amplitudes: ClassVar[tuple[str, ...]] = ("rate",)
+    stage: ClassVar[int] = 1
+
+    rate: float = parameter(0.0, unit="V/s", typical=1e-3, meaning="change of the offset with time")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] with the offset, its mean over each sample."""
+        return voltage + self.rate * Ts * (jnp.arange(voltage.shape[0], dtype=voltage.dtype) + 0.5)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"rate": 1e-3 * scale.voltage}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the offset of the voltage drifts by {1e3 * self.rate:+.3g} mV per second"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Delay(Actuation):
+    """A pure delay between command and motor, of any length.
+
+        v(t) = u(t - time)
+
+    Exact in the mean and in the first moment over each sample, also where the delay is no multiple of the
+    sampling period. Before the recording the command has its first value. Slow inputs cannot
+    distinguish it from a first-order lag.
+
+    Args:
+        at: Always `input`.
+        time: Delay [s].
+
+    Source: L. Ljung, System Identification, 2nd ed., 1999, section 4.2 (`nk`); Laakso and others,
+    Splitting the unit delay, 1996, equation 42 (Lagrange interpolation) with N = 2.
+    """
+
+    name: ClassVar[str] = "delay"
+    title: ClassVar[str] = "delay of the input"
+    equation: ClassVar[str] = "v(t) = u(t - time)"
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    stage: ClassVar[int] = 3
+
+    time: float = parameter(0.004, unit="s", lower=0.0, meaning="delay")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] to hold over each sample."""
+        # A delay of n + f samples: the older of two neighbouring commands fills the share f of a sample.
+        late = self.time / Ts
+        whole = jnp.floor(late)
+        part = late - whole
+        newer = jnp.arange(voltage.shape[0]) - whole.astype(int)
+        command = lambda k: voltage[jnp.maximum(k, 0)]  # noqa: E731
+        mean = part * command(newer - 1) + (1 - part) * command(newer)
+        # The older one comes first, which the mean does not show: a pulse and its opposite one sample later.
+        late_half = part * (1 - part) / 2
+        return mean - late_half * (command(newer) - 2 * command(newer - 1) + command(newer - 2))
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two delays, each an alternative."""
+        return [[{"time": 0.0021}], [{"time": 0.0081}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the voltage comes {1e3 * self.time:.3g} ms later than its command"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Lag(Actuation):
+    """An amplifier or filter of first order between command and motor.
+
+        time dv/dt = u - v
+
+    Exact in the mean and in the first moment over each sample. Before the recording the command has its
+    first value. Slow inputs cannot distinguish it from a pure delay: both shift the phase, only the lag
+    reduces the amplitude.
+
+    Args:
+        at: Always `input`.
+        time: Time constant [s].
+
+    Source: Any first-order low-pass; L. Ljung, System Identification, 2nd ed., 1999, section 2.2.
+    """
+
+    name: ClassVar[str] = "lag"
+    title: ClassVar[str] = "first-order lag of the input"
+    equation: ClassVar[str] = "time * dv/dt = u - v"
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    stage: ClassVar[int] = 4
+
+    time: float = parameter(0.006, unit="s", lower=1e-7, meaning="time constant")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] to hold over each sample."""
+        slow = self.time / Ts
+        fade = jnp.exp(-1 / slow)
+        behind = -slow * jnp.expm1(-1 / slow)  # mean of exp(-t / time) over a sample
+        # Its first moment about the middle of the sample.
+        early = slow * (behind - fade) - behind / 2
+
+        def sample(v: jax.Array, u: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+            return u + fade * (v - u), (u + behind * (v - u), early * (v - u))
+
+        mean, moment = jax.lax.scan(sample, voltage[0], voltage)[1]
+        # The first moment, which the mean does not show: a pulse and its opposite one sample later.
+        return mean - jnp.diff(moment, prepend=0.0)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two time constants, each an alternative."""
+        return [[{"time": 0.003}], [{"time": 0.012}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the voltage follows its command with a lag of {1e3 * self.time:.3g} ms"

@@ -1,0 +1,417 @@
+"""What an effect is: its kinds, what it writes into a linear model, and the catalogue.
+
+A new effect is a frozen dataclass that derives from one kind. A kind says by the attributes of `Effect` where
+it acts, which states it has and how a step treats it; the other packages ask these attributes, so that a new
+kind is this file, its step in `mechanism/` and its drawing in `docs/generate/laws.py`.
+
+Sign: an effect returns the torque that acts *on* the port in its positive direction, except the `limit` of a
+dry friction, which is the (non-negative) level of the torque that opposes sliding.
+"""
+
+import abc
+import dataclasses
+import math
+import numbers
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Real
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.parameters import Specification, specifications
+
+Scalar = Real[Array, "..."] | Real[np.ndarray, "..."] | float | int
+"""A number of one state, or an array of them for states side by side."""
+Period = float | Float[Array, ""]
+"""Sampling period [s]."""
+Probe = Mapping[str, float]
+"""Parameter name -> value at which a score test tries an effect."""
+Drive = Literal["voltage", "motor"]
+Domain = Literal["port", "input", "channel"]
+StatePart = Literal["linear", "rotor", "memory"]
+EffectType = TypeVar("EffectType", bound="Effect")
+
+
+class Stamp(NamedTuple):
+    """What a linear effect writes into the equations of motion at its port `p`.
+
+    `M += inertia p p'`, `D += damping p p'`, `K += stiffness p p'`, torque `drive voltage` at `p`.
+    A linear effect with states `z` of its own adds `z' = own z + from_speed p.dq + from_voltage v`
+    (lists of length m, `own` m by m) and the torque `torque . z` at `p`.
+    """
+
+    inertia: Scalar = 0.0
+    damping: Scalar = 0.0
+    stiffness: Scalar = 0.0
+    drive: Scalar = 0.0
+    own: tuple[tuple[Scalar, ...], ...] = ()
+    from_speed: tuple[Scalar, ...] = ()
+    from_voltage: tuple[Scalar, ...] = ()
+    torque: tuple[Scalar, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """How large the signals of a recording are, so that an effect can propose shapes worth trying.
+
+    Attributes:
+        voltage: Largest |u| [V].
+        speed: Root mean square speed of the port [rad/s].
+        position: Largest |position| of the port about its mean [rad].
+        torque: Root mean square torque the motor can be seen to give [N m].
+        stiffness: Of the linear springs at the port [N m/rad].
+        inertia: Inertia that a torque at the port accelerates [kg m^2].
+    """
+
+    voltage: float
+    speed: float
+    position: float
+    torque: float
+    stiffness: float = 0.0
+    inertia: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect(abc.ABC):
+    """One physical mechanism at one port.
+
+    Attributes:
+        at: Port it acts at; `input` for actuation, a channel's name for sensing.
+
+    Raises:
+        InputError: At the definition of a class with a `name` that lacks a method or declaration which its
+            kind requires; at an instance with a value outside of its bounds.
+    """
+
+    # -- declared by each effect
+    name: ClassVar[str]
+    title: ClassVar[str]
+    equation: ClassVar[str]
+    ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
+    # Parameters that are amplitudes: at zero (all of them) the effect is inactive.
+    amplitudes: ClassVar[tuple[str, ...]] = ()
+    # Simpler effects that this one contains at special values of its parameters.
+    contains: ClassVar[tuple[str, ...]] = ()
+    # Ports a search tries it at by default; none for what a model has from the start.
+    searched: ClassVar[tuple[str, ...]] = ()
+    turning: ClassVar[bool] = False  # a function of an angle: no meaning where a port moves along a line
+
+    # -- declared by each kind
+    kind_label: ClassVar[str]
+    kind_meaning: ClassVar[str]  # one sentence for the catalogue
+    # What `at` names: a port, the voltage, or an output.
+    acts_on: ClassVar[Domain] = "port"
+    # Which part of the state holds its own states, `order` of them; None where it has none.
+    state_part: ClassVar[StatePart | None] = None
+    is_linear: ClassVar[bool] = False  # enters the matrices of the equations of motion, by a `stamp`
+    # One step per sample is exact for it, or it takes no part in the step.
+    exact_step: ClassVar[bool] = False
+    torque_at_port: ClassVar[bool] = False  # a torque that the step adds to the linear part
+    dry_contact: ClassVar[bool] = False  # a torque that the step limits to a level
+    # False where a small amplitude changes nothing: no slope at zero shows the effect.
+    slope_at_zero: ClassVar[bool] = True
+    single: ClassVar[bool] = False  # a mechanism has one of this kind at most
+    # Why a linear model of a mechanism leaves it out; empty where it enters by its slope.
+    not_linearised: ClassVar[str] = ""
+
+    # While a mechanism is traced its numbers are arrays or placeholders: `__post_init__` checks the values,
+    # a checker of annotations at run time would not accept them.
+    __no_type_check__: ClassVar[bool] = True
+
+    at: str
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        super().__init_subclass__(**given)
+        if not hasattr(cls, "name"):  # a kind, or a base class of several effects
+            return
+        missing = [n for n in ("title", "equation", "kind_label") if not hasattr(cls, n)]
+        missing += [n for n in dir(cls) if getattr(getattr(cls, n, None), "__isabstractmethod__", False)]
+        if cls.searched and cls.probes.__func__ is Effect.probes.__func__:
+            missing.append("probes")
+        if missing:
+            raise InputError(
+                f"The effect {cls.__name__} was defined without {', '.join(missing)}, but it needs a name, a "
+                "title, an equation, a kind that it derives from, and the methods of this kind; add what is "
+                "missing."
+            )
+
+    def __post_init__(self) -> None:
+        kind = type(self).__name__
+        if not isinstance(self.at, str):
+            raise InputError(
+                f"{kind} was given at={self.at!r}, but it needs the name of a port as its first "
+                "argument; give parameters by name."
+            )
+        for name, spec in specifications(type(self)).items():
+            value = getattr(self, name)
+            if value is None and getattr(type(self), name) is None:
+                continue  # an optional part that the instance lacks
+            if value is None or isinstance(value, str):
+                raise InputError(
+                    f"{kind} was given {name}={value!r}, but it needs a number"
+                    f"{f' in {spec.unit}' if spec.unit else ''}; give one."
+                )
+            if isinstance(value, jax.Array) or not isinstance(value, numbers.Real):
+                continue  # traced or symbolic: checked where the number was given
+            number = float(value)
+            if not math.isfinite(number) or not spec.lower <= number <= spec.upper:
+                raise InputError(
+                    f"{kind} was given {name}={value!r} {spec.unit}, but it needs a "
+                    f"finite value between {spec.lower:g} and {spec.upper:g}; correct the value."
+                )
+
+    @classmethod
+    def declared(cls) -> dict[str, Specification]:
+        """Parameters of this class, by name."""
+        return specifications(cls)
+
+    @property
+    def order(self) -> int:
+        """Number of states of its own."""
+        return 0
+
+    @property
+    def location(self) -> str:
+        """Where it acts, in words."""
+        words = {"port": f"at {self.at}", "input": "on the voltage", "channel": f"at the sensor {self.at}"}
+        return words[self.acts_on]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Parameter values [declared units], by name."""
+        return {name: getattr(self, name) for name in specifications(self)}
+
+    def replace(self: EffectType, **values: Any) -> EffectType:
+        """The same effect with other parameter values."""
+        return dataclasses.replace(self, **values)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Parameter sets at which a score test tries the effect.
+
+        Returns:
+            Alternatives (different shapes); each a list of parameter sets that are tried together,
+            one direction of the test per set. None for what a model has from the start.
+        """
+        return []
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """Effects that must be at its port: `motor`, `inertia`."""
+        return ()
+
+    def sentence(self) -> str:
+        """What was found, in words with numbers, for a person."""
+        numbers = ", ".join(
+            f"{n} {v:.4g} {specifications(self)[n].unit}".rstrip() for n, v in self.values.items()
+        )
+        return f"{self.title} at the {self.at} ({numbers})"
+
+    @classmethod
+    def describe(cls) -> dict[str, Any]:
+        """Plain description for tables: name, kind, ports, equation, parameters."""
+        return {
+            "name": cls.name,
+            "class": cls.__name__,
+            "kind": cls.kind(),
+            "title": cls.title,
+            "equation": cls.equation,
+            "ports": list(cls.ports),
+            "parameters": {
+                n: {"unit": s.unit, "typical": s.typical, "meaning": s.meaning}
+                for n, s in cls.declared().items()
+            },
+        }
+
+    @classmethod
+    def kind(cls) -> str:
+        """Name of the kind, for instance 'dry friction'."""
+        return cls.kind_label
+
+
+# -- kinds ---------------------------------------------------------------------------------------------
+
+
+class Linear(Effect):
+    """Enters the linear part, which the step integrates exactly."""
+
+    kind_label: ClassVar[str] = "linear"
+    kind_meaning: ClassVar[str] = (
+        "Enters the linear part of the equations, which the step integrates exactly."
+    )
+    state_part: ClassVar[StatePart | None] = "linear"
+    is_linear: ClassVar[bool] = True
+    exact_step: ClassVar[bool] = True
+    # True for what turns voltage into torque at its port.
+    motor: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def stamp(self) -> Stamp:
+        """Entries of the equations of motion."""
+
+
+class Force(Effect):
+    """A smooth (or at least continuous) torque at a port."""
+
+    kind_label: ClassVar[str] = "force"
+    kind_meaning: ClassVar[str] = "A torque that depends on position, speed or voltage at this moment."
+    torque_at_port: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+
+
+class DryFriction(Effect):
+    """Set-valued friction: any torque within the level holds the port, sliding meets the level."""
+
+    kind_label: ClassVar[str] = "dry friction"
+    kind_meaning: ClassVar[str] = (
+        "A level that opposes motion; a port at rest is held by any torque within it."
+    )
+    torque_at_port: ClassVar[bool] = True
+    dry_contact: ClassVar[bool] = True
+    not_linearised: ClassVar[str] = "has no slope at rest"
+    # True where the level is the same at every speed and position: a step need not iterate on it.
+    steady: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+        """Level [N m] >= 0 that opposes motion in `direction` (+1 or -1) at |speed| [rad/s]."""
+
+
+class Memory(Effect):
+    """A torque with one state of its own, `dz/dt = flow`.
+
+    Normalise the state so that its flow does not depend on the amplitudes where these are zero: a
+    search sees the torque's slope along them there, `z` as it is.
+    """
+
+    kind_label: ClassVar[str] = "with memory"
+    kind_meaning: ClassVar[str] = "A torque with a state of its own: it depends on what came before."
+    state_part: ClassVar[StatePart | None] = "memory"
+    torque_at_port: ClassVar[bool] = True
+    # The last argument of `flow` and `force`: the motor's voltage [V], or the torque [N m] of the motors at
+    # its port.
+    driven_by: ClassVar[Drive] = "voltage"
+
+    @property
+    def order(self) -> int:
+        """One state."""
+        return 1
+
+    def initial(self) -> float:
+        """State at rest."""
+        return 0.0
+
+    @abc.abstractmethod
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the state [its unit per s]."""
+
+    @abc.abstractmethod
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A motor where its torque is asked for."""
+        return ("motor",) if cls.driven_by == "motor" else ()
+
+
+class Gear(Effect):
+    """A gear that lets the motor's rotor turn on its own between two stops, where port and rotor are one."""
+
+    kind_label: ClassVar[str] = "gear"
+    kind_meaning: ClassVar[str] = "Motor and machine touch only where the teeth do."
+    state_part: ClassVar[StatePart | None] = "rotor"
+    slope_at_zero: ClassVar[bool] = False
+    single: ClassVar[bool] = True
+    not_linearised: ClassVar[str] = "has no slope within the play; the gear is taken as tight"
+
+    @property
+    def order(self) -> int:
+        """Two states, angle and speed of the rotor against the port."""
+        return 2
+
+    @abc.abstractmethod
+    def stops(self) -> Scalar:
+        """Angle [rad] >= 0 from the middle to each stop; none at zero."""
+
+    @abc.abstractmethod
+    def rotor(self) -> Scalar:
+        """The rotor's part of the inertia that is entered at the port, above 0 and below 1."""
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A motor, and an inertia of which the rotor is split off."""
+        return ("motor", "inertia")
+
+
+@dataclasses.dataclass(frozen=True)
+class Actuation(Effect):
+    """Voltage to voltage, between the recorded command and the motor."""
+
+    kind_label: ClassVar[str] = "actuation"
+    kind_meaning: ClassVar[str] = "What lies between the recorded command and the motor."
+    acts_on: ClassVar[Domain] = "input"
+    exact_step: ClassVar[bool] = True
+    not_linearised: ClassVar[str] = "acts on the voltage before the motor, which is the input here"
+    ports: ClassVar[tuple[str, ...]] = ("input",)
+    # Several are applied in this order, from the command to the motor.
+    stage: ClassVar[int] = 0
+
+    at: str = "input"
+
+    @abc.abstractmethod
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """The whole sequence (N,) [V] that reaches the motor."""
+
+
+class Sensing(Effect):
+    """Output to output: what the sensor of one channel makes of the true value."""
+
+    kind_label: ClassVar[str] = "sensing"
+    kind_meaning: ClassVar[str] = "What a sensor makes of the true value."
+    acts_on: ClassVar[Domain] = "channel"
+    exact_step: ClassVar[bool] = True
+    # True for an error that shows only against another sensor.
+    relative: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def measure(self, value: Scalar) -> Scalar:
+        """Reading [unit of the channel] for a true value."""
+
+
+KINDS: tuple[type[Effect], ...] = (DryFriction, Force, Memory, Gear, Linear, Actuation, Sensing)
+"""All kinds, in the order of the catalogue."""
+
+# -- catalogue -----------------------------------------------------------------------------------------
+
+EffectClass = TypeVar("EffectClass", bound=type[Effect])
+
+CATALOG: dict[str, type[Effect]] = {}
+
+
+def register(effect: EffectClass) -> EffectClass:
+    """Enters an effect class under its `name`; use it as the outermost decorator.
+
+    Args:
+        effect: A frozen dataclass that derives from one of the kinds.
+
+    Returns:
+        The class, unchanged.
+
+    Raises:
+        InputError: Another class has the name already.
+    """
+    known = CATALOG.setdefault(effect.name, effect)
+    # A module that is run again (a notebook cell, a reload) replaces its own earlier class.
+    if (known.__module__, known.__qualname__) != (effect.__module__, effect.__qualname__):
+        raise InputError(
+            f"The effect name '{effect.name}' is taken by {known.__qualname__}; an effect needs a "
+            f"name of its own, so give {effect.__qualname__} another one."
+        )
+    CATALOG[effect.name] = effect
+    return effect

@@ -1,0 +1,160 @@
+"""Dry friction: Coulomb, different in each direction, Stribeck."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from rotflex_jax.effects.base import DryFriction, Probe, Scalar, Scale, register
+from rotflex_jax.parameters import parameter
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Coulomb(DryFriction):
+    """Constant (Coulomb) friction, with true sticking.
+
+        tau = -level sign(speed) while sliding, any |tau| <= level at rest
+
+    Not where the level falls as the motion starts: that is Stribeck friction.
+
+    Args:
+        at: Port.
+        level: Friction torque [N m].
+
+    Source: Coulomb 1785.
+    """
+
+    name: ClassVar[str] = "coulomb"
+    title: ClassVar[str] = "constant (Coulomb) friction"
+    equation: ClassVar[str] = "tau = -level * sign(speed), holds while |tau| <= level"
+    amplitudes: ClassVar[tuple[str, ...]] = ("level",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
+    steady: ClassVar[bool] = True
+
+    level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque")
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+        """Level [N m] that opposes motion in `direction`."""
+        return self.level
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"level": 0.1 * scale.torque}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the {self.at} meets a constant friction torque of {self.level:.3g} N m whichever way it turns"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class CoulombAsymmetric(DryFriction):
+    """Constant friction with a level for each direction.
+
+        tau = -forward while speed > 0, backward while speed < 0, between the two at rest
+
+    On most recordings it cannot be distinguished from symmetric friction with a constant torque (a
+    voltage offset at the hub, a shift of the deflection at the joint), to which it is equal
+    while it slides.
+
+    Args:
+        at: Port.
+        forward: Level that opposes positive motion [N m].
+        backward: Level that opposes negative motion [N m].
+
+    Source: Armstrong-Hélouvry, Dupont and Canudas de Wit 1994, section 2.
+    """
+
+    name: ClassVar[str] = "coulomb_asymmetric"
+    title: ClassVar[str] = "constant friction, unequal in the two directions"
+    equation: ClassVar[str] = (
+        "tau = -forward if speed > 0, +backward if speed < 0, holds while -forward <= tau <= backward"
+    )
+    amplitudes: ClassVar[tuple[str, ...]] = ("forward", "backward")
+    contains: ClassVar[tuple[str, ...]] = ("coulomb",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
+    steady: ClassVar[bool] = True
+
+    forward: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque against positive motion")
+    backward: float = parameter(
+        0.02, unit="N m", lower=0.0, meaning="friction torque against negative motion"
+    )
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+        """Level [N m] that opposes motion in `direction`."""
+        return jnp.where(direction > 0, self.forward, self.backward)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two directions, one for each direction of motion."""
+        torque = 0.1 * scale.torque
+        return [[{"forward": torque, "backward": 0.0}, {"forward": 0.0, "backward": torque}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the {self.at} meets a friction torque of {self.forward:.3g} N m turning forwards and "
+            f"{self.backward:.3g} N m turning backwards"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Stribeck(DryFriction):
+    """Friction that falls from a breakaway level to a constant one as the motion picks up.
+
+        |tau| = level + excess exp(-(v/speed)^2) while sliding, up to level + excess at rest
+
+    Not for a recording without slow motion: where the port reverses quickly, the excess cannot be
+    distinguished from a slightly larger constant level.
+
+    Args:
+        at: Port.
+        level: Friction torque at high speed [N m].
+        excess: How much more it is at standstill [N m].
+        speed: Speed over which the excess is lost [rad/s].
+
+    Source: Stribeck 1902; Bo and Pavelescu 1982 with exponent 2.
+    """
+
+    name: ClassVar[str] = "stribeck"
+    title: ClassVar[str] = "friction that is larger near standstill (Stribeck)"
+    equation: ClassVar[str] = (
+        "tau = -(level + excess * exp(-(v / speed)^2)) * sign(v), holds while |tau| <= level + excess"
+    )
+    amplitudes: ClassVar[tuple[str, ...]] = ("level", "excess")
+    contains: ClassVar[tuple[str, ...]] = ("coulomb",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
+
+    level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque at speed")
+    excess: float = parameter(0.01, unit="N m", lower=0.0, meaning="additional friction torque at standstill")
+    # A shape has no value at which the effect is absent; the bound keeps the quotient finite.
+    speed: float = parameter(0.2, unit="rad/s", lower=1e-4, meaning="speed over which the excess is lost")
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+        """Level [N m] that opposes motion at |speed| [rad/s]."""
+        return self.level + self.excess * jnp.exp(-jnp.square(speed / self.speed))
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two directions at each of three speeds."""
+        torque = 0.1 * scale.torque
+        speeds = [max(share * scale.speed, 1e-3) for share in (0.05, 0.2, 0.6)]
+        return [
+            [
+                {"level": torque, "excess": 0.0, "speed": speed},
+                {"level": 0.0, "excess": torque, "speed": speed},
+            ]
+            for speed in speeds
+        ]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"friction at the {self.at} falls from {self.level + self.excess:.3g} N m at "
+            f"standstill to {self.level:.3g} N m within about {2 * self.speed:.2g} rad/s"
+        )

@@ -1,0 +1,70 @@
+"""Play in the gear between motor and hub."""
+
+import dataclasses
+import math
+from typing import ClassVar
+
+from rotflex_jax.effects.base import Gear, Probe, Scalar, Scale, register
+from rotflex_jax.parameters import parameter
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Backlash(Gear):
+    """Play of a gear: the gear transmits torque only while its teeth are in contact.
+
+        |r| <= gap,    tau >= 0 at r = gap,    tau <= 0 at r = -gap,    tau = 0 between
+
+    `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the transmitted
+    torque. The rotor has a `share` of the inertia that is entered at the port; the motor with its back-EMF
+    acts on it, all other effects at the port on the rest. The impact of the teeth is perfectly inelastic.
+    Not for a spring that is loose about its rest position, which is `joint_play`, nor for play that is
+    never crossed, which shifts the angle only. Beside `heating` the lost torque acts on the port even
+    while the rotor is in flight.
+
+    Args:
+        at: Port of the motor.
+        gap: Half of the play [rad], as the port sees it.
+        share: The rotor's part of the port's inertia.
+
+    Source: M. Nordin and P.-O. Gutman, Controlling mechanical systems with backlash, Automatica 38,
+    2002; F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 6.
+    """
+
+    name: ClassVar[str] = "backlash"
+    title: ClassVar[str] = "play of the gear"
+    equation: ClassVar[str] = (
+        "|r| <= gap, torque passes only at |r| = gap, r angle of the rotor against the port, rotor inertia = "
+        "share * inertia"
+    )
+    ports: ClassVar[tuple[str, ...]] = ("hub",)
+    amplitudes: ClassVar[tuple[str, ...]] = ("gap",)
+    searched: ClassVar[tuple[str, ...]] = ("hub",)
+
+    gap: float = parameter(0.005, unit="rad", lower=0.0, meaning="half of the play")
+    share: float = parameter(
+        0.7, unit="", lower=0.02, upper=0.98, meaning="the rotor's part of the port's inertia"
+    )
+
+    def stops(self) -> Scalar:
+        """Angle [rad] from the middle to each stop."""
+        return self.gap
+
+    def rotor(self) -> Scalar:
+        """The rotor's part of the inertia at the port."""
+        return self.share
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Gaps in steps of two, those that the motor's torque crosses in 3 to 34 ms, each an alternative."""
+        times = [0.012 * 2 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, -4)]
+        if not scale.inertia:
+            return []
+        return [[{"gap": scale.torque / scale.inertia * t * t / 4, "share": 0.6}] for t in times]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the gear at the {self.at} has a play of {math.degrees(2 * self.gap):.3g} deg in all, which the "
+            f"rotor with {100 * self.share:.0f} % of the inertia there crosses alone"
+        )

@@ -1,0 +1,196 @@
+"""Friction and hysteresis with a state: Dahl, LuGre, Bouc-Wen."""
+
+import dataclasses
+import math
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from rotflex_jax.effects.base import Memory, Probe, Scalar, Scale, register
+from rotflex_jax.parameters import parameter
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Dahl(Memory):
+    """Friction with presliding: it builds up over a small displacement after each reversal.
+
+        dz/dt = speed/presliding - |speed|/presliding z,    tau = -level z
+
+    Not for a recording in which the presliding is smaller than the sensor resolves: it is Coulomb
+    friction there, and simpler. It has no breakaway level and creeps under a vibrating load.
+
+    Args:
+        at: Port.
+        level: Friction torque when it slides [N m].
+        presliding: Displacement over which it builds up [rad].
+
+    Source: Dahl 1968, equation with exponent 1.
+    """
+
+    name: ClassVar[str] = "dahl"
+    title: ClassVar[str] = "friction with presliding (Dahl)"
+    equation: ClassVar[str] = "dz/dt = speed / presliding * (1 - z * sign(speed)), tau = -level * z"
+    amplitudes: ClassVar[tuple[str, ...]] = ("level",)
+    contains: ClassVar[tuple[str, ...]] = ("coulomb",)
+    searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
+
+    level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque when it slides")
+    # Coulomb friction is the limit of none at all; the bound keeps the rate finite.
+    presliding: float = parameter(
+        0.003, unit="rad", lower=1e-6, meaning="displacement over which it builds up"
+    )
+
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the state [1/s]."""
+        # |speed| instead of speed sign(speed): its derivative at rest is zero, not undefined.
+        return speed / self.presliding - jnp.abs(speed) / self.presliding * z
+
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        return -self.level * z
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction at each of three displacements."""
+        torque = 0.1 * scale.torque
+        return [[{"level": torque, "presliding": size}] for size in (0.001, 0.003, 0.01)]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the {self.at} meets a friction torque of {self.level:.3g} N m that builds up over "
+            f"{self.presliding:.2g} rad ({math.degrees(self.presliding):.2g} degrees) after each "
+            "reversal"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class LuGre(Memory):
+    """The friction model of Lund and Grenoble, with a state that is 1 while the port slides fast.
+
+        g = 1 + rise exp(-(speed/slow)^2)
+        dz/dt = (speed - |speed| z / g) / presliding
+        tau = -(level z + damping presliding dz/dt)
+
+    In the usual symbols `level` is Fc, `level rise` is Fs - Fc, `level / presliding` is sigma0 and
+    `damping` is sigma1; sigma2 is viscous damping, which has an effect of its own. Not for a
+    recording in which the presliding is smaller than the sensor resolves: there it is Stribeck
+    friction, and simpler. The damping of the bristles may give energy at speeds where `damping
+    |speed|` exceeds `4 level g`: a fitted value that large is not physical.
+
+    Args:
+        at: Port.
+        level: Friction torque when it slides fast [N m].
+        rise: Breakaway level over `level`, less one.
+        slow: Speed over which the rise is lost [rad/s].
+        presliding: Displacement over which the torque builds up [rad].
+        damping: Of the bristles [N m s/rad].
+
+    Source: Canudas de Wit, Olsson, Åström and Lischinsky, IEEE Trans. Automatic Control 40, 1995,
+    equations 1 to 4.
+    """
+
+    name: ClassVar[str] = "lugre"
+    title: ClassVar[str] = "friction with presliding and breakaway (LuGre)"
+    equation: ClassVar[str] = (
+        "g = 1 + rise * exp(-(speed/slow)**2), dz/dt = (speed - |speed| * z / g) / presliding, "
+        "tau = -(level * z + damping * presliding * dz/dt)"
+    )
+    amplitudes: ClassVar[tuple[str, ...]] = ("level", "damping")
+    contains: ClassVar[tuple[str, ...]] = ("coulomb", "stribeck", "dahl")
+    searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
+
+    level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque when it slides fast")
+    # Where it hardly slides at all (a large rise, a small level), only their product shows.
+    rise: float = parameter(0.5, unit="", lower=0.0, upper=10.0, meaning="breakaway level over it, less one")
+    slow: float = parameter(0.3, unit="rad/s", lower=1e-3, meaning="speed over which the rise is lost")
+    # Stribeck friction is the limit of none at all; the bound keeps the rate finite.
+    presliding: float = parameter(
+        0.003, unit="rad", lower=1e-6, meaning="displacement over which it builds up"
+    )
+    damping: float = parameter(0.0, unit="N m s/rad", lower=0.0, typical=0.01, meaning="of the bristles")
+
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the state [1/s]."""
+        g = 1 + self.rise * jnp.exp(-((speed / self.slow) ** 2))
+        return (speed - jnp.abs(speed) * z / g) / self.presliding
+
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        bending = self.presliding * self.flow(z, position, speed, drive)
+        return -(self.level * z + self.damping * bending)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Friction and damping of the bristles, at each of two displacements."""
+        torque, slow = 0.1 * scale.torque, 0.15 * scale.speed + 1e-3
+        friction = {"level": torque, "damping": 0.0, "rise": 0.5, "slow": slow}
+        bristles = friction | {"level": 0.0, "damping": 0.3 * torque / slow}
+        return [[a | {"presliding": size} for a in (friction, bristles)] for size in (0.001, 0.005)]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the {self.at} sticks up to {self.level * (1 + self.rise):.3g} N m and slides at "
+            f"{self.level:.3g} N m, its friction building up over {self.presliding:.2g} rad "
+            f"({math.degrees(self.presliding):.2g} degrees)"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class BoucWen(Memory):
+    """Hysteresis of Bouc and Wen, normalised so that the state stays within -1 and 1.
+
+        dz/dt = speed/width - (beta |speed| z + (1 - beta) speed |z|) / width,    tau = -level z
+
+    `beta` is the share that depends on the direction of motion: 1 is Dahl friction, 0 a spring that
+    saturates without loss. A recording without small reversals cannot distinguish it from Dahl friction:
+    the two differ only where the motion reverses before the state has saturated.
+
+    Args:
+        at: Port.
+        level: Torque at saturation [N m].
+        width: Deflection over which it builds up [rad].
+        beta: Share of the hysteretic part.
+
+    Source: R. Bouc 1967; Y.-K. Wen, J. Eng. Mech. Div. 102, 1976, with exponent 1.
+    """
+
+    name: ClassVar[str] = "bouc_wen"
+    title: ClassVar[str] = "hysteresis (Bouc-Wen)"
+    equation: ClassVar[str] = (
+        "dz/dt = (speed - beta * |speed| * z - (1 - beta) * speed * |z|) / width, tau = -level * z"
+    )
+    amplitudes: ClassVar[tuple[str, ...]] = ("level",)
+    contains: ClassVar[tuple[str, ...]] = ("coulomb", "dahl")
+    searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
+
+    level: float = parameter(0.02, unit="N m", lower=0.0, meaning="torque at saturation")
+    width: float = parameter(0.02, unit="rad", lower=1e-6, meaning="deflection over which it builds up")
+    beta: float = parameter(0.5, unit="", lower=0.0, upper=1.0, meaning="share of the hysteretic part")
+
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the state [1/s]."""
+        turning, fixed = jnp.abs(speed) * z, speed * jnp.abs(z)
+        return (speed - self.beta * turning - (1 - self.beta) * fixed) / self.width
+
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        return -self.level * z
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction at each of two widths."""
+        torque = 0.1 * scale.torque
+        widths = (0.1 * scale.position, 0.4 * scale.position)
+        return [[{"level": torque, "width": width, "beta": 0.5}] for width in widths]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the {self.at} has a hysteretic torque of up to {self.level:.3g} N m that builds up over "
+            f"{self.width:.2g} rad ({math.degrees(self.width):.2g} degrees) after each reversal"
+        )

@@ -1,0 +1,185 @@
+"""Springs: linear, cubic, quadratic, with play."""
+
+import dataclasses
+import math
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from rotflex_jax.effects.base import Force, Linear, Probe, Scalar, Scale, Stamp, register
+from rotflex_jax.parameters import parameter
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Spring(Linear):
+    """A linear torsion spring.
+
+        tau = -stiffness position
+
+    Not for deflections at which the geometry of the springs shows: add a quadratic or cubic term.
+
+    Args:
+        at: Port.
+        stiffness: Torque per angle [N m/rad].
+
+    Source: Hooke 1678.
+    """
+
+    name: ClassVar[str] = "spring"
+    title: ClassVar[str] = "linear spring"
+    equation: ClassVar[str] = "tau = -stiffness * position"
+    amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)
+
+    stiffness: float = parameter(1.0, unit="N m/rad", lower=0.0, meaning="torque per angle")
+
+    def stamp(self) -> Stamp:
+        """Entries of the equations of motion."""
+        return Stamp(stiffness=self.stiffness)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"stiffness": 0.1 * scale.torque / scale.position}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"a spring of {self.stiffness:.3g} N m/rad pulls the {self.at} back"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class CubicSpring(Force):
+    """The cubic term of a spring: it hardens, or softens where the stiffness is negative.
+
+        tau = -stiffness position^3
+
+    Not far outside the deflections of the recording: a softening cubic pulls outwards there.
+
+    Args:
+        at: Port.
+        stiffness: Cubic stiffness [N m/rad^3].
+
+    Source: Duffing 1918.
+    """
+
+    name: ClassVar[str] = "cubic_spring"
+    title: ClassVar[str] = "cubic spring (hardening or softening)"
+    equation: ClassVar[str] = "tau = -stiffness * position^3"
+    ports: ClassVar[tuple[str, ...]] = ("joint",)
+    amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)
+    searched: ClassVar[tuple[str, ...]] = ("joint",)
+
+    stiffness: float = parameter(0.0, unit="N m/rad^3", typical=10.0, meaning="cubic stiffness")
+
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        return -self.stiffness * position * position * position
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"stiffness": 0.1 * scale.torque / scale.position**3}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        verb = "hardens" if self.stiffness >= 0 else "softens"
+        # A tenth of a radian is a deflection people can picture.
+        torque = abs(self.stiffness) * 0.1**3
+        return (
+            f"the spring at the {self.at} {verb} with deflection, by {torque:.3g} N m at 0.1 rad "
+            f"({self.stiffness:.3g} N m/rad^3)"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class QuadraticSpring(Force):
+    """The quadratic term of a spring that is stiffer to one side, as two unlike springs give.
+
+        tau = -stiffness position^2
+
+    Not far outside the deflections of the recording: to one side it pulls outwards.
+
+    Args:
+        at: Port.
+        stiffness: Quadratic stiffness [N m/rad^2], positive where positive deflection is stiffer.
+
+    Source: Second-order Taylor term of any spring characteristic.
+    """
+
+    name: ClassVar[str] = "quadratic_spring"
+    title: ClassVar[str] = "spring that is stiffer to one side"
+    equation: ClassVar[str] = "tau = -stiffness * position^2"
+    ports: ClassVar[tuple[str, ...]] = ("joint",)
+    amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)
+    searched: ClassVar[tuple[str, ...]] = ("joint",)
+
+    stiffness: float = parameter(0.0, unit="N m/rad^2", typical=1.0, meaning="quadratic stiffness")
+
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        return -self.stiffness * position * position
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"stiffness": 0.1 * scale.torque / scale.position**2}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        side = "positive" if self.stiffness >= 0 else "negative"
+        torque = abs(self.stiffness) * 0.1**2
+        return (
+            f"the spring at the {self.at} is stiffer towards {side} deflection, by "
+            f"{torque:.3g} N m at 0.1 rad ({self.stiffness:.3g} N m/rad^2)"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class JointPlay(Force):
+    """Play of a spring: within it, part or all of the stiffness is missing.
+
+        tau = stiffness min(max(position, -play), play)
+
+    It comes on top of the linear spring at the port. With `stiffness` equal to the spring's, the
+    spring gives no torque at all within the play; a smaller value is a spring that is softer there.
+    Not for play between motor and gear: that is `backlash`.
+
+    Args:
+        at: Port.
+        play: Deflection to each side that is free [rad].
+        stiffness: What the spring lacks within the play [N m/rad].
+
+    Source: M. Nordin and P.-O. Gutman, Controlling mechanical systems with backlash, Automatica 38,
+    2002, the dead-zone model.
+    """
+
+    name: ClassVar[str] = "joint_play"
+    title: ClassVar[str] = "play of the spring"
+    equation: ClassVar[str] = "tau = stiffness * min(max(position, -play), play), beside the spring"
+    ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
+    amplitudes: ClassVar[tuple[str, ...]] = ("play",)
+    searched: ClassVar[tuple[str, ...]] = ("joint",)
+
+    play: float = parameter(0.005, unit="rad", lower=0.0, meaning="free deflection to each side")
+    stiffness: float = parameter(1.6, unit="N m/rad", lower=0.0, meaning="what the spring lacks there")
+
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m] on the port."""
+        # Not `clip`: at no play it would halve the derivative with respect to the play.
+        above = jnp.where(position > self.play, self.play, position)
+        return self.stiffness * jnp.where(position < -self.play, -self.play, above)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction, the spring wholly missing."""
+        return [[{"play": 0.05 * scale.position, "stiffness": scale.stiffness}]] if scale.stiffness else []
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the {self.at} is loose by {self.play:.2g} rad ({math.degrees(self.play):.2g} degrees) to "
+            f"each side: {self.stiffness:.3g} N m/rad of its spring are missing there"
+        )

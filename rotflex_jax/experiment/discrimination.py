@@ -1,0 +1,182 @@
+"""The evidence that an input gives for one of two models: what the other at its best leaves unexplained.
+
+T-optimality: the run of one model is fitted by its rival, and half the squared whitened residuals are the
+log-likelihood by which the true model is expected to win.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.rival_fit import RivalFit, best_rival_fit, free_run_from_rest, input_gradient
+from rotflex_jax.experiment.rival_model import RivalModel
+from rotflex_jax.experiment.standard_inputs import Limits
+
+# Further starts of a rival fit: factors of every parameter of the rival's effect that is not an amplitude,
+# since least squares from one start finds the local minimum of that shape.
+SHAPE_FACTORS = (0.6, 1.6)
+# A model is nested in its rival where the rival reproduces its run to this share of the evidence of the
+# opposite case, or to so little that no recording would decide [nat].
+NESTED_SHARE, NEGLIGIBLE_EVIDENCE = 0.05, 10.0
+# Exponent of the smooth maximum whose gradient stands for that of a peak.
+SMOOTH_MAXIMUM_EXPONENT = 24
+
+
+@dataclasses.dataclass(frozen=True)
+class Discrimination:
+    """Both models under one voltage, each fitted by its rival.
+
+    Attributes:
+        outputs: Runs of A and of B.
+        rival_fits: B fitted to the run of A, and A to that of B.
+        counted: Which of the two directions count.
+    """
+
+    outputs: Float[np.ndarray, "2 N C"]
+    rival_fits: tuple[RivalFit, RivalFit]
+    counted: tuple[bool, bool] = (True, True)
+
+    @property
+    def nats(self) -> float:
+        """Expected log-likelihood by which the true model wins, in the less distinct direction [nat]."""
+        return min(self._counted_nats)
+
+    @property
+    def mean_nats(self) -> float:
+        """Geometric mean of the directions that count: the objective of an input optimisation [nat].
+
+        Where one direction is bounded, as that of a play by its size, the gradient of the smaller would
+        leave the other where it is.
+        """
+        return float(np.exp(np.mean(np.log(np.maximum(self._counted_nats, 1e-12)))))
+
+    @property
+    def _counted_nats(self) -> list[float]:
+        """Evidence of each direction that counts; zero where a fit failed, since then nothing is known."""
+        pairs = zip(self.rival_fits, self.counted, strict=True)
+        return [f.nats if np.isfinite(f.nats) else 0.0 for f, counts in pairs if counts]
+
+
+@dataclasses.dataclass(frozen=True)
+class DiscriminationProblem:
+    """Two rival models at one sampling period, with the limits of the machine.
+
+    Attributes:
+        pair: A and B.
+        Ts: Sampling period [s].
+        limits: Of the machine.
+        variations: Other parameters that A may have, for the predicted peaks.
+        counted: Whether the run of A counts, and that of B: not one of a model that is nested in the other.
+    """
+
+    pair: tuple[RivalModel, RivalModel]
+    Ts: float
+    limits: Limits
+    variations: Sequence[Float[np.ndarray, " P"]] = ()
+    counted: tuple[bool, bool] = (True, True)
+
+    def evaluate(
+        self, u: Float[np.ndarray, " N"], last: Discrimination | None = None, thorough: bool = False
+    ) -> Discrimination:
+        """Runs of both models, and each one fitted to the run of the other.
+
+        Args:
+            u: Voltage [V].
+            last: Result under a similar voltage, to start from.
+            thorough: Start from several shapes of the rival's effect too, and keep the best.
+        """
+        runs = [free_run_from_rest(model, u, self.Ts) for model in self.pair]
+        fits = []
+        for k, y in enumerate(runs):
+            rival = self.pair[1 - k]
+            starts = [rival.start if last is None else last.rival_fits[k].unknowns]
+            if thorough:
+                starts += [rival.start] * (last is not None) + starts_with_other_shapes(rival)
+            fits.append(best_rival_fit(rival, u, y, self.Ts, starts))
+        return Discrimination(np.array(runs), (fits[0], fits[1]), self.counted)
+
+    def without_nested_direction(self, results: Sequence[Discrimination]) -> "DiscriminationProblem":
+        """The problem without a direction that no input can show.
+
+        Where one model is nested in the other (Coulomb friction in Stribeck's), or one effect is next to
+        nothing at the size that fits the other, the other reproduces every run of it; only the opposite
+        case shows in a recording.
+
+        Args:
+            results: Under inputs of many kinds.
+        """
+        nats = np.array([[fit.nats for fit in result.rival_fits] for result in results])
+        a, b = np.max(nats, axis=0, where=np.isfinite(nats), initial=0.0)
+        counted = (
+            bool(a > min(NESTED_SHARE * b, NEGLIGIBLE_EVIDENCE)),
+            bool(b > min(NESTED_SHARE * a, NEGLIGIBLE_EVIDENCE)),
+        )
+        return dataclasses.replace(self, counted=counted if any(counted) else (True, True))
+
+    def relative_peaks(self, outputs: Float[np.ndarray, "2 N C"]) -> Float[np.ndarray, "2 C"]:
+        """Peak over limit, per model and channel."""
+        return np.max(np.abs(outputs), axis=1) / self.limits.outputs(outputs.shape[-1])
+
+    def gradient(
+        self, u: Float[np.ndarray, " N"], result: Discrimination, penalty: Float[np.ndarray, "2 C"]
+    ) -> Float[np.ndarray, " N"]:
+        """Gradient of `log(mean_nats) - sum penalty * log(peak)` along the voltage [1/V].
+
+        Args:
+            u: Voltage [V].
+            result: Evidence under it.
+            penalty: Weight of each model's peak in each channel.
+        """
+        total = np.zeros_like(u)
+        for k, fit in enumerate(result.rival_fits):
+            y = result.outputs[k]
+            size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
+            power = np.abs(y / size) ** (SMOOTH_MAXIMUM_EXPONENT - 1) * np.sign(y)
+            slope = power / np.sum(np.abs(y / size) ** SMOOTH_MAXIMUM_EXPONENT, axis=0) / size
+            true, rival = self.pair[k], self.pair[1 - k]
+            weight = self.counted[k] / sum(self.counted) / max(fit.nats, 1e-12)
+            total += input_gradient(true, rival, fit.unknowns, u, self.Ts, weight, -penalty[k] * slope)
+        return total
+
+    def peaks(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " C"]:
+        """Largest |output| per channel under A, B, and A with other parameters."""
+        a, b = self.pair
+        varied = [dataclasses.replace(a, mechanism=a.mechanism.with_values(v)) for v in self.variations]
+        runs = [free_run_from_rest(model, u, self.Ts) for model in (a, b, *varied)]
+        return np.max([np.max(np.abs(y), axis=0) for y in runs], axis=0)
+
+    def scaled_to_limits(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+        """The voltage, made smaller until every predicted peak is within its limit.
+
+        Raises:
+            InputError: The machine leaves its limits almost without an input.
+        """
+        for _ in range(30):
+            peaks = self.peaks(u)
+            excess = float(np.max(peaks / self.limits.outputs(len(peaks))))
+            if excess <= 1:
+                return u
+            u = u * 0.998 / min(excess, 5.0)
+        raise InputError(
+            "The model is predicted to leave the limits on travel or deflection under the smallest voltage, "
+            "which an offset in it may do; widen the limits, shorten the experiment, or take the offset out."
+        )
+
+
+def starts_with_other_shapes(rival: RivalModel) -> list[Float[np.ndarray, " D"]]:
+    """Starts of a rival fit with other shapes of the effect, one parameter changed at a time."""
+    effect = rival.effect()
+    names, starts = rival.mechanism.parameter_names, []
+    for name, value in effect.values.items():
+        full = f"{effect.at}.{effect.name}.{name}"
+        if name in effect.amplitudes or names.index(full) not in rival.free or value == 0:
+            continue
+        spec = effect.declared()[name]
+        for factor in SHAPE_FACTORS:
+            if spec.lower < factor * value < spec.upper:
+                m = rival.mechanism.with_values({full: factor * value})
+                starts.append(dataclasses.replace(rival, mechanism=m).start)
+    return starts

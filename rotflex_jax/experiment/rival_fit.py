@@ -1,0 +1,253 @@
+"""How well a rival model can reproduce a run of the true one: the inner problem of an experiment's design.
+
+The rival B is fitted to a run of A by Gauss-Newton steps, each an exact linear least squares over all that a
+new recording leaves open: B's shape, every free parameter of the machine, first state, offset, bias.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.experiment.rival_model import RivalModel
+from rotflex_jax.fit.linear import factor
+from rotflex_jax.mechanism import Mechanism, Solver, free_run, predictor_run
+from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, Status, minimise
+from rotflex_jax.parameters import Transform
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import double_precision
+
+# A fit has converged when a further step promises less than this share of what is left, or this much [nat].
+GAIN_SHARE_TOLERANCE, GAIN_TOLERANCE = 2e-3, 0.01
+MAX_STEPS = 25
+# Largest step of an unconstrained coordinate.
+LARGEST_STEP = 1.0
+# Directions weaker than this share of the strongest do not count in the exact projection.
+RANK_TOLERANCE = 1e-7
+# A short recording determines some of the unknowns hardly at all, and most steps are nearly exact: little
+# damping, raised fast where a step fails.
+RULES = Rules(
+    enough=GAIN_TOLERANCE / 2, enough_share=GAIN_SHARE_TOLERANCE / 2, damping=1e-6, increase=30.0, least=1e-9
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class RivalFit:
+    """A rival model fitted to a run of the true one.
+
+    Attributes:
+        unknowns: Unconstrained values of the free parameters, then the first state.
+        nats: Half the squared whitened residuals that remain after an exact projection [nat].
+        residuals: Whitened innovations of the rival on the run of the true model.
+        predicted_gain: What a further step would gain to first order [nat]; small at convergence.
+        steps: Gauss-Newton steps taken.
+    """
+
+    unknowns: Float[np.ndarray, " D"]
+    nats: float
+    residuals: Float[np.ndarray, "N C"]
+    predicted_gain: float
+    steps: int
+
+    @property
+    def converged(self) -> bool:
+        """Whether a further step would gain next to nothing."""
+        return self.predicted_gain <= max(GAIN_SHARE_TOLERANCE * self.nats, GAIN_TOLERANCE)
+
+
+def free_run_from_rest(model: RivalModel, u: Float[np.ndarray, " N"], Ts: float) -> Float[np.ndarray, "N C"]:
+    """Outputs of a model from rest, without noise."""
+    structure = model.mechanism.structure
+    with double_precision():
+        arrays = tuple(map(jnp.asarray, (model.mechanism.values, u, float(Ts))))
+        return np.asarray(_free_run_from_rest(structure, model.solver, *arrays))
+
+
+@persistent_jit(static=2)
+def _free_run_from_rest(
+    structure: Mechanism, solver: Solver, values: jax.Array, u: jax.Array, Ts: jax.Array
+) -> jax.Array:
+    gates = jnp.ones(len(structure.effects), u.dtype)
+    return free_run(structure, solver, values, gates, _rest_state(structure, u), u, Ts)[1]
+
+
+def _rest_state(structure: Mechanism, like: jax.Array) -> jax.Array:
+    return jnp.asarray(rest_state(structure, np.float64), like.dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class _StaticRival:
+    """What of a rival model is static in a compiled program."""
+
+    structure: Mechanism
+    solver: Solver
+    free: tuple[int, ...]
+
+    def whitened(
+        self, unknowns: jax.Array, fixed: Any, u: jax.Array, y: jax.Array, Ts: jax.Array
+    ) -> jax.Array:
+        """Whitened innovations (N, C) on a run `y` under the voltage `u`."""
+        values, K, L = fixed
+        P = len(self.free)
+        specs = self.structure.parameter_specifications
+        fitted = Transform.of([specs[i] for i in self.free]).constrain(unknowns[:P])
+        values = values.at[np.array(self.free)].set(fitted)
+        gates = jnp.ones(len(self.structure.effects), u.dtype)
+        x0 = _rest_state(self.structure, u).at[: len(unknowns) - P].set(unknowns[P:])
+        seen = jnp.ones_like(u)
+        y_hat = predictor_run(self.structure, self.solver, values, gates, x0, u, y, seen, K, Ts)[1]
+        return (y - y_hat) @ L.T
+
+
+@persistent_jit(static=1)
+def _whitened_residuals(
+    rival: _StaticRival, unknowns: jax.Array, fixed: Any, u: jax.Array, y: jax.Array, Ts: jax.Array
+) -> Any:
+    return rival.whitened(unknowns, fixed, u, y, Ts)
+
+
+@persistent_jit(static=1)
+def _residuals_and_jacobian(
+    rival: _StaticRival, unknowns: jax.Array, fixed: Any, u: jax.Array, y: jax.Array, Ts: jax.Array
+) -> Any:
+    def run(x: jax.Array) -> jax.Array:
+        return rival.whitened(x, fixed, u, y, Ts)
+
+    directions = jnp.eye(len(unknowns))
+    return jax.vmap(lambda d: jax.jvp(run, (unknowns,), (d,)), out_axes=(None, -1))(directions)
+
+
+@persistent_jit(static=3)
+def _input_gradient(
+    structure: Mechanism, solver: Solver, rival: _StaticRival, arrays: Any, u: jax.Array, Ts: jax.Array
+) -> Any:
+    values, unknowns, fixed, evidence_weight, output_weight = arrays
+
+    def objective(u: jax.Array) -> jax.Array:
+        y = _free_run_from_rest(structure, solver, values, u, Ts)
+        nats = 0.5 * jnp.sum(rival.whitened(unknowns, fixed, u, y, Ts) ** 2)
+        return evidence_weight * nats + jnp.sum(output_weight * y)
+
+    return jax.grad(objective)(u)
+
+
+def _static_and_arrays(model: RivalModel) -> tuple[_StaticRival, Any]:
+    arrays = tuple(map(jnp.asarray, (model.mechanism.values, model.K, model.L)))
+    return _StaticRival(model.mechanism.structure, model.solver, model.free), arrays
+
+
+def fit_rival(
+    rival: RivalModel,
+    u: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, "N C"],
+    Ts: float,
+    start: Float[np.ndarray, " D"] | None = None,
+) -> RivalFit:
+    """The rival fitted to a run of the true model, or to a recording.
+
+        nats = min over unknowns of  1/2 sum_k |L (y_k - y_hat_k)|^2
+
+    Args:
+        rival: The model to fit.
+        u: Voltage [V].
+        y: Outputs to reproduce.
+        Ts: Sampling period [s].
+        start: Unknowns to start from; the rival's own if None.
+    """
+    with double_precision():
+        static, fixed = _static_and_arrays(rival)
+        data = tuple(map(jnp.asarray, (u, y, float(Ts))))
+
+        def linearised(unknowns: np.ndarray) -> _Linearisation:
+            w, J = _residuals_and_jacobian(static, jnp.asarray(unknowns), fixed, *data)
+            return _Linearisation(np.asarray(w), np.asarray(J))
+
+        first = rival.start if start is None else start
+        limit = np.full(len(first), LARGEST_STEP)
+        found = minimise(linearised, first, RULES, limit=limit, max_steps=MAX_STEPS - 1)
+    steps = found.evaluations + 1
+    if found.status == Status.DIVERGED:
+        return RivalFit(found.x, np.inf, np.full_like(y, np.inf), np.inf, steps)
+    nats = found.equations.projected_cost()
+    return RivalFit(found.x, nats, found.equations.residuals, found.cost - nats, steps)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Linearisation:
+    """Whitened residuals (N, C) and their Jacobian (N, C, D) at some unknowns, with normal equations."""
+
+    residuals: np.ndarray
+    jacobian: np.ndarray
+
+    @functools.cached_property
+    def _normal(self) -> NormalEquations:
+        return NormalEquations.of(self.jacobian.reshape(self.residuals.size, -1), self.residuals.ravel())
+
+    @property
+    def cost(self) -> float:
+        return float(self._normal.cost)
+
+    def step(self, damping: float, limit: np.ndarray) -> Any:
+        return self._normal.step(damping, limit)
+
+    def predicted_decrease(self, step: np.ndarray) -> Any:
+        return self._normal.predicted_decrease(step)
+
+    def projected_cost(self) -> float:
+        """Half the squared residuals that an undamped step leaves to first order, by a triangular factor."""
+        A, r = self.jacobian.reshape(self.residuals.size, -1), self.residuals.ravel()
+        size = np.linalg.norm(A, axis=0)
+        size = np.where(size > 0, size, 1.0)
+        R = factor(np.column_stack([A / size, r]))
+        step = -np.linalg.lstsq(R[:-1, :-1], R[:-1, -1], rcond=RANK_TOLERANCE)[0] / size
+        left = r + A @ step
+        return 0.5 * float(left @ left)
+
+
+def best_rival_fit(
+    rival: RivalModel,
+    u: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, "N C"],
+    Ts: float,
+    starts: Sequence[Float[np.ndarray, " D"]],
+) -> RivalFit:
+    """The fit with the smallest residuals, of those from several starts; arguments as in `fit_rival`."""
+    return min((fit_rival(rival, u, y, Ts, start) for start in starts), key=lambda fit: fit.nats)
+
+
+def input_gradient(
+    true: RivalModel,
+    rival: RivalModel,
+    unknowns: Float[np.ndarray, " D"],
+    u: Float[np.ndarray, " N"],
+    Ts: float,
+    evidence_weight: float = 1.0,
+    output_weight: float | Float[np.ndarray, "N C"] = 0.0,
+) -> Float[np.ndarray, " N"]:
+    """Gradient of `evidence_weight * nats + sum output_weight * y` along the voltage [1/V].
+
+    At the minimum over the rival's unknowns the gradient along them vanishes, so the gradient of the minimum
+    is that with the unknowns held.
+
+    Args:
+        true: Model whose run is fitted.
+        rival: Model that is fitted to it.
+        unknowns: The rival's best unknowns under this voltage.
+        u: Voltage [V].
+        Ts: Sampling period [s].
+        evidence_weight: Factor of the evidence.
+        output_weight: Factors of the run of the true model.
+    """
+    with double_precision():
+        static, fixed = _static_and_arrays(rival)
+        m = true.mechanism
+        weight = np.broadcast_to(np.asarray(output_weight, float), (len(u), len(m.channels)))
+        held = (m.values, unknowns, fixed, float(evidence_weight), weight)
+        args = jax.tree.map(jnp.asarray, (held, u, float(Ts)))
+        return np.asarray(_input_gradient(m.structure, true.solver, static, *args))

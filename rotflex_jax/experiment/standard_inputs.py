@@ -1,0 +1,153 @@
+"""Limits of a machine, and the standard inputs within them from which an experiment is chosen."""
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rotflex_jax.data import excitation
+from rotflex_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What an experiment must not exceed.
+
+    Voltage and slew rate hold exactly. Travel and deflection are predicted by the models, so a margin is
+    kept; where the models are wrong, the machine may still go further.
+
+    Args:
+        voltage: Largest |u| [V].
+        slew: Largest change of the voltage per second [V/s].
+        travel: Largest |first channel| from its start, the servo angle [rad].
+        deflection: Largest |second channel|, the deflection of the arm [rad].
+        margin: Share of travel and deflection that is kept free for errors of the models.
+
+    >>> Limits(voltage=5.0, deflection=0.17).outputs(2)
+    array([  inf, 0.153])
+    """
+
+    voltage: float
+    slew: float = math.inf
+    travel: float = math.inf
+    deflection: float = math.inf
+    margin: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, unit in (("voltage", "V"), ("slew", "V/s"), ("travel", "rad"), ("deflection", "rad")):
+            value = getattr(self, name)
+            if not value > 0 or (name == "voltage" and not math.isfinite(value)):
+                raise InputError(
+                    f"The limit `{name}` was given as {value:g}, but needs a positive number in {unit}; "
+                    "give what the machine bears."
+                )
+        if not 0 <= self.margin < 1:
+            raise InputError(
+                f"The margin was given as {self.margin:g}, but is a share from 0 up to, but without, 1; "
+                "give for instance 0.1."
+            )
+
+    def outputs(self, channels: int) -> Float[np.ndarray, " C"]:
+        """Largest |output| of each channel, less the margin."""
+        known = np.array([self.travel, self.deflection])[:channels] * (1 - self.margin)
+        return np.concatenate([known, np.full(channels - len(known), np.inf)])
+
+    def playable(self, u: Float[np.ndarray, " N"], Ts: float) -> Float[np.ndarray, " N"]:
+        """The voltage made to keep the limits on voltage and slew rate; unchanged where it does so already.
+
+        Clipped, then the mean of the largest signal below and the smallest above that change no faster
+        than allowed (the envelopes of Pasch and Hausdorff). It starts from 0 V and can end there.
+
+        Args:
+            u: Voltage [V].
+            Ts: Sampling period [s].
+        """
+        return self.playable_with_sources(u, Ts)[0]
+
+    def playable_with_sources(
+        self, u: Float[np.ndarray, " N"], Ts: float
+    ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+        """`playable(u)`, and for each of its samples the two samples of `u` whose mean it follows."""
+        N = len(u)
+        inside = np.clip(u, -self.voltage, self.voltage)
+        if not math.isfinite(self.slew):
+            k = np.arange(N)
+            return inside, k, k
+        step = self.slew * Ts * (1 - 1e-12)
+        ends = step * np.minimum(np.arange(1, N + 1), np.arange(N, 0, -1))
+        inside = np.clip(inside, -ends, ends)
+        low, low_source = _lower_envelope(inside, step)
+        high, high_source = _lower_envelope(-inside, step)
+        return (low - high) / 2, low_source, high_source
+
+
+def _lower_envelope(u: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """min_j u[j] + step |k - j| for every k, and the j that gives it."""
+    k = np.arange(len(u))
+    after, j = _running_minimum(u - step * k)
+    before, i = _running_minimum((u + step * k)[::-1])
+    before, i = before[::-1], len(u) - 1 - i[::-1]
+    first, second = after + step * k, before - step * k
+    return np.minimum(first, second), np.where(first <= second, j, i)
+
+
+def _running_minimum(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Running minimum and where it was reached."""
+    least = np.minimum.accumulate(x)
+    new = np.concatenate([[True], x[1:] < least[:-1]])
+    return least, np.maximum.accumulate(np.where(new, np.arange(len(x)), 0))
+
+
+# Peak over root mean square: of Gaussian noise, which is clipped there, and of a multisine.
+NOISE_CREST, MULTISINE_CREST = 2.5, 1.7
+# Amplitudes at which the best inputs are rated again, as shares of what the limits allow.
+REDUCED_AMPLITUDES = (0.5, 0.25)
+
+
+@dataclasses.dataclass(frozen=True)
+class StandardInput:
+    """One standard input.
+
+    Attributes:
+        kind: Name in `rotflex_jax.data.excitation`.
+        setting: Its parameters in words.
+        u: Voltage [V].
+    """
+
+    kind: str
+    setting: str
+    u: Float[np.ndarray, " N"]
+
+
+def standard_inputs(N: int, Ts: float, limits: Limits) -> list[StandardInput]:
+    """Every standard input as large as the limits on voltage and slew rate allow, at several bandwidths.
+
+    Args:
+        N: Samples.
+        Ts: Sampling period [s].
+        limits: Of the machine.
+    """
+    V, top, out = limits.voltage, 0.4 / Ts, []
+
+    def add(kind: str, setting: str, u: np.ndarray) -> None:
+        # A constant part would only make the machine drift.
+        out.append(StandardInput(kind, setting, limits.playable(u - u.mean(), Ts)))
+
+    for corner in (2.0, 5.0, 15.0):
+        add("noise", f"{corner:g} Hz", excitation.noise(N, Ts, rms=V / NOISE_CREST, bandwidth=corner, seed=1))
+    for high in (6.0, 12.0, 30.0):
+        band = (max(0.1, 1 / (N * Ts)), min(high, top))
+        add(
+            "multisine",
+            f"to {band[1]:g} Hz",
+            excitation.multisine(N, Ts, band=band, rms=V / MULTISINE_CREST, seed=1),
+        )
+        add("sweep", f"to {band[1]:g} Hz", excitation.sweep(N, Ts, band=band, amplitude=V))
+    for hold in (0.1, 0.05, 0.02, 0.01):
+        held = max(hold, Ts)
+        add("prbs", f"held {1e3 * held:g} ms", excitation.prbs(N, Ts, amplitude=V, hold=held, seed=1))
+    for hold in ((0.15, 0.8), (0.05, 0.3), (0.02, 0.1)):
+        setting = f"held {1e3 * hold[0]:g} to {1e3 * hold[1]:g} ms"
+        add("steps", setting, excitation.steps(N, Ts, amplitude=V, hold=hold, seed=1))
+    return out

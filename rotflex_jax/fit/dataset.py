@@ -1,0 +1,158 @@
+"""Recordings prepared for a model: arrays side by side, sensor noise, sizes of torques, first states."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.initial_state import rough_state
+from rotflex_jax.mechanism.linear import inverse_mass, linearise
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+
+
+class StackedRecordings(NamedTuple):
+    """Recordings side by side, shorter ones padded with samples that are not `seen`.
+
+    Attributes:
+        u: Inputs.
+        y: Outputs, with the channels that the model has.
+        seen: One where a sample counts, zero where it is padding.
+        Ts: Sampling periods [s].
+    """
+
+    u: Float[Any, "R N"]
+    y: Float[Any, "R N C"]
+    seen: Float[Any, "R N"]
+    Ts: Float[Any, " R"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """Recordings with all that a fit of one model needs to know of them beforehand.
+
+    Attributes:
+        recordings: As they were given.
+        data: The same as arrays.
+        noise: Standard deviation of the sensor noise of each channel.
+        torque_scale: Torque that the motor gives at the root mean square voltage [N m].
+        first_states: First positions and speeds, where a fit starts.
+    """
+
+    recordings: tuple[Recording, ...]
+    data: StackedRecordings
+    noise: Float[np.ndarray, " C"]
+    torque_scale: float
+    first_states: Float[np.ndarray, "R n"]
+
+
+def prepare(
+    model: Model,
+    recordings: Sequence[Recording],
+    *,
+    length: int | None = None,
+    noise_of: Sequence[Recording] = (),
+    like: Dataset | None = None,
+) -> Dataset:
+    """Recordings prepared for a model.
+
+    Args:
+        model: Its channels, its motor and its coordinates count.
+        recordings: One or several.
+        length: Least number of samples of the arrays, so that other recordings share compiled code.
+        noise_of: Further recordings of the same sensors, from which their noise is estimated as well.
+        like: Data set whose sensor noise and torque scale are taken over.
+
+    Raises:
+        InputError: No recording, or one without a channel of the model.
+    """
+    data = stack(recordings, model, length)
+    return Dataset(
+        recordings=tuple(recordings),
+        data=data,
+        noise=like.noise if like else sensor_noise((*recordings, *noise_of), model),
+        torque_scale=like.torque_scale if like else torque_scale(model.mechanism, data),
+        first_states=first_states(model, recordings),
+    )
+
+
+def padded_length(recordings: Sequence[Recording]) -> int:
+    """A length of arrays that recordings of nearby lengths share, and with it the compiled code.
+
+    The longest, rounded up to one of eight lengths between powers of two: 1/16 more on average.
+    """
+    longest = max((r.N for r in recordings), default=0)
+    step = 2 ** max(0, longest.bit_length() - 4)
+    return -(-longest // step) * step
+
+
+def stack(recordings: Sequence[Recording], model: Model, length: int | None = None) -> StackedRecordings:
+    """Recordings as arrays, float64, with the channels the model has; of the given length at least."""
+    if not recordings:
+        raise InputError("No recording was given, but at least one is needed; pass a Recording.")
+    N = max(length or 0, *(r.N for r in recordings))
+    R, C = len(recordings), len(model.mechanism.channels)
+    data = StackedRecordings(np.zeros((R, N)), np.zeros((R, N, C)), np.zeros((R, N)), np.ones(R))
+    for i, r in enumerate(recordings):
+        data.u[i, : r.N], data.y[i, : r.N], data.seen[i, : r.N] = r.u, model.measured(r), 1.0
+        data.Ts[i] = r.Ts
+    return data
+
+
+def first_states(model: Model, recordings: Sequence[Recording]) -> Float[np.ndarray, "R n"]:
+    """First positions and speeds (R, 2 n): straight lines through the first samples, where a fit starts."""
+    heads = [model.measured(r)[: r.n_init].astype(float) for r in recordings]
+    structure = model.mechanism.structure
+    return np.array([rough_state(structure, y, r.Ts) for y, r in zip(heads, recordings, strict=True)])
+
+
+def sensor_noise(recordings: Sequence[Recording], model: Model) -> Float[np.ndarray, " C"]:
+    """Standard deviation of the sensor noise per channel (C,), from residuals of local polynomials.
+
+    A cubic through 11 neighbouring samples follows the motion; what it leaves is noise. Where a period
+    of the motion is but a few samples long, only a higher degree follows it: the least of several counts.
+    Never less than the rounding to steps of `resolution` leaves, step / sqrt(12).
+    """
+    return np.min([_left_by(degree, recordings, model) for degree in (3, 5, 7, 9)], axis=0)
+
+
+def _left_by(degree: int, recordings: Sequence[Recording], model: Model) -> np.ndarray:
+    """Standard deviation that local polynomials of a degree leave, if all of it were white noise."""
+    half = 5
+    t = np.arange(-half, half + 1) / half
+    V = np.vander(t, degree + 1)
+    leftover = np.eye(len(t)) - V @ np.linalg.pinv(V)
+    row = leftover[half]
+    total, floor, count = 0.0, 0.0, 0
+    for r in recordings:
+        y = model.measured(r).astype(float)
+        filtered = np.stack([np.convolve(c, row[::-1], "valid") for c in y.T], axis=1)
+        total = total + np.sum(filtered**2, axis=0) / np.sum(row**2)
+        count += len(filtered)
+        steps = [r.resolution.get(c) or 0.0 for c in model.mechanism.channels]
+        floor = np.maximum(floor, np.array(steps) / np.sqrt(12))
+    smallest = 1e-9 * max(float(np.max(np.abs(model.measured(r)))) for r in recordings)
+    return np.maximum(np.maximum(np.sqrt(total / max(count, 1)), floor), max(smallest, 1e-300))
+
+
+def process_noise_ports(m: Mechanism, intensity: float) -> dict[str, float]:
+    """The same intensity along every coordinate; ports that move one coordinate each."""
+    chosen: dict[str, float] = {}
+    span = np.zeros((0, len(m.coordinates)))
+    for port, vector in m.port_vectors.items():
+        grown = np.vstack([span, vector])
+        if np.linalg.matrix_rank(grown) > len(span):
+            span, chosen[port] = grown, intensity
+    return chosen
+
+
+def torque_scale(m: Mechanism, data: StackedRecordings) -> float:
+    """Torque [N m] that the motor gives at the root mean square voltage."""
+    n = len(m.coordinates)
+    push = np.linalg.solve(inverse_mass(m), linearise(m).B[n : 2 * n])
+    level = float(np.sqrt(np.sum(data.u**2 * data.seen) / np.sum(data.seen)))
+    return max(float(np.max(np.abs(push))) * level, 1e-6)

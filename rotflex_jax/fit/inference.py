@@ -1,0 +1,182 @@
+"""Covariances and intervals of estimates from residuals that may be correlated in time."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, Real
+
+from rotflex_jax.parameters import Estimate, Specification
+
+# Relative curvature below which a combination of parameters counts as not determined.
+UNDETERMINED_CURVATURE = 1e-11
+
+
+def correlation_length(e: Float[np.ndarray, "N C"]) -> int:
+    """RecordingSamples after which the autocorrelation of residuals stays small; at most N / 10."""
+    N = len(e)
+    longest = 1
+    for column in (e - e.mean(axis=0)).T:
+        spectrum = np.abs(np.fft.rfft(column, 2 * N)) ** 2
+        r = np.fft.irfft(spectrum)[: N // 10 + 1]
+        if r[0] <= 0:
+            continue
+        large = np.flatnonzero(np.abs(r / r[0]) > max(0.05, 2 / np.sqrt(N)))
+        # Beyond the first gap of small values lies noise of the estimate itself.
+        gaps = np.flatnonzero(np.diff(large) > 1)
+        last = large[gaps[0]] if len(gaps) else large[-1]
+        longest = max(longest, int(last) + 1)
+    return max(1, min(2 * longest, N // 10))
+
+
+def bandwidth(e: Float[np.ndarray, "N C"]) -> int:
+    """Lags that a sandwich sums over: as far as residuals are visibly correlated, and sqrt(N)."""
+    N = len(e)
+    # A weak correlation that lasts is not visible in any one lag, but its sum counts.
+    return max(correlation_length(e), min(round(np.sqrt(N)), N // 10), 1)
+
+
+class RecordingSlopes(NamedTuple):
+    """Of one recording: slopes of its scaled residuals by d of the parameters, the residuals, and which d."""
+
+    J: Float[np.ndarray, "N C d"]
+    e: Float[np.ndarray, "N C"]
+    columns: Int[np.ndarray, " d"]
+
+
+def by_recording(
+    J: Float[np.ndarray, "N C D"], e: Float[np.ndarray, "N C"], segments: Real[np.ndarray, " N"]
+) -> list[RecordingSlopes]:
+    """Slopes and residuals recording by recording, where every recording depends on every parameter.
+
+    Args:
+        J: Derivative of the scaled residuals.
+        e: Scaled residuals.
+        segments: Number of the recording each sample belongs to.
+    """
+    every = np.arange(J.shape[2])
+    return [RecordingSlopes(J[segments == s], e[segments == s], every) for s in np.unique(segments)]
+
+
+def curvature(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, "D D"]:
+    """Sum of J'J over all samples, by `size` parameters; nan where a slope is not finite."""
+    if not all(np.isfinite(part.J).all() for part in parts):
+        return np.full((size, size), np.nan)
+    H = np.zeros((size, size))
+    for J, _, columns in parts:
+        flat = J.reshape(-1, len(columns))
+        H[np.ix_(columns, columns)] += flat.T @ flat
+    return H
+
+
+def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> Float[np.ndarray, "D D"]:
+    """Covariance of least-squares estimates, robust to autocorrelation and unequal variance of the residuals.
+
+        H^-1 S H^-1,  H = sum J_k' J_k,  S = sum over lags of Bartlett-weighted products of J_k' e_k
+
+    The iid formula sigma^2 H^-1 makes intervals many times too narrow where the model is incomplete.
+    Where it is complete, the sum over lags scatters, and those parameters whose interval it happens to
+    make narrow miss the truth too often: no combination has less variance than with white residuals.
+
+    Args:
+        parts: The recordings; products do not cross them. Memory and time are those of the slopes by what
+            each recording depends on: first states, which are a recording's own, cost nothing in others.
+        H: Their `curvature`.
+
+    Returns:
+        Covariance; nan where the residuals are not finite, and for parameters that the data do not
+        determine.
+
+    Source: Newey and West 1987, Econometrica 55; the larger of two variances: Angrist and Pischke,
+    Mostly Harmless Econometrics, 2009, section 8.1.
+    """
+    size, n = len(H), sum(len(p.e) for p in parts)
+    if not (np.isfinite(H).all() and all(np.isfinite(p.e).all() for p in parts)):
+        return np.full((size, size), np.nan)
+    residual_covariance = sum(p.e.T @ p.e for p in parts) / n
+    white, S = np.zeros((size, size)), np.zeros((size, size))
+    for J, e, columns in parts:
+        own = np.ix_(columns, columns)
+        white[own] += J.reshape(-1, len(columns)).T @ (residual_covariance @ J).reshape(-1, len(columns))
+        scores = np.einsum("nc,ncd->nd", e, J)
+        width, none = bandwidth(e), np.zeros((1, len(columns)))
+        # Sums over all stretches of `width` samples give exactly the Bartlett kernel.
+        total = np.cumsum(np.concatenate([none, scores, np.repeat(none, width - 1, axis=0)]), axis=0)
+        sums = total[1:].copy()
+        sums[width:] -= total[1:-width]
+        S[own] += sums.T @ sums / width
+    # In units in which each parameter alone is as well determined as any other, an eigenvalue at the
+    # level of rounding is a direction that the data do not determine: no interval, rather than a narrow one.
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    undetermined = eigenvalues < UNDETERMINED_CURVATURE
+    inverse = (vectors / np.where(undetermined, np.inf, eigenvalues)) @ vectors.T / np.outer(scale, scale)
+    robust, plain = (inverse @ M @ inverse * (n / max(n - size, 1)) for M in (S, white))
+    covariance = _larger(robust, plain)
+    lost = (np.abs(vectors[:, undetermined]) > 1e-3).any(axis=1) | (np.diag(H) <= 0)
+    covariance[lost, :] = covariance[:, lost] = np.nan
+    return covariance
+
+
+def _larger(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest covariance of `a` or more that is `b` or more in every direction that `b` determines.
+
+    It does not matter in which combinations of the parameters the two are written.
+    """
+    size = np.sqrt(np.maximum(np.diag(b), 1e-300))
+    d, u = np.linalg.eigh(b / np.outer(size, size))
+    u, d = u[:, d > UNDETERMINED_CURVATURE], d[d > UNDETERMINED_CURVATURE]
+    root, back = size[:, None] * u * np.sqrt(d), (u / np.sqrt(d)).T / size
+    m, v = np.linalg.eigh(back @ a @ back.T)
+    turned = root @ v
+    return (turned * np.maximum(m, 1.0)) @ turned.T
+
+
+class Combination(NamedTuple):
+    """A parameter to first order as a weighted sum of fitted coordinates: their rows, and its derivatives."""
+
+    rows: Sequence[int]
+    weights: Float[np.ndarray, " k"]
+
+
+def combined_covariance(
+    covariance: Float[np.ndarray, "D D"], combinations: Sequence[Combination]
+) -> Float[np.ndarray, "P P"]:
+    """Covariance of parameters that are combinations of fitted coordinates."""
+    return np.array(
+        [[a @ covariance[np.ix_(i, k)] @ b for k, b in combinations] for i, a in combinations]
+    ).reshape(len(combinations), len(combinations))
+
+
+def estimates(
+    names: Sequence[str],
+    values: Float[np.ndarray, " P"],
+    specifications: Sequence[Specification],
+    combinations: Sequence[Combination | None],
+    covariance: Float[np.ndarray, "D D"],
+    notes: Sequence[str] | None = None,
+) -> tuple[Estimate, ...]:
+    """Estimates with 95 % intervals from the covariance of fitted coordinates.
+
+        var p = w' covariance w,   w = dp / d coordinates
+
+    Args:
+        names: Full names.
+        values: Estimated values [declared units].
+        specifications: What is declared of each parameter.
+        combinations: Of the fitted coordinates; None for a parameter that was held.
+        covariance: Of the fitted coordinates; nan where the data do not determine them.
+        notes: A remark on each; none if None.
+    """
+    found = []
+    for name, value, spec, combination, note in zip(
+        names, values.tolist(), specifications, combinations, notes or [""] * len(names), strict=True
+    ):
+        if combination is None:
+            nan = float("nan")
+            found.append(Estimate(name, value, nan, (nan, nan), spec.unit, free=False, note=note))
+            continue
+        rows, weights = combination
+        variance = weights @ covariance[np.ix_(rows, rows)] @ weights
+        found.append(Estimate.of(name, value, float(np.sqrt(np.maximum(variance, 0.0))), spec, note))
+    return tuple(found)

@@ -1,0 +1,150 @@
+"""From texts of the command line to a joint, a model of the user, or an effect with its parameters."""
+
+import difflib
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rotflex_jax.errors import InputError
+
+JOINTS = ("paper", "quanser_2002", "quanser_2010", "single_inertia")
+
+
+def choose(name: str, choices: Iterable[str], what: str) -> str:
+    """`name` if it is one of the choices; otherwise a sentence with the likely one."""
+    choices = list(choices)
+    if name in choices:
+        return name
+    close = difflib.get_close_matches(name, choices, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
+    raise InputError(f"There is no {what} called {name!r}; {hint}")
+
+
+def joint(text: str) -> Any:
+    """The mechanism meant by `paper`, by `quanser_2010:spring=3,hub_anchor=A`, or as for `model`."""
+    return model(text).mechanism
+
+
+def model(text: str, add: Iterable[str] = ()) -> Any:
+    """The model meant by a joint, by `FILE.py:NAME`, or by a saved `MODEL.json`, with effects added."""
+    found = _model(text)
+    for each in add:
+        found = found + effect(each)
+    return found
+
+
+def _model(text: str) -> Any:
+    from rotflex_jax import joints
+    from rotflex_jax.models.model import Model
+
+    name, separator, values = text.partition(":")
+    if text.endswith(".json") or (separator and "=" not in values and name not in JOINTS):
+        return named(text)
+    preset = getattr(joints, choose(name, JOINTS, "joint"))
+    # A motor is not a number; whoever needs another one writes Python.
+    names = [key for key in inspect.signature(preset).parameters if key != "motor"]
+    return Model(preset(**_numbers(values, names, f"option of {name}")))
+
+
+def named(text: str) -> Any:
+    """The model meant by `plant.py:turntable`, `package.module:turntable` or `model.json`.
+
+    What the file registers (effects of one's own) is known from then on.
+
+    Args:
+        text: A Python file or module with the name of a `Mechanism`, of a `Model` or of a function that
+            returns one; or a file that `model.save` has written.
+
+    Raises:
+        InputError: No such file, module or name, or something else than a mechanism behind it.
+    """
+    from rotflex_jax.mechanism import Mechanism
+    from rotflex_jax.models.model import Model
+
+    place, separator, name = text.rpartition(":")
+    if not separator or text.endswith(".json"):
+        return Model.load(text)
+    found = getattr(imported(place), name, None)
+    if callable(found) and not isinstance(found, type):
+        found = found()
+    if isinstance(found, Model):
+        return found
+    if isinstance(found, Mechanism):
+        return Model(found)
+    known = [n for n, v in vars(imported(place)).items() if isinstance(v, (Mechanism, Model))]
+    raise InputError(
+        f"{place} has no mechanism called {name!r}; "
+        + (f"it has {', '.join(known)}." if known else f"write {name} = rotflex_jax.Mechanism(...) in it.")
+    )
+
+
+def imported(place: str) -> ModuleType:
+    """The Python file or module, run once."""
+    try:
+        if not place.endswith(".py"):
+            here = str(Path.cwd())
+            sys.path.insert(0, here)
+            try:
+                return importlib.import_module(place)
+            finally:
+                sys.path.remove(here)
+        file = Path(place).resolve()
+        if not file.is_file():
+            raise InputError(f"{place} does not exist; give the path of a Python file.")
+        known = sys.modules.get(file.stem)
+        if known is not None and getattr(known, "__file__", None) == str(file):
+            return known
+        spec = importlib.util.spec_from_file_location(file.stem, file)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        if known is None:
+            sys.modules[file.stem] = module  # dataclasses look their module up
+        spec.loader.exec_module(module)
+        return module
+    except InputError:
+        raise
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{place} cannot be imported ({error}); give FILE.py:NAME or a module on the path."
+        ) from None
+    except Exception as error:
+        raise InputError(
+            f"{place} cannot be run: {type(error).__name__}: {error}; correct the file."
+        ) from None
+
+
+def effect(text: str) -> Any:
+    """The effect meant by `coulomb@hub`, or by `coulomb@hub:level=0.03`."""
+    from rotflex_jax.effects import CATALOG
+
+    place, _, values = text.partition(":")
+    name, separator, port = place.partition("@")
+    kind = CATALOG[choose(name, CATALOG, "effect")]
+    ports = list(kind.ports)
+    if not separator and len(ports) > 1:
+        raise InputError(
+            f"The effect {name} was given no port, but can act at {', '.join(ports)}; give for "
+            f"instance {name}@{ports[0]}."
+        )
+    numbers = _numbers(values, kind.declared(), f"parameter of {name}")
+    return kind(at=port or ports[0], **numbers)
+
+
+def _numbers(text: str, names: Iterable[str], what: str) -> dict[str, Any]:
+    """`a=1,b=C` as a dict; what does not read as a number stays text."""
+    found: dict[str, Any] = {}
+    for pair in filter(None, text.split(",")):
+        key, separator, value = (part.strip() for part in pair.partition("="))
+        if not separator or not value:
+            raise InputError(f"{pair!r} has no value, but needs one; write {key}=VALUE.")
+        choose(key, names, what)
+        try:
+            found[key] = int(value) if value.lstrip("+-").isdigit() else float(value)
+        except ValueError:
+            found[key] = value
+    return found

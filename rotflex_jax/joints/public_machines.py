@@ -1,0 +1,200 @@
+"""Public machines: EMPS, the Silverbox, the rotary arm of a student laboratory, a serial flexible link."""
+
+import math
+from types import MappingProxyType
+
+from rotflex_jax.effects import CurrentDrive, Inertia, Motor, Spring, Viscous
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints.rotary_flexible import PORTS, flexible_joint
+from rotflex_jax.joints.single_inertia import single_inertia
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.units import Units
+
+FORCE_PER_VOLT = 35.15065188248547
+"""Force on the carriage per volt of command [N/V], as the recordings give it."""
+
+
+def emps(mass: float = 80.0, *, damping: float = 100.0, gain: float = FORCE_PER_VOLT) -> Mechanism:
+    """A linear axis: mass, viscous damping and a drive in proportion to the voltage, one output.
+
+        mass x'' = gain v - damping x'
+
+    The gain is trusted, mass and damping are free. What friction the axis has is for a search to find.
+
+    Args:
+        mass: Of carriage, screw and rotor together, as the carriage feels it [kg].
+        damping: [N s/m].
+        gain: Force per volt [N/V].
+
+    Returns:
+        Mechanism with the output `position` [m] and the port `axis`.
+
+    Source: Janot, Gautier and Brunot 2019, Data set and reference models of EMPS, equation 1 less
+        friction and offset.
+
+    >>> emps().free_names
+    ('axis.inertia.inertia', 'axis.viscous.coefficient')
+    >>> [s.unit for s in emps().parameter_specifications]
+    ['kg', 'N/V', 'N s/m']
+    """
+    return Mechanism(
+        coordinates=("position",),
+        ports={"axis": (1.0,)},
+        effects=(
+            Inertia(at="axis", inertia=mass),
+            CurrentDrive(at="axis", gain=gain),
+            Viscous(at="axis", coefficient=damping),
+        ),
+        outputs={"position": "axis"},
+        trusted=("axis.current_drive.gain",),
+        units=Units("m", "N", motion_size=0.1, effort_size=1000.0),
+    )
+
+
+def silverbox(frequency: float = 60.0, *, damping_ratio: float = 0.1, stiffness: float = 1.0) -> Mechanism:
+    """A mass on a spring with a damper, from voltage to voltage.
+
+        mass y'' + damping y' + stiffness y = v
+
+    The output in volts stands for the position and the input for the force, so the gain is one and
+    held; mass, damping and stiffness are free. The input of the public recordings is smooth between
+    its samples: simulate with `Exponential(substeps=4, between="smooth")`.
+
+    Args:
+        frequency: Of the resonance, where to start [Hz].
+        damping_ratio: Where to start.
+        stiffness: Input per output at rest, where to start.
+
+    Returns:
+        Mechanism with the output `output` [V] and the port `joint`.
+
+    Source: Wigren and Schoukens 2013, section on the Silverbox, less the cubic spring.
+
+    >>> silverbox().free_names
+    ('joint.inertia.inertia', 'joint.viscous.coefficient', 'joint.spring.stiffness')
+    >>> [s.unit for s in silverbox().parameter_specifications]
+    ['s^2', '', 's', '']
+    """
+    w = 2 * math.pi * frequency
+    return Mechanism(
+        coordinates=("output",),
+        ports={"joint": (1.0,)},
+        effects=(
+            Inertia(at="joint", inertia=stiffness / w**2),
+            CurrentDrive(at="joint", gain=1.0),
+            Viscous(at="joint", coefficient=2 * damping_ratio * stiffness / w),
+            Spring(at="joint", stiffness=stiffness),
+        ),
+        outputs={"output": "joint"},
+        trusted=("joint.current_drive.gain",),
+        units=Units("V", "V", motion_size=0.1, effort_size=0.1),
+    )
+
+
+GEAR_RATIO, TORQUE_CONSTANT, RESISTANCE = 48.4, 0.0107, 3.29
+"""Turns of the motor per turn of the arm, torque per current [N m/A] and armature resistance [ohm]."""
+
+
+def rotary_arm(flexible: bool = False, *, arm_inertia: float = 0.004, stiffness: float = 1.0) -> Mechanism:
+    """The arm of the laboratory with its constants as a start; the motor is trusted as a whole.
+
+    Rigid, one inertia with the output `theta`. Flexible, a hub and an arm on a spring with the outputs
+    `theta` and `alpha`, the angle of the tip against the hub; there the laboratory gives the hub's
+    inertia, the arm's and the stiffness are a guess, and all three are free.
+
+    Args:
+        flexible: Which of the two arms.
+        arm_inertia: Of the flexible arm, where to start [kg m^2].
+        stiffness: Of the flexible arm, where to start [N m/rad].
+
+    Returns:
+        Mechanism with the ports of `single_inertia` or of a flexible joint.
+
+    Source: Constants of the laboratory, ASEN 2003, laboratory 6, 2017.
+
+    >>> rotary_arm().free_names
+    ('hub.inertia.inertia', 'hub.viscous.coefficient')
+    >>> rotary_arm(flexible=True).free_names[:3]
+    ('hub.inertia.inertia', 'arm.inertia.inertia', 'joint.spring.stiffness')
+    """
+    motor = Motor(
+        at="hub",
+        torque_constant=TORQUE_CONSTANT,
+        back_emf=TORQUE_CONSTANT,
+        resistance=RESISTANCE,
+        gear_ratio=GEAR_RATIO,
+    )
+    if not flexible:
+        return single_inertia(0.0035, motor=motor)
+    joint = flexible_joint(hub_inertia=0.002, arm_inertia=arm_inertia, stiffness=stiffness, motor=motor)
+    return joint.release("arm.inertia.inertia").trust("hub.motor.torque_constant")
+
+
+TWO_DOF_LINK = MappingProxyType(
+    {
+        1: MappingProxyType(
+            {
+                "hub_inertia": 0.06353616,
+                "arm_inertia": 0.17043427,
+                "stiffness": 39.957193,
+                "torque_per_current": 8.925,
+                "hub_damping": 4.0,
+                "joint_damping": 0.0,
+            }
+        ),
+        2: MappingProxyType(
+            {
+                "hub_inertia": 0.00301955,
+                "arm_inertia": 0.0064387,
+                "stiffness": 6.857751,
+                "torque_per_current": 0.87,
+                "hub_damping": 1.5,
+                "joint_damping": 0.085608,
+            }
+        ),
+    }
+)
+"""Constants of the laboratory by stage: J11, J12, Ks1, Ktg1, B11, B12 and the same with 2, in SI units."""
+
+
+def two_dof_link(stage: int = 1) -> Mechanism:
+    """One stage of the serial flexible link, the other left out: a flexible joint driven by a current.
+
+        hub_inertia theta'' + arm_inertia (theta'' + alpha'') = torque_per_current i - hub_damping theta'
+        arm_inertia (theta'' + alpha'') = -stiffness alpha - joint_damping alpha'
+
+    The torque per current is trusted; inertias, stiffness and damping are free and start at the
+    laboratory's constants. Of these the damping of the hubs is above what the recordings show, and
+    the dry friction of the gears is missing. Stage 2 stands on the end of link 1, whose motion this
+    model does not know: expect more error there.
+
+    Args:
+        stage: 1, which carries stage 2, or 2.
+
+    Returns:
+        Mechanism with the ports of a flexible joint and the outputs `theta` and `alpha`; its input is
+        a current [A], so that the gain of the drive is in N m/A.
+
+    Source: Constants of the laboratory in lqr_full_10deg.mat; Quanser, 2-DOF serial flexible link,
+        reference manual, 2011.
+
+    >>> two_dof_link(2).free_names[:3]
+    ('hub.inertia.inertia', 'arm.inertia.inertia', 'joint.spring.stiffness')
+    """
+    if stage not in TWO_DOF_LINK:
+        raise InputError(f"The machine has the stages 1 and 2, but stage={stage!r} was given; choose one.")
+    constants = TWO_DOF_LINK[stage]
+    return Mechanism(
+        coordinates=("theta", "alpha"),
+        ports=PORTS,
+        effects=(
+            Inertia(at="hub", inertia=constants["hub_inertia"]),
+            Inertia(at="arm", inertia=constants["arm_inertia"]),
+            Spring(at="joint", stiffness=constants["stiffness"]),
+            CurrentDrive(at="hub", gain=constants["torque_per_current"]),
+            Viscous(at="hub", coefficient=constants["hub_damping"]),
+            Viscous(at="joint", coefficient=constants["joint_damping"]),
+        ),
+        outputs={"theta": "hub", "alpha": "joint"},
+        trusted=("hub.current_drive.gain",),
+    )

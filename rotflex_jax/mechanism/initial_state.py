@@ -1,0 +1,131 @@
+"""The state at the start of a recording from its first samples, by least squares through the simulator."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Float
+
+from rotflex_jax.mechanism.assembly import Layout, rest_state
+from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.simulate import Solver, free_run
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_compiled
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import double_precision
+
+# Segments of one call at least; short as they are, more of them cost next to nothing.
+LEAST_SEGMENTS_PER_CALL = 8
+# Increment of a state for a difference quotient.
+DIFFERENCE = 1e-6
+# Evaluations of one segment at most.
+MAX_EVALUATIONS = 25
+# Near a stop of friction difference quotients are rough, and with less damping some segments end elsewhere
+# than at the least error; directions that a segment does not determine stay where they are.
+RULES = Rules(enough_share=1e-14, least=1e-6)
+
+
+def rough_state(structure: Mechanism, y: Float[np.ndarray, "N C"], Ts: float) -> Float[np.ndarray, " s"]:
+    """Positions and speeds from a straight line through the samples.
+
+    What the sensors do not determine follows from the springs, which are relaxed, and is zero where there is
+    none. Speeds come from the slopes of positions before they come from sensors of speed, whose sign a
+    rectifier may hide.
+
+    Args:
+        structure: Mechanism.
+        y: First samples of the outputs.
+        Ts: Sampling period [s].
+    """
+    layout = Layout.of(structure)
+    t = np.arange(len(y)) * Ts
+    slope, start = np.polyfit(t, y, 1) if len(y) > 1 else (0 * y[0], y[0])
+    rows = np.array(layout.output_rows)
+    n, is_position = layout.n, np.array([q.is_position for q in structure.quantities])
+    C, V = rows[is_position, :n], rows[~is_position, n:]
+    ports = {e.at for e in structure.effects if e.name == "spring"}
+    springs = np.array([structure.port_vectors[p] for p in sorted(ports)]).reshape(-1, n)
+    relaxed = np.zeros(len(springs))
+    q = _lexicographic_fit([(C, start[is_position]), (springs, relaxed)], n)
+    dq = _lexicographic_fit([(C, slope[is_position]), (springs, relaxed), (V, start[~is_position])], n)
+    return np.concatenate([q, dq])
+
+
+def _lexicographic_fit(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> np.ndarray:
+    """The smallest `x` with `A x = b` for the first pair, then for the next as far as it is undetermined."""
+    x, free = np.zeros(n), np.eye(n)
+    for A, b in rows:
+        left = A @ free
+        x = x + free @ np.linalg.pinv(left) @ (b - A @ x)
+        free = free @ scipy.linalg.null_space(left)
+    return x
+
+
+@persistent_jit(static=2)
+def _fitted_states(
+    structure: Mechanism,
+    solver: Solver,
+    values: Array,
+    gates: Array,
+    guess: Array,
+    hidden: Array,
+    u: Array,
+    y: Array,
+    Ts: Array,
+) -> Array:
+    """Positions and speeds (W, m) with the least squared error, each segment by itself.
+
+    Slopes are difference quotients: segments are short, and the derivative of the simulation would take
+    longer to compile than all the runs take.
+    """
+    m = guess.shape[1]
+    increments = jnp.concatenate([jnp.zeros((1, m)), DIFFERENCE * jnp.eye(m)])
+    runs = jax.vmap(functools.partial(free_run, structure, solver), in_axes=(None, None, 0, None, None))
+
+    def fitted(guess: Array, hidden: Array, u: Array, y: Array) -> Array:
+        def linearise(x: Array) -> NormalEquations:
+            starts = jnp.concatenate([x[None] + increments, jnp.tile(hidden[None], (m + 1, 1))], axis=1)
+            e = (runs(values, gates, starts, u, Ts)[1] - y[None]).reshape(m + 1, -1)
+            return NormalEquations.of((e[1:] - e[:1]).T / DIFFERENCE, e[0])
+
+        return minimise_compiled(linearise, guess, RULES, max_steps=MAX_EVALUATIONS)[0]
+
+    return jax.vmap(fitted)(guess, hidden, u, y)
+
+
+def initial_states(
+    mechanism: Mechanism,
+    solver: Solver,
+    gates: Float[np.ndarray, " E"],
+    u: Float[np.ndarray, "W N"],
+    y: Float[np.ndarray, "W N C"],
+    Ts: float,
+    hidden: Float[np.ndarray, "W h"] | None = None,
+) -> Float[np.ndarray, "W n"]:
+    """First states of W segments of a recording, each by itself.
+
+    Positions and speeds are fitted; errors of the channels are weighted in their own units. States that no
+    sensor measures (memories, motor current, modes of a part) are given.
+
+    Args:
+        mechanism: Model.
+        solver: Integration rule.
+        gates: One factor per effect.
+        u: Voltage [V].
+        y: Measured outputs.
+        Ts: Sampling period [s].
+        hidden: The states after positions and speeds; at rest if None.
+    """
+    structure = mechanism.structure
+    if hidden is None:
+        rest = rest_state(structure, np.float64)[2 * Layout.of(structure).n :]
+        hidden = np.tile(rest, (len(u), 1))
+    guess = np.array([rough_state(structure, segment, Ts) for segment in y])
+    # Filled up with copies of the last, so that few numbers of segments are compiled for.
+    rows = np.minimum(np.arange(max(LEAST_SEGMENTS_PER_CALL, 2 ** (len(u) - 1).bit_length())), len(u) - 1)
+    with double_precision():
+        segments = map(jnp.asarray, (guess[rows], hidden[rows], u[rows], y[rows], np.float64(Ts)))
+        parameters = map(jnp.asarray, (mechanism.values, gates))
+        found = np.asarray(_fitted_states(structure, solver, *parameters, *segments))
+    return np.concatenate([found[: len(u)], hidden], axis=1)

@@ -1,0 +1,243 @@
+"""Sensitivities of a run: forward mode along with the run, and along effects that are inactive.
+
+    x[k+1] = f(x[k], v[k], c),   dx[k+1] = df/dx dx[k] + df/dv dv[k] + df/dc dc
+
+State and tangents advance together and nothing of the length of the run is stored but what is asked for. The
+D directions are the last axis, so that vector units work on all at once. The state is repeated along that
+axis: the same arithmetic for all costs less than to keep it apart. `scan.states` stores the Jacobians of the
+step instead, for reverse mode and for inactive effects.
+
+An effect whose amplitude is zero leaves the run and its Jacobians `A[k]` as they are without it. It only adds
+a forcing `b[k]` to the same recursion,
+
+    dx[k+1] = A[k] dx[k] + b[k],
+
+evaluated along the run, with the effect's own states driven by that run. Each inactive effect therefore costs
+one forcing, however many states it has.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Integer
+
+from rotflex_jax.effects.base import Actuation, Gear, Memory
+from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
+from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.scan import forcing, state_jacobians, states, tangent_recursion
+from rotflex_jax.mechanism.simulate import FreeStep, PredictorStep, Solver, prepared_run, read_outputs
+from rotflex_jax.mechanism.step import Exponential
+
+
+class RunParameters(NamedTuple):
+    """Parameters of a predictor run of one structure.
+
+    Attributes:
+        values: Parameter values.
+        gates: One factor per effect.
+        x0: First state.
+        K: Gain; None for a free run.
+    """
+
+    values: Float[Array, "*batch P"]
+    gates: Float[Array, "*batch E"]
+    x0: Float[Array, "*batch n"]
+    K: Float[Array, "*batch n C"] | None
+
+
+class RecordingSamples(NamedTuple):
+    """Samples of one recording.
+
+    Attributes:
+        u: Voltage [V].
+        y: Measured outputs.
+        seen: One where a sample may correct the state, zero where it may not.
+        Ts: Sampling period [s].
+    """
+
+    u: Float[Array, "*batch N"]
+    y: Float[Array, "*batch N C"]
+    seen: Float[Array, "*batch N"]
+    Ts: Float[Array, "*batch"]
+
+
+def predictor_jacobians(
+    structure: Mechanism, solver: Solver, parameters: RunParameters, samples: RecordingSamples
+) -> Float[Array, "N n n"]:
+    """Jacobians of the step `A[k]` along a predictor run.
+
+    Args:
+        structure: Without the inactive effects; static.
+        solver: Integration rule; static.
+        parameters: Of this structure.
+        samples: The recording.
+    """
+    step = PredictorStep(structure, solver)
+    _, v, c = prepared_run(structure, solver, parameters.values, parameters.gates, samples.u, samples.Ts)
+    inputs, constants = (v, samples.y, samples.seen), (c, parameters.K)
+    return state_jacobians(step, states(step, parameters.x0, inputs, constants), inputs, constants)
+
+
+def inactive_sensitivities(
+    structure: Mechanism,
+    solver: Solver,
+    parameters: RunParameters,
+    samples: RecordingSamples,
+    active: Integer[Array, " r"],
+    A: Float[Array, "N r r"],
+    dvalues: Float[Array, "D P"],
+    dgates: Float[Array, "D E"],
+) -> Float[Array, "D N C"]:
+    """Derivatives of the predicted outputs along effects that are inactive.
+
+    Args:
+        structure: With all effects; static.
+        solver: Integration rule; static.
+        parameters: Every inactive effect at zero amplitude, or with its gate closed.
+        samples: The recording.
+        active: Places of the states that do not belong to inactive effects.
+        A: From `predictor_jacobians` without the inactive effects.
+        dvalues: Directions in the parameter values.
+        dgates: Directions in the gates.
+    """
+    step = PredictorStep(structure, solver)
+
+    def prepared(values: Array, gates: Array) -> Any:
+        return prepared_run(structure, solver, values, gates, samples.u, samples.Ts)[1:]
+
+    v, c = prepared(parameters.values, parameters.gates)
+    inputs, constants = (v, samples.y, samples.seen), (c, parameters.K)
+    X = states(step, parameters.x0, inputs, constants)
+    still = (jnp.zeros_like(samples.y), jnp.zeros_like(samples.seen))
+
+    def derivative(dv: Array, dg: Array) -> Array:
+        direction = (parameters.values, parameters.gates), (dv, dg)
+        dvoltage, dc = jax.jvp(prepared, *direction)[1]
+        dK = jax.tree.map(jnp.zeros_like, parameters.K)
+        b = forcing(step, X, inputs, (dvoltage, *still), constants, (dc, dK))
+        dx = tangent_recursion(A, b[:, active], jnp.zeros_like(parameters.x0[active]))
+        dX = jnp.zeros_like(X).at[:, active].set(dx)
+        read = lambda x, values, gates: read_outputs(structure.with_values(values), gates, x)  # noqa: E731
+        return jax.jvp(read, (X.T, *direction[0]), (dX.T, *direction[1]))[1].T
+
+    return jax.vmap(derivative)(dvalues, dgates)
+
+
+Accumulator = Callable[[Any, Float[Array, " C"], Float[Array, "C D"], Any], tuple[Any, Any]]
+"""`accumulate(sums, y_hat, J, (y, seen))` to new sums and what is stored."""
+
+
+class TangentDirections(NamedTuple):
+    """Directions in which a run is differentiated.
+
+    Attributes:
+        values: In the parameter values.
+        gates: In the gates.
+        x0: In the first state.
+    """
+
+    values: Float[Array, "*batch D P"]
+    gates: Float[Array, "*batch D E"]
+    x0: Float[Array, "*batch D n"]
+
+
+def accumulate_outputs(
+    structure: Mechanism,
+    solver: Solver,
+    parameters: RunParameters,
+    directions: TangentDirections,
+    samples: RecordingSamples,
+    accumulate: Accumulator,
+    start: Any,
+) -> tuple[Any, Any]:
+    """Sums over the outputs of a run and their derivatives, sample by sample.
+
+    Forward mode only. Not for a prediction in hundreds of directions, which no longer fit into the
+    processor's first cache.
+
+    Args:
+        structure: Mechanism without parameter values; static.
+        solver: Integration rule; static.
+        parameters: Where it runs; a free run where the gain is None.
+        directions: Of the derivatives.
+        samples: The recording.
+        accumulate: What to do with the outputs of a sample.
+        start: Sums before the first sample.
+
+    Returns:
+        The last sums, and what was stored (N, ...).
+    """
+    values, gates, x0, K = parameters
+    D = len(directions.x0)
+    repeated = functools.partial(jax.tree.map, lambda a: jnp.broadcast_to(a[..., None], (*jnp.shape(a), D)))
+    repeats = _takes_repeated_constants(structure, solver)
+
+    def prepare(p: Array, g: Array) -> Any:
+        return solver.prepare(structure, p, g, samples.Ts)
+
+    def drive(p: Array, g: Array) -> Any:
+        return solver.inputs(motor_voltage(structure.with_values(p), g, samples.u, samples.Ts))
+
+    def read(x: Array, p: Array, g: Array) -> Array:
+        return read_outputs(structure.with_values(p), g, x)
+
+    def derivatives(f: Callable[[Array, Array], Any]) -> Any:
+        derivative = lambda *tangent: jax.jvp(f, (values, gates), tangent)[1]  # noqa: E731
+        return jax.vmap(derivative, out_axes=-1)(directions.values, directions.gates)
+
+    c, dc = prepare(values, gates), derivatives(prepare)
+    dv = derivatives(drive) if effects_of(structure, Actuation) else None
+    free, predictor = FreeStep(structure, solver), PredictorStep(structure, solver)
+
+    def step(v: Any, x: Array, c: Any, sample: Any) -> Array:
+        if K is None:
+            return free(x, v, c)
+        return predictor(x, (v, *sample), (c, repeated(K) if repeats else K))
+
+    def later(x: Array, dx: Array, v: Any, dv: Any, sample: Any) -> tuple[Array, Array]:
+        at, tangents = (v, x, c), (dv, dx, dc)
+        if repeats:
+            at, sample = repeated(at), repeated(sample)
+        f: Callable[..., Array] = lambda *at: step(at[0], at[1], at[2], sample)  # noqa: E731
+        if dv is None:  # the voltage has no derivative
+            f, at, tangents = functools.partial(f, at[0]), at[1:], tangents[1:]
+        if repeats:
+            end, dend = jax.jvp(f, at, tangents)
+            return end[:, 0], dend
+        dend = jax.vmap(lambda *tangent: jax.jvp(f, at, tangent)[1], in_axes=-1, out_axes=-1)(*tangents)
+        return f(*at), dend
+
+    def advance(carry: Any, sample: Any) -> Any:
+        (x, dx, sums), (v, dv, here) = carry, sample
+        J = jax.jvp(read, repeated((x, values, gates)), (dx, directions.values.T, directions.gates.T))[1]
+        sums, stored = accumulate(sums, read(x, values, gates), J, here)
+        return (*later(x, dx, v, dv, here), sums), stored
+
+    measured = (samples.y, samples.seen)
+    carry = (jnp.asarray(x0), jnp.asarray(directions.x0).T, start)
+    (_, _, sums), stored = jax.lax.scan(advance, carry, (drive(values, gates), dv, measured))
+    return sums, stored
+
+
+def _takes_repeated_constants(structure: Mechanism, solver: Solver) -> bool:
+    """Whether the step accepts constants that are repeated along the directions."""
+    by_motor = any(e.driven_by == "motor" for _, e in effects_of(structure, Memory))
+    return isinstance(solver, Exponential) and not effects_of(structure, Gear) and not by_motor
+
+
+def outputs_with_sensitivities(
+    structure: Mechanism,
+    solver: Solver,
+    parameters: RunParameters,
+    directions: TangentDirections,
+    samples: RecordingSamples,
+) -> tuple[Float[Array, "N C"], Float[Array, "N C D"]]:
+    """Outputs of a run and their derivatives along some directions; arguments as in `accumulate_outputs`.
+
+    Forward mode only, and several times quicker than `jax.jacfwd` of a run.
+    """
+    store: Accumulator = lambda sums, y, J, _: (sums, (y, J))  # noqa: E731
+    return accumulate_outputs(structure, solver, parameters, directions, samples, store, ())[1]

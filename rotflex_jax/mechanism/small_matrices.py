@@ -1,0 +1,55 @@
+"""Products of small matrices with states, written out so that the compiler fuses them into the loop.
+
+States may stand side by side: (m, ...). Then each may have a matrix of its own, which is how a run carries
+its sensitivities along many directions (`sensitivities`): the directions come last, for the vector units.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Shaped
+
+from rotflex_jax.effects.base import Effect
+
+
+def matvec(A: Shaped[Array, "n m *D"], x: Shaped[Array, "m *S"]) -> Shaped[Array, "n *S"]:
+    """`A @ x`, column by column; A has no axes beyond the second, or those of x."""
+    if A.ndim == 2 and x.ndim > 1:  # several states: written out, the compiler would compute terms repeatedly
+        return jnp.sum(expand_axes(A, x[None]) * x[None], axis=1)
+    A = expand_axes(A, x[None])
+    total = jnp.zeros((A.shape[0], *x.shape[1:]), x.dtype)
+    for j in range(A.shape[1]):
+        term = A[:, j] * x[j][None]
+        total = total + term if j else term
+    return total
+
+
+def expand_axes(m: Shaped[Array, "*a"], x: Shaped[Array, "*b"]) -> Shaped[Array, "*c"]:
+    """`m` with trailing axes of length one, as many axes as `x` has."""
+    return m.reshape(m.shape + (1,) * (x.ndim - m.ndim))
+
+
+def scaled_vector(a: Shaped[Array, "n *D"], v: Shaped[Array, "*S"]) -> Shaped[Array, "n *S"]:
+    """The vector `a` times the scalar `v`."""
+    return expand_axes(a, v[None]) * v[None]
+
+
+def sparse_matvec(rows: tuple[tuple[float, ...], ...], x: Shaped[Array, "m *S"]) -> Shaped[Array, "k *S"]:
+    """`rows @ x` for constant coefficients, most of them zero or one, which cost nothing."""
+    zero = jnp.zeros(x.shape[1:], x.dtype)
+    found = []
+    for row in rows:
+        terms = [x[j] if c == 1 else c * x[j] for j, c in enumerate(row) if c]
+        found.append(sum(terms[1:], terms[0]) if terms else zero)
+    return jnp.stack(found) if found else jnp.zeros((0, *x.shape[1:]), x.dtype)
+
+
+def evaluate_effect(e: Effect, function: Callable[..., Any], *signals: Shaped[Array, "*S"]) -> Any:
+    """`function(effect, *signals)`; for each state separately where each has parameter values of its own."""
+    values = e.values
+    if all(np.ndim(value) == 0 for value in values.values() if value is not None):
+        return function(e, *signals)
+    return jax.vmap(lambda values, *signals: function(e.replace(**values), *signals))(values, *signals)

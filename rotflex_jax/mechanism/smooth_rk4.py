@@ -1,0 +1,101 @@
+"""Independent check of the step: classical Runge-Kutta on all equations, friction smoothed by tanh.
+
+Use it to check `Exponential`, not to identify friction: the smoothing width biases the friction level
+and looks like a Stribeck effect.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Real
+
+from rotflex_jax.effects.base import DryFriction, Gear
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.assembly import EquationsOfMotion, Layout, effects_of, equations
+from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.small_matrices import matvec, scaled_vector
+from rotflex_jax.mechanism.step import memory_rates, port_motion, torques
+
+
+class SmoothConstants(NamedTuple):
+    """Constants of the Runge-Kutta step.
+
+    Attributes:
+        values: Parameter values.
+        gates: One factor per effect.
+        h: Length of a step [s].
+        equations: Of the linear part.
+    """
+
+    values: Real[Array, " P"]
+    gates: Float[Array, " E"]
+    h: Float[Array, ""]
+    equations: EquationsOfMotion
+
+
+@dataclasses.dataclass(frozen=True)
+class SmoothRK4:
+    """Classical Runge-Kutta of order 4 with friction `level * tanh(speed / width)`.
+
+    Stable while `h < 2.5 J width / level` and while h is short against the fastest linear mode.
+
+    Attributes:
+        width: Speed over which friction changes sign [rad/s].
+        substeps: Steps per sample.
+    """
+
+    width: float = 0.02
+    substeps: int = 20
+
+    def inputs(self, v: Float[Array, " N"]) -> Float[Array, " N"]:
+        """Input of `advance` at each sample, for a sequence of voltages."""
+        return v
+
+    def prepare(
+        self,
+        structure: Mechanism,
+        values: Real[Array, " P"],
+        gates: Float[Array, " E"],
+        Ts: Float[Array, ""],
+    ) -> SmoothConstants:
+        """Constants for `advance`."""
+        if effects_of(structure, Gear):
+            raise InputError(
+                "SmoothRK4 cannot integrate a gear with play, but one was given; use Exponential."
+            )
+        eq = equations(structure.with_values(values), gates)
+        return SmoothConstants(values, gates, Ts / self.substeps, eq)
+
+    def advance(
+        self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*S"], c: SmoothConstants
+    ) -> Float[Array, "n *S"]:
+        """State one sample later under the held voltage `v` [V]."""
+        mechanism = structure.with_values(c.values)
+
+        def step(_: Any, s: Array) -> Array:
+            k1 = self._flow(mechanism, s, v, c)
+            k2 = self._flow(mechanism, s + c.h / 2 * k1, v, c)
+            k3 = self._flow(mechanism, s + c.h / 2 * k2, v, c)
+            k4 = self._flow(mechanism, s + c.h * k3, v, c)
+            return s + c.h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+        return jax.lax.fori_loop(0, self.substeps, step, x)
+
+    def _flow(self, mechanism: Mechanism, x: Array, v: Array, c: SmoothConstants) -> Array:
+        layout, eq = Layout.of(mechanism.structure), c.equations
+        L, z = x[: layout.linear], x[layout.linear :]
+        dL = matvec(eq.A, L) + scaled_vector(eq.B, v)
+        if not layout.torque_ports:
+            return dL
+        total = torques(mechanism, L, z, v, c.gates)
+        position, speed = port_motion(layout, L)
+        for i, e in effects_of(mechanism, DryFriction):
+            k = layout.torque_ports.index(e.at)
+            size = jnp.abs(speed[k])
+            up, down = (e.limit(position[k], size, direction) for direction in (1.0, -1.0))
+            smooth = jnp.tanh(speed[k] / self.width)
+            total = total.at[k].add(-c.gates[i] * jnp.where(smooth > 0, up, down) * smooth)
+        dL = dL + matvec(eq.ports, total)
+        return jnp.concatenate([dL, memory_rates(mechanism, L, z, v, c.gates)]) if z.shape[0] else dL

@@ -1,0 +1,87 @@
+"""A sampled linear system without any physics in it: what the identified linear models end in."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Inexact
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.recording import Recording
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearSystem:
+    """A sampled linear system with an offset and the gain of its own predictor.
+
+        x+ = A x + B [u, 1] + K e,    y = C x + D [u, 1] + e
+
+    Attributes:
+        A: State matrix.
+        B: Columns of the input and of the constant.
+        C: Output matrix.
+        D: Columns of the input and of the constant.
+        K: Gain of the prediction error e.
+        Ts: Sampling period it holds for [s].
+    """
+
+    A: Float[np.ndarray, "n n"]
+    B: Float[np.ndarray, "n 2"]
+    C: Float[np.ndarray, "C n"]
+    D: Float[np.ndarray, "C 2"]
+    K: Float[np.ndarray, "n C"]
+    Ts: float
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.A)
+
+    @property
+    def poles(self) -> Inexact[np.ndarray, " n"]:
+        """Eigenvalues of A, in the z domain."""
+        return np.linalg.eigvals(self.A)
+
+    def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """Free run; the first state is the one that follows the first `n_init` samples best."""
+        with np.errstate(all="ignore"):  # an unstable system overflows
+            return self._run(recording, self.start(recording), np.zeros_like(self.K))
+
+    def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """One step ahead: every sample from all before it."""
+        with np.errstate(all="ignore"):
+            return self._run(recording, self.start(recording), self.K)
+
+    def start(self, recording: Recording) -> Float[np.ndarray, " n"]:
+        """First state, by least squares on the first `n_init` samples."""
+        if abs(recording.Ts / self.Ts - 1) > 1e-6:
+            raise InputError(
+                f"The system holds for a sampling period of {self.Ts:g} s, but the recording has "
+                f"{recording.Ts:g} s; fit it to a recording of that period."
+            )
+        m = recording.n_init
+        head = recording.slice(0, m)
+        forced = self._run(head, np.zeros(self.order), np.zeros_like(self.K))
+        rows, power = [], np.eye(self.order)
+        for _ in range(m):
+            rows.append(self.C @ power)
+            power = self.A @ power
+        # Channels of one size, and no state that hardly shows.
+        size = np.maximum(np.std(recording.y[:m], axis=0), 1e-12 + 1e-3 * np.abs(self.C).max(axis=1))
+        O = np.stack(rows) / size[:, None]  # noqa: E741
+        y = (recording.y[:m].astype(float) - forced) / size
+        O = O.reshape(-1, self.order)  # noqa: E741
+        scale = np.maximum(np.linalg.norm(O, axis=0), 1e-300)
+        return np.linalg.lstsq(O / scale, y.ravel(), rcond=1e-3)[0] / scale
+
+    def _run(self, recording: Recording, x: np.ndarray, K: np.ndarray) -> np.ndarray:
+        y = recording.y.astype(float)
+        u = np.stack([recording.u.astype(float), np.ones(recording.N)], axis=1)
+        forcing, through = u @ self.B.T, u @ self.D.T
+        out = np.empty((recording.N, len(self.C)))
+        correct = bool(K.any())
+        for k in range(recording.N):
+            out[k] = self.C @ x + through[k]
+            x = self.A @ x + forcing[k]
+            if correct:
+                x = x + K @ (y[k] - out[k])
+        return out

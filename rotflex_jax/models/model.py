@@ -1,0 +1,232 @@
+"""A model of a recording: a mechanism with the rule that integrates it."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Real
+
+from rotflex_jax.effects.base import Actuation, Effect
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import Exponential, Mechanism, Solver, free_run, kalman_gains, predictor_run
+from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, rest_state
+from rotflex_jax.mechanism.initial_state import initial_states
+from rotflex_jax.mechanism.linear import check_movable
+from rotflex_jax.metrics import window_starts
+from rotflex_jax.recording import Recording
+from rotflex_jax.recording.quality import ACCEPTABLE
+from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit
+from rotflex_jax.runtime.xla import double_precision
+
+_free, _predict = PersistentJit(free_run, static=2), PersistentJit(predictor_run, static=2)
+
+
+@persistent_jit(static=2)
+def _free_many(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN202 - as `free_run`, many starts
+    return jax.vmap(free_run, in_axes=(None, None, None, None, 0, 0, None))(
+        structure, solver, values, gates, x0, u, Ts
+    )
+
+
+@persistent_jit(static=1)
+def _motor_voltage(structure: Mechanism, values: Array, gates: Array, u: Array, Ts: Array) -> Any:
+    return motor_voltage(structure.with_values(values), gates, u, Ts)
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A mechanism with its integration rule; it simulates recordings.
+
+    Attributes:
+        mechanism: The physics.
+        solver: Integration rule.
+        gates: Factor of each effect, 0 where it is switched off; None for all on. Models that differ only
+            in their gates share one compilation.
+    """
+
+    mechanism: Mechanism
+    solver: Solver = Exponential()
+    gates: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        check_movable(self.mechanism)
+
+    def __add__(self, effect: Effect) -> "Model":
+        """The model with one more effect."""
+        gates = None if self.gates is None else (*self.gates, 1.0)
+        return dataclasses.replace(self, mechanism=self.mechanism + effect, gates=gates)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the model as JSON; `Model.load` reads it back bit for bit."""
+        from rotflex_jax.models.model_json import Saved, save  # imported on request: it needs this module
+
+        return save(Saved(self), path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Model":
+        """The model in a file that `save` of a model, a fit or a discovery has written."""
+        from rotflex_jax.models.model_json import read  # imported on request: it needs this module
+
+        return read(path).model
+
+    def measured(self, recording: Recording) -> Float[np.ndarray, "N C"]:
+        """The channels of a recording that the mechanism has as outputs, in its order."""
+        missing = [c for c in self.mechanism.channels if c not in recording.channels]
+        if missing:
+            raise InputError(
+                f"The model has the outputs {', '.join(self.mechanism.channels)}, but the recording "
+                f"has the channels {', '.join(recording.channels)}; give the recording these "
+                f"channel names, or the model these outputs."
+            )
+        return np.stack([recording.channel(c) for c in self.mechanism.channels], axis=1)
+
+    def parameters_and_gates(self) -> tuple[Float[Array, " P"], Float[Array, " E"]]:
+        """Parameter values and gates, in the precision of the context."""
+        return jnp.asarray(self.mechanism.values), jnp.asarray(self._switches())
+
+    def _switches(self) -> np.ndarray:
+        return np.ones(len(self.mechanism.effects)) if self.gates is None else np.array(self.gates)
+
+    def _behind_actuation(self, recording: Recording) -> tuple[np.ndarray, "Model"]:
+        """The voltage (N,) [V] that reaches the motor, and the model without its actuation."""
+        u, acting = recording.u.astype(float), effects_of(self.mechanism, Actuation)
+        if not acting:
+            return u, self
+        gates = self._switches()
+        with double_precision():
+            given = map(jnp.asarray, (self.mechanism.values, gates, u, float(recording.Ts)))
+            v = np.asarray(_motor_voltage(self.mechanism.structure, *given))
+        gates[[i for i, _ in acting]] = 0.0
+        return v, dataclasses.replace(self, gates=tuple(gates.tolist()))
+
+    def behind_actuation(self, recording: Recording) -> tuple["Model", Recording]:
+        """The model without its actuation, and the recording with the voltage that reaches the motor.
+
+        In a part of that recording no delay, lag or drift starts again.
+        """
+        v, inner = self._behind_actuation(recording)
+        return inner, dataclasses.replace(recording, u=v, accept=ACCEPTABLE)
+
+    def _starts(
+        self, u: np.ndarray, y: np.ndarray, Ts: float, hidden: np.ndarray | None = None
+    ) -> np.ndarray:
+        return initial_states(self.mechanism, self.solver, self._switches(), u, y, Ts, hidden)
+
+    def _start(self, recording: Recording) -> np.ndarray:
+        """State at the start of a recording, from its first `n_init` samples.
+
+        States that no sensor measures come from a free run over the recording that this one continues; they
+        are at rest where it continues none.
+        """
+        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        m, moving, before = recording.n_init, 2 * len(self.mechanism.coordinates), recording.continues
+        hidden = None
+        if before is not None and len(rest_state(self.mechanism.structure, np.float64)) > moving:
+            left = self._run(before, self._start(before))[0][-1:, moving:]
+            hidden = left if np.all(np.isfinite(left)) else None
+        return self._starts(u[None, :m], y[None, :m], recording.Ts, hidden)[0]
+
+    def _run(self, recording: Recording, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (N, n) and outputs (N, C) of a free run."""
+        with double_precision():
+            run = _free(
+                self.mechanism.structure,
+                self.solver,
+                *self.parameters_and_gates(),
+                jnp.asarray(start),
+                jnp.asarray(recording.u.astype(float)),
+                jnp.asarray(float(recording.Ts)),
+            )
+            return np.asarray(run[0]), np.asarray(run[1])
+
+    def simulate(
+        self, recording: Recording, x0: Real[np.ndarray, " m"] | Sequence[float] | None = None
+    ) -> Float[np.ndarray, "N C"]:
+        """Free run over a recording: outputs from its voltage alone.
+
+        The first state is estimated from the first `n_init` samples; the model uses no other measured
+        outputs.
+
+        Args:
+            recording: Its voltage drives the model.
+            x0: First positions and speeds, where they are known.
+        """
+        if x0 is None:
+            return self._run(recording, self._start(recording))[1]
+        start = rest_state(self.mechanism.structure, np.float64)
+        start[: len(x0)] = x0
+        return self._run(recording, start)[1]
+
+    def simulate_states(self, recording: Recording) -> Float[np.ndarray, "N n"]:
+        """States of the free run of `simulate`: positions, speeds, then states of effects."""
+        return self._run(recording, self._start(recording))[0]
+
+    def simulate_windows(self, recording: Recording, seconds: float = 2.0) -> Float[np.ndarray, "N C"]:
+        """Outputs of free runs that start again every few seconds.
+
+        Each starts from positions and speeds that are estimated on the first `n_init` samples of its window.
+        States that no sensor measures (memories, motor current) come from a free run over the whole
+        recording, and actuation (a delay, a drift) acts on the voltage of the whole recording. The servo
+        angle integrates every small torque error, so one long run hides where the error arises.
+
+        Args:
+            recording: Its voltage drives the model.
+            seconds: Length of a window [s]; a remainder of up to twice `n_init` belongs to the last one.
+        """
+        y = self.measured(recording).astype(float)
+        u, inner = self._behind_actuation(recording)
+        starts, length = window_starts(recording, seconds)
+        pick = starts[:, None] + np.arange(length)[None, :]
+        inside = np.minimum(pick, len(u) - 1)
+        m = recording.n_init
+        head, moving = inside[:, :m], 2 * len(self.mechanism.coordinates)
+        hidden = None
+        if len(rest_state(self.mechanism.structure, np.float64)) > moving:
+            states = self._run(recording, self._start(recording))[0]
+            hidden = states[starts, moving:]
+        x0 = inner._starts(u[head], y[head], recording.Ts, hidden)
+        with double_precision():
+            run = _free_many(
+                inner.mechanism.structure,
+                inner.solver,
+                *inner.parameters_and_gates(),
+                jnp.asarray(x0),
+                jnp.asarray(u[inside]),
+                jnp.asarray(float(recording.Ts)),
+            )
+            answers = np.asarray(run[1])
+        out = np.empty_like(y)
+        for window, start, end in zip(answers, starts, [*starts[1:], len(u)], strict=True):
+            out[start:end] = window[: end - start]
+        return out
+
+    def predict(
+        self,
+        recording: Recording,
+        process_noise: Mapping[str, float],
+        noise: Float[np.ndarray, " C"] | Sequence[float],
+    ) -> Float[np.ndarray, "N C"]:
+        """Outputs predicted one step ahead by the steady Kalman gain of the linear part.
+
+        Args:
+            recording: Voltage and measured outputs.
+            process_noise: Port -> intensity of a white process torque [(N m)^2 s].
+            noise: Standard deviation of the sensor noise per channel.
+        """
+        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        K = kalman_gains(self.mechanism, [process_noise], noise, recording.Ts)[0]
+        x0 = self._start(recording)
+        with double_precision():
+            run = _predict(
+                self.mechanism.structure,
+                self.solver,
+                *self.parameters_and_gates(),
+                jnp.asarray(x0),
+                *map(jnp.asarray, (u, y, np.ones(len(u)), K)),
+                jnp.asarray(float(recording.Ts)),
+            )
+            return np.asarray(run[1])

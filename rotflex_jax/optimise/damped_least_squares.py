@@ -1,0 +1,444 @@
+"""Damped least squares (Levenberg-Marquardt): the step, its damping and when to stop, for every fit.
+
+    f(x) = e'e / 2,   g = J'e,   H = J'J
+    (H + damping diag H) s = -g,   |s_i| <= limit_i
+
+A step that lowers the cost is taken and divides the damping; one that does not multiplies it. The formulas
+hold for numpy arrays and, inside compiled code, for JAX arrays, and act along leading axes: one problem or
+a batch of them, each with a damping of its own.
+
+Three callers, one set of formulas:
+
+- `minimise`: one problem, evaluated by a Python function;
+- `minimise_together`: several, evaluated by one call for all that still run;
+- `minimise_compiled`: the loop inside a compiled program, also under `jax.vmap` and `jax.lax.map`.
+
+Equations of another form (a block structure, a triangular factor) take the place of `NormalEquations` by
+having `cost`, `step` and `predicted_decrease`.
+
+Source: K. Levenberg 1944, Quart. Appl. Math. 2; D. Marquardt 1963, SIAM J. Appl. Math. 11; J. Nocedal and
+S. Wright, Numerical Optimization, 2nd ed., 2006, sections 4.1 and 10.3.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+from jaxtyping import Real, Shaped
+
+SHORT = 1e-3
+"""Damping above which a step is held short and says nothing of what is left to gain."""
+RIDGE = 1e-14
+"""Damping that is always added, against rounding, as a share of the diagonal."""
+LEAST_CURVATURE = 1e-12
+"""Least entry of the diagonal that the damping is scaled by, as a share of the largest entry."""
+
+Scalar = float | Shaped[Any, "..."]
+"""One number, or one for each problem of a batch."""
+
+
+class Status(enum.IntEnum):
+    """How a minimisation stands."""
+
+    RUNNING = 0
+    CONVERGED = 1
+    DIVERGED = 2
+    """The cost at the start is not finite."""
+    UNSOLVED = 3
+    """The step is not finite."""
+
+
+class Rules(NamedTuple):
+    """When a minimisation stops, and how the damping changes.
+
+    It converges where a step promises or brings a decrease of no more than `enough + enough_share |f|`,
+    unless the damping or a limit holds it short; where `window` evaluations bring less than
+    `least_progress`; or where the damping is beyond `largest`, so that no step lowers the cost.
+
+    Attributes:
+        enough: Decrease of the cost that is not worth a step.
+        enough_share: The same as a share of the cost.
+        window: Evaluations over which progress is measured.
+        least_progress: Least decrease over these; 0 for no such rule.
+        damping: At the start.
+        decrease: What a step that is taken divides the damping by.
+        increase: What a step that is refused multiplies it by.
+        least: Least damping.
+        largest: Damping at which the search ends.
+    """
+
+    enough: Scalar = 0.0
+    enough_share: Scalar = 0.0
+    window: int = 8
+    least_progress: Scalar = 0.0
+    damping: Scalar = 1e-3
+    decrease: float = 10.0
+    increase: float = 8.0
+    least: float = 1e-12
+    largest: float = 1e10
+
+
+def damped(H: Real[Any, "*batch n n"], damping: Scalar) -> Real[Any, "*damped n n"]:
+    """The matrix of the damped step, `H + damping diag H`.
+
+    Args:
+        H: Product of the Jacobian with itself.
+        damping: One for each matrix, or several for one matrix.
+    """
+    xp = _numpy(H)
+    D = xp.diagonal(H, axis1=-2, axis2=-1)
+    largest = xp.max(D, axis=-1, keepdims=True)
+    size = xp.maximum(D, xp.where(largest > 0, LEAST_CURVATURE * largest, 1.0))
+    share = xp.asarray(damping) + RIDGE
+    added = (share[..., None] if share.ndim else share) * size
+    return H + added[..., None] * _identity(added)
+
+
+def bounded_solution(
+    A: Real[Any, "*batch n n"], b: Real[Any, "*batch n"], limit: Real[Any, "*#batch n"] | None = None
+) -> tuple[Real[Any, "*batch n"], Shaped[Any, "*batch"]]:
+    """The `x` with `A x = b`, and whether a limit holds it short.
+
+    Entries beyond their limit are held there, and the others solved for again.
+
+    Args:
+        A: Positive definite.
+        b: Right-hand side.
+        limit: Largest size of each entry, infinite for none; no entry has one if None.
+    """
+    xp = _numpy(A)
+    size = xp.sqrt(xp.diagonal(A, axis1=-2, axis2=-1))
+    A, b = A / (size[..., :, None] * size[..., None, :]), b / size
+    if limit is None:
+        return xp.linalg.solve(A, b[..., None])[..., 0] / size, xp.zeros(b.shape[:-1], bool)
+    most = limit * size
+    unit = _identity(b)
+
+    def solve_again(state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        x, held, _ = state
+        fixed = xp.where(held, x, 0.0)
+        right = xp.where(held, x, b - xp.einsum("...ij,...j->...i", A, fixed))
+        within = xp.where(held[..., :, None] | held[..., None, :], unit, A)
+        x = xp.linalg.solve(within, right[..., None])[..., 0]
+        over = ~held & (xp.abs(x) > most)
+        return xp.clip(x, -most, most), held | over, xp.any(over)
+
+    state = xp.zeros_like(b), xp.zeros(b.shape, bool), xp.asarray(True)
+    if xp is jnp:
+        state = jax.lax.while_loop(lambda s: s[2], solve_again, state)
+    else:
+        while state[2]:
+            state = solve_again(state)
+    return state[0] / size, xp.any(state[1], axis=-1)
+
+
+@runtime_checkable
+class Equations(Protocol):
+    """A cost and its quadratic model at one point; a tuple of arrays where it goes into compiled code."""
+
+    @property
+    def cost(self) -> Any:
+        """Cost at the point."""
+        ...
+
+    def step(self, damping: Any, limit: Any) -> Any:
+        """Damped step within the limits, and whether a limit holds it short."""
+        ...
+
+    def predicted_decrease(self, step: Any) -> Any:
+        """By how much the quadratic model falls along a step."""
+        ...
+
+
+class NormalEquations(NamedTuple):
+    """Half the squared residuals of G groups (channels, say), gradient `J'e`, and `H = J'J`.
+
+    The cost may be another one with this gradient, such as a logarithm of a likelihood.
+    """
+
+    costs: Real[Any, "*batch G"]
+    gradient: Real[Any, "*batch n"]
+    H: Real[Any, "*batch n n"]
+
+    @classmethod
+    def of(cls, J: Real[Any, "*batch m n"], e: Real[Any, "*batch m"]) -> "NormalEquations":
+        """Of residuals and their Jacobian."""
+        xp = _numpy(J)
+        return cls(
+            xp.sum(e * e, axis=-1)[..., None] / 2,
+            (xp.swapaxes(J, -1, -2) @ e[..., None])[..., 0],
+            xp.swapaxes(J, -1, -2) @ J,
+        )
+
+    @property
+    def cost(self) -> Real[Any, "*batch"]:
+        """Half the sum of squared residuals."""
+        return self.costs.sum(axis=-1)
+
+    def step(
+        self, damping: Scalar, limit: Real[Any, "*#batch n"] | None = None
+    ) -> tuple[Real[Any, "*damped n"], Shaped[Any, "*damped"]]:
+        """Damped Gauss-Newton step, not finite where the equations are not, and whether a limit holds it."""
+        A = damped(self.H, damping)
+        xp = _numpy(A)
+        right = xp.broadcast_to(-self.gradient, A.shape[:-1])
+        if xp is np and not (np.isfinite(A).all() and np.isfinite(right).all()):
+            return np.full(A.shape[:-1], np.nan), np.zeros(A.shape[:-2], bool)
+        return bounded_solution(A, right, limit)
+
+    def predicted_decrease(self, step: Real[Any, "*batch n"]) -> Real[Any, "*batch"]:
+        """`-(g's + s'H s / 2)`."""
+        xp = _numpy(step)
+        bent = xp.einsum("...i,...ij,...j->...", step, self.H, step)
+        return -(xp.sum(self.gradient * step, axis=-1) + bent / 2)
+
+
+export.register_namedtuple_serialization(NormalEquations, serialized_name=f"{__name__}.NormalEquations")
+
+
+class Progress(NamedTuple):
+    """How far a minimisation is; each entry is one number, or one for each problem of a batch.
+
+    Attributes:
+        cost: The least so far.
+        damping: Of the next step.
+        evaluations: Steps tried.
+        reference: Cost when progress was last measured.
+        status: A `Status`.
+    """
+
+    cost: Any
+    damping: Any
+    evaluations: Any
+    reference: Any
+    status: Any
+
+
+def begin(cost: Scalar, rules: Rules) -> Progress:
+    """Progress at the start, with the cost there."""
+    xp = _numpy(cost)
+    status = xp.where(xp.isfinite(cost), int(Status.RUNNING), int(Status.DIVERGED))
+    none = xp.zeros_like(cost)
+    return Progress(xp.asarray(cost), none + rules.damping, xp.zeros_like(status), none + np.inf, status)
+
+
+def before_trial(progress: Progress, finite: Any, limited: Any, predicted: Scalar, rules: Rules) -> Progress:
+    """Ends a minimisation whose next step is not worth a run.
+
+    Args:
+        progress: So far.
+        finite: Whether the step is finite.
+        limited: Whether a limit holds it short, so that it says nothing of what is left to gain.
+        predicted: Decrease that it promises.
+        rules: When to stop.
+    """
+    xp = _numpy(progress.cost)
+    worthless = (
+        ~xp.asarray(limited) & (progress.damping <= SHORT) & (predicted <= _enough(progress.cost, rules))
+    )
+    status = xp.where(worthless, int(Status.CONVERGED), progress.status)
+    status = xp.where(xp.asarray(finite), status, int(Status.UNSOLVED))
+    return progress._replace(status=xp.where(progress.status == Status.RUNNING, status, progress.status))
+
+
+def after_trial(progress: Progress, cost: Scalar, rules: Rules) -> tuple[Progress, Any]:
+    """The progress after a step was tried, and whether it is taken.
+
+    Args:
+        progress: Before.
+        cost: After the step; may be infinite or not a number.
+        rules: When to stop, and how the damping changes.
+    """
+    xp = _numpy(progress.cost)
+    gain = progress.cost - cost
+    accepted = gain > 0  # not where it is not a number
+    lowered = xp.maximum(progress.damping / rules.decrease, rules.least)
+    damping = xp.where(accepted, lowered, progress.damping * rules.increase)
+    cost = xp.where(accepted, cost, progress.cost)
+    evaluations = progress.evaluations + 1
+    due = evaluations % rules.window == 0
+    slow = due & (progress.reference - cost < rules.least_progress)
+    little = accepted & (gain <= _enough(cost, rules)) & (damping <= SHORT)
+    status = xp.where(slow | little | (damping > rules.largest), int(Status.CONVERGED), progress.status)
+    return Progress(cost, damping, evaluations, xp.where(due, cost, progress.reference), status), accepted
+
+
+def _enough(cost: Any, rules: Rules) -> Any:
+    return rules.enough + rules.enough_share * abs(cost)
+
+
+@dataclasses.dataclass(frozen=True)
+class Minimum:
+    """Where a minimisation ended.
+
+    Attributes:
+        x: The point.
+        first: Equations at the start.
+        equations: Equations at the point, or where they were last made if costs are evaluated apart.
+        cost: Cost at the point.
+        evaluations: Steps tried.
+        status: RUNNING where the evaluations were used up.
+    """
+
+    x: Any
+    first: Any
+    equations: Any
+    cost: float
+    evaluations: int
+    status: Status
+
+
+def minimise_together(
+    linearise: Callable[[list[Any]], Sequence[Equations]],
+    starts: Sequence[Any],
+    rules: Rules,
+    *,
+    limit: Callable[[int], Any] | None = None,
+    costs: Callable[[list[Any]], Sequence[float]] | None = None,
+    move: Callable[[Any, Any], Any] = np.add,
+    max_steps: int = 60,
+    report: Callable[[Sequence[Progress]], None] | None = None,
+) -> list[Minimum]:
+    """Minimises several costs, independent of each other, with one evaluation for all that still run.
+
+    Args:
+        linearise: Equations at points, in their order.
+        starts: First point of each; anything that `move` knows.
+        rules: When to stop, and how the damping changes.
+        limit: Largest step along each coordinate of problem i; None for no limits.
+        costs: Costs at points, where these are cheaper than equations; the equations' own if None.
+        move: The point that a step leads to.
+        max_steps: Most steps that are tried of each.
+        report: Called after each round.
+    """
+    points, first = list(starts), list(linearise(list(starts)))
+    equations = list(first)
+    progress = [begin(np.float64(e.cost), rules) for e in equations]
+
+    def runs(i: int) -> bool:
+        return bool(progress[i].status == Status.RUNNING) and bool(progress[i].evaluations < max_steps)
+
+    while True:
+        trials: dict[int, Any] = {}
+        for i in filter(runs, range(len(points))):
+            step, limited = equations[i].step(float(progress[i].damping), limit and limit(i))
+            finite = bool(np.isfinite(step).all())
+            predicted = equations[i].predicted_decrease(step) if finite else np.nan
+            progress[i] = before_trial(progress[i], finite, limited, predicted, rules)
+            if runs(i):
+                trials[i] = move(points[i], step)
+        if not trials:
+            break
+        tried = list(trials.values())
+        made = [] if costs else linearise(tried)
+        found = costs(tried) if costs else [e.cost for e in made]
+        accepted = []
+        for k, i in enumerate(trials):
+            progress[i], better = after_trial(progress[i], np.float64(found[k]), rules)
+            if better:
+                points[i] = tried[k]
+                accepted.append(i)
+                if made:
+                    equations[i] = made[k]
+        # Where only costs were evaluated, equations are made if another step follows.
+        follow = [i for i in accepted if runs(i)] if costs else []
+        if follow:
+            for i, e in zip(follow, linearise([points[i] for i in follow]), strict=True):
+                equations[i] = e
+        if report:
+            report(progress)
+    return [
+        Minimum(x, start, here, float(p.cost), int(p.evaluations), Status(int(p.status)))
+        for x, start, here, p in zip(points, first, equations, progress, strict=True)
+    ]
+
+
+def minimise(
+    linearise: Callable[[Any], Equations],
+    start: Any,
+    rules: Rules,
+    *,
+    limit: Any = None,
+    cost: Callable[[Any], float] | None = None,
+    move: Callable[[Any, Any], Any] = np.add,
+    max_steps: int = 60,
+    report: Callable[[Progress], None] | None = None,
+) -> Minimum:
+    """Minimises one cost; arguments as in `minimise_together`, for one point.
+
+    >>> A, b = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]), np.array([1.0, 3.0, 5.0])
+    >>> found = minimise(lambda x: NormalEquations.of(A, A @ x - b), np.zeros(2), Rules(enough=1e-20))
+    >>> found.x.round(6), found.status.name
+    (array([1., 2.]), 'CONVERGED')
+    """
+    return minimise_together(
+        lambda points: [linearise(x) for x in points],
+        [start],
+        rules,
+        limit=None if limit is None else lambda _: limit,
+        costs=None if cost is None else lambda points: [cost(x) for x in points],
+        move=move,
+        max_steps=max_steps,
+        report=None if report is None else lambda progress: report(progress[0]),
+    )[0]
+
+
+def minimise_compiled(
+    linearise: Callable[[Any], Any], start: Any, rules: Rules, *, limit: Any = None, max_steps: Any = 60
+) -> tuple[Any, Any, Progress]:
+    """The same as a loop in compiled code; for use inside of `jax.jit`, `jax.vmap` or `jax.lax.map`.
+
+    Args:
+        linearise: Equations at a point, a pytree of arrays.
+        start: First point, an array or a pytree of them; a step is one of the same kind.
+        rules: When to stop, and how the damping changes.
+        limit: As the equations' `step` takes it.
+        max_steps: Most evaluations, that of the start included.
+
+    Returns:
+        The point, the equations there, and the progress.
+    """
+    none = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(linearise, start))
+    unknown = jnp.full_like(none.cost, jnp.inf)
+    # The start is the first trial, against an infinite cost, so that a run is compiled once and not twice.
+    progress = begin(unknown, rules)._replace(
+        damping=jnp.zeros_like(unknown) + rules.damping * rules.decrease,
+        status=jnp.asarray(int(Status.RUNNING)),
+    )
+
+    def evaluate(state: Any) -> Any:
+        x, step, equations, progress = state
+        trial = jax.tree.map(jnp.add, x, step)
+        made = linearise(trial)
+        progress, accepted = after_trial(progress, made.cost, rules)
+        keep = lambda new, old: jnp.where(accepted, new, old)  # noqa: E731
+        x, equations = jax.tree.map(keep, (trial, made), (x, equations))
+        lost = ~jnp.isfinite(progress.cost)
+        progress = progress._replace(status=jnp.where(lost, int(Status.DIVERGED), progress.status))
+        step, limited = equations.step(progress.damping, limit)
+        finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(part)) for part in jax.tree.leaves(step)]))
+        predicted = equations.predicted_decrease(step)
+        return x, step, equations, before_trial(progress, finite, limited, predicted, rules)
+
+    def runs(state: Any) -> Any:
+        return (state[3].status == Status.RUNNING) & (state[3].evaluations < max_steps)
+
+    state = (start, jax.tree.map(jnp.zeros_like, start), none, progress)
+    x, _, equations, progress = jax.lax.while_loop(runs, evaluate, state)
+    return x, equations, progress
+
+
+def _identity(like: Any) -> Any:
+    """The matrix (..., n, n) for vectors (..., n), with axes of length one in front."""
+    n = like.shape[-1]
+    return _numpy(like).eye(n, dtype=like.dtype).reshape((1,) * (like.ndim - 1) + (n, n))
+
+
+def _numpy(array: Any) -> Any:
+    """The functions for an array: those of JAX inside of compiled code."""
+    return jnp if isinstance(array, jax.Array) else np

@@ -1,0 +1,181 @@
+"""Figures of where the error occurs: maps over speed and deflection, and one profile per place."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy.signal import savgol_filter
+
+from rotflex_jax.discover.conditions import half_width, missing_acceleration
+from rotflex_jax.discover.result import SearchResult, Where
+from rotflex_jax.discover.tables import channel_units
+from rotflex_jax.report.figures.registry import figure
+from rotflex_jax.report.figures.runs import Shown, shown
+from rotflex_jax.text.colours import BASELINE, INK, NO_DATA
+from rotflex_jax.text.numbers import readable
+from rotflex_jax.text.plotting import blank, legend_above
+
+# Cells of a map along each axis, and samples without which one stays blank.
+MAP_CELLS, MIN_CELL_SAMPLES = 13, 8
+MOST_PROFILES = 6
+
+_AXES = {
+    "speed": "speed of {turning}",
+    "deflection": "{bending}",
+    "reversal": "time since a reversal",
+    "time": "time",
+}
+
+
+def worst_channel(discovery: SearchResult) -> str:
+    """The channel whose baseline error is the largest multiple of its noise."""
+    errors, floor = discovery.baseline.held_out_rmse_windows, discovery.noise_floor
+    return max(errors, key=lambda c: errors[c] / (floor.get(c) or errors[c] or 1.0))
+
+
+def _grid(discovery: SearchResult, s: Shown) -> tuple[list[np.ndarray], list[str]]:
+    """What the maps are drawn over: speed and deflection, or speed and time of a single channel."""
+    by_channel = channel_units(discovery)
+    channels = list(by_channel)
+    unit = by_channel[channels[0]]
+    is_speed = unit.endswith("/s")
+    scale, read = readable(1.0, unit if is_speed else f"{unit}/s")
+    window = 2 * (half_width(s.recording) or 3) + 1
+    order = 0 if is_speed else 1
+    rate = savgol_filter(s.measured[:, 0], window, 2, deriv=order, delta=s.recording.Ts)
+    values = [scale * np.asarray(rate)]
+    labels = [f"{channels[0] if is_speed else f'speed of {channels[0]}'} [{read}]"]
+    if len(channels) == 1:
+        return [*values, s.recording.t], [*labels, "time [s]"]
+    scale, read = readable(1.0, by_channel[channels[1]])
+    return [*values, scale * s.measured[:, 1]], [*labels, f"{channels[1]} [{read}]"]
+
+
+def _cells(over: list[np.ndarray]) -> list[np.ndarray]:
+    edges = []
+    for x in over:
+        low, high = (float(q) for q in np.quantile(x, (0.003, 0.997)))
+        edges.append(np.linspace(low, high if high > low else low + 1.0, MAP_CELLS + 1))
+    return edges
+
+
+@figure(
+    "profiles",
+    section="where",
+    caption="Bars above the black line mark where the baseline makes more than its share of error; "
+    "the outermost take what lies beyond.",
+    description="Share of the error by bins, against the share that an even spread would have.",
+)
+def profiles(discovery: SearchResult) -> Figure | None:
+    """Share of the error in each bin against the share of the time, one panel per place.
+
+    Frequencies are left to the spectra.
+    """
+    places = [w for w in discovery.where if w.kind in _AXES and len(w.edges) > 1][:MOST_PROFILES]
+    if not places:
+        return None
+    columns = 2 if len(places) in (2, 4) else min(3, len(places))
+    rows = -(-len(places) // columns)
+    figure = blank(10.0 if columns > 1 else 5.5, 2.5 * rows + 0.4)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, place in zip(axes, places, strict=False):
+        _profile(ax, place, list(channel_units(discovery)))
+    for ax in axes[len(places) :]:
+        ax.remove()
+    legend_above(figure, axes[: len(places)])
+    return figure
+
+
+def _profile(ax: Axes, place: Where, channels: list[str]) -> None:
+    names = {"turning": channels[0], "bending": channels[min(1, len(channels) - 1)]}
+    scale, read = readable(1.0, place.unit)
+    edges = scale * place.edges
+    if place.kind == "reversal":  # bins of unequal width are drawn equally wide
+        scale, read = 1e3, "ms"
+        edges = np.arange(len(place.edges), dtype=float)
+        ax.set_xticks(edges, [f"{scale * e:.3g}" if np.isfinite(e) else "later" for e in place.edges])
+    bars = 0.86 * np.diff(edges)
+    middle = (edges[:-1] + edges[1:]) / 2
+    ax.bar(middle, 100 * place.profile, bars, color=BASELINE, alpha=0.85, label="share of the error")
+    ax.stairs(100 * place.expected, edges, color=INK, lw=1.4, label="if it were spread evenly")
+    ax.grid(axis="x", visible=False)
+    ax.set_title(f"{place.channel} error")
+    ax.set_xlabel(f"{_AXES[place.kind].format(**names)} [{read}]")
+    ax.set_ylabel("share [%]")
+    ax.set_xlim(edges[0], edges[-1])
+    ax.set_ylim(bottom=0)
+
+
+def _map_caption(discovery: SearchResult) -> str:
+    return (
+        f"Left: error of {worst_channel(discovery)} at each speed and position; blank where the machine "
+        "hardly ever was. Right of it: the mean acceleration that the model lacks there. A pattern is "
+        "the picture of a missing force, less what other parameters took over; speckles are "
+        "noise" + ("; after the last round none should be left." if discovery.rounds else ".")
+    )
+
+
+@figure(
+    "map",
+    section="where",
+    caption=_map_caption,
+    description="Maps of the held-out error and of the missing acceleration over speed and position.",
+)
+def residual_map(discovery: SearchResult) -> Figure:
+    """Error and missing acceleration over speed and deflection, before and after."""
+    s, by_channel = shown(discovery), channel_units(discovery)
+    channel = worst_channel(discovery)
+    c, unit = list(by_channel).index(channel), by_channel[channel]
+    over, labels = _grid(discovery, s)
+    edges = _cells(over)
+
+    def mean(values: np.ndarray, seen: np.ndarray) -> np.ma.MaskedArray:
+        count = np.histogram2d(over[0][seen], over[1][seen], edges)[0]
+        total = np.histogram2d(over[0][seen], over[1][seen], edges, weights=values[seen])[0]
+        return np.ma.masked_where(count < MIN_CELL_SAMPLES, total / np.maximum(count, 1))
+
+    scale, read = readable(1.0, unit)
+    all_samples = np.ones(s.recording.N, bool)
+    error = scale * (s.measured[:, c] - s.baseline[:, c])
+    maps = [(np.ma.sqrt(mean(error**2, all_samples)), "baseline: rms error", f"[{read}]")]
+    order = 1 if unit.endswith("/s") else 2
+    rate = f"[{read}/s{'²' if order == 2 else ''}]"
+    for run, label in ((s.baseline, "baseline"), (s.final, "final model")):
+        if run is not None:
+            e = scale * (s.measured[:, c] - run[:, c])
+            lacks = missing_acceleration(e, s.recording, s.starts.tolist(), order)
+            maps.append((mean(*lacks), f"{label}: what it lacks", rate))
+    figure = blank(10.0 if len(maps) > 2 else 7.5, 3.5)
+    axes = figure.subplots(1, len(maps), squeeze=False, sharey=True)[0]
+    # Below these sizes a map is noise, and is to look pale.
+    floor = scale * discovery.noise_floor.get(channel, 0.0)
+    pulse = np.eye(1, s.recording.N, s.recording.N // 2)[0]
+    weights = missing_acceleration(pulse, s.recording, order=order)[0]
+    usual = floor * float(np.linalg.norm(weights))
+    limit = max(_largest([m[0] for m in maps[1:]]), 4 * usual) or 1.0
+    signed = {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r"}
+    sized = {"vmin": 0.0, "vmax": max(_largest([maps[0][0]]), 4 * floor) or 1.0, "cmap": "YlOrRd"}
+    meshes = [
+        ax.pcolormesh(*edges, values.T, **(signed if k else sized))
+        for k, (ax, (values, _, _)) in enumerate(zip(axes, maps, strict=True))
+    ]
+    for ax, (_, title, _) in zip(axes, maps, strict=True):
+        ax.set_facecolor(NO_DATA)
+        ax.grid(False)
+        ax.set_title(title)
+        ax.set_xlabel(labels[0])
+    axes[0].set_ylabel(labels[1])
+    what = "acceleration" if order == 2 else "change"
+    bar_style = {"orientation": "horizontal", "pad": 0.02}
+    first = figure.colorbar(meshes[0], ax=[axes[0]], aspect=20, **bar_style)
+    first.set_label(f"rms error of {channel} {maps[0][2]}")
+    second = figure.colorbar(meshes[1], ax=axes[1:].tolist(), aspect=20 * (len(maps) - 1), **bar_style)
+    second.set_label(f"missing {what} of {channel} {rate}")
+    for bar in (first, second):
+        bar.locator = MaxNLocator(5)
+        bar.update_ticks()
+    return figure
+
+
+def _largest(maps: list[np.ma.MaskedArray]) -> float:
+    return max((float(np.ma.max(np.abs(m))) for m in maps if m.count()), default=0.0)

@@ -1,0 +1,6 @@
+"""The figures of the report; `@figure` enters one, with its caption and its section of the page."""
+
+from rotflex_jax.text.plotting import FigureRegistry
+
+FIGURES = FigureRegistry()
+figure = FIGURES.figure

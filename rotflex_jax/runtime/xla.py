@@ -1,0 +1,224 @@
+"""Settings of JAX and of this machine: fast loops, compilation cache, precision, threads and devices.
+
+Fast loops and the compilation cache are global settings, so importing rotflex_jax never changes them: the
+command line does, and so may a benchmark or the first cell of a notebook.
+"""
+
+import contextlib
+import functools
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Num
+from threadpoolctl import ThreadpoolController
+
+_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+
+
+def enable_fast_loops(limit: int = 262144) -> bool:
+    """Ask XLA to compile a small loop on the CPU into one function, not one call per operation.
+
+    A scan over the samples of a recording spends most of its time starting operations. XLA fuses a
+    whole loop as long as one iteration touches fewer bytes than a limit, 1024 by default.
+    Raising the limit makes simulating and fitting a joint five to twelve times faster.
+
+    Do not call it in a library: `XLA_FLAGS` holds for the whole process. XLA reads it at the first
+    use of a device, so a call after the first array is without effect.
+
+    Args:
+        limit: Memory that one iteration may touch [bytes]. Far larger values slow down loops with
+            big matrix products.
+
+    Returns:
+        True if `XLA_FLAGS` now carries the option. A value the user chose is kept, and nothing is
+        changed where `XLA_FLAGS` names a file of flags.
+
+    Example:
+        >>> import os
+        >>> kept = os.environ.pop("XLA_FLAGS", None)
+        >>> enable_fast_loops()
+        True
+        >>> os.environ["XLA_FLAGS"]
+        '--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=262144'
+        >>> _ = os.environ.pop("XLA_FLAGS") if kept is None else os.environ.update(XLA_FLAGS=kept)
+    """
+    flags = os.environ.get("XLA_FLAGS", "").strip()
+    if _OPTION in flags:
+        return True
+    if flags and not flags.startswith("-"):
+        return False
+    # XLA merges several --xla_backend_extra_options, so the user's own stay in force.
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={limit}".strip()
+    return True
+
+
+def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
+    """Stores compiled code on disk, so that the next run of the program starts quickly.
+
+    Do not call it in a library: the setting holds for the whole process. Old entries are not
+    removed; deleting the folder is safe at any time.
+
+    Args:
+        folder: For compiled code; the user's cache folder unless given. A folder that the user chose before
+            (`JAX_COMPILATION_CACHE_DIR`) is kept, and so is the shortest compilation that is stored
+            (`JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS`); without it all are stored.
+
+    Returns:
+        The folder in use, or None where it cannot be written (then nothing is changed).
+    """
+    import jax
+
+    chosen = jax.config.values["jax_compilation_cache_dir"]
+    if folder is not None or not chosen:
+        if folder is None:
+            import pooch
+
+            folder = Path(pooch.os_cache("rotflex_jax")) / "compiled"
+        folder = Path(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return None
+        if not os.access(folder, os.W_OK):
+            return None
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    # Most programs compile in less than the second that JAX asks for, and a search needs dozens of them.
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    return Path(folder or chosen)
+
+
+def enable_fast_start() -> None:
+    """Both settings, for a program of its own, before it computes."""
+    enable_fast_loops()
+    enable_compilation_cache()
+
+
+def working_precision(*arrays: Num[np.ndarray, "..."]) -> contextlib.AbstractContextManager:
+    """Context in which JAX keeps float64 if any of `arrays` is float64.
+
+    Outside it the user's own JAX configuration is untouched.
+    """
+    if any(np.asarray(a).dtype == np.float64 for a in arrays):
+        return jax.enable_x64(True)
+    return contextlib.nullcontext()
+
+
+def double_precision() -> contextlib.AbstractContextManager:
+    """Context in which JAX computes in float64, as fits and discovery need."""
+    return jax.enable_x64(True)
+
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def one_thread(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Decorator: inside the function linear algebra runs in one thread."""
+
+    @functools.wraps(function)
+    def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        with _loaded().limit(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return run
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def bind_to_cores(place: int, of: int) -> None:
+    """Bind this process, one of several equal ones, to cores of its own, where the system allows it.
+
+    Threads that migrate between cores slow each other down. Call it before JAX computes, which starts as many
+    threads as it finds cores.
+    """
+    if hasattr(os, "sched_setaffinity"):
+        mine = sorted(os.sched_getaffinity(0))
+        n, alone = len(mine), place % len(mine)
+        chosen = mine[place * n // of : (place + 1) * n // of] if of <= n else mine[alone : alone + 1]
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, chosen)
+
+
+@functools.cache
+def _loaded() -> ThreadpoolController:
+    """The libraries of this process; finding them takes as long as a small fit."""
+    import scipy.linalg  # noqa: F401 - JAX uses its library, and only loaded libraries can be limited
+
+    return ThreadpoolController()
+
+
+_ROWS = "rows"
+
+
+def mesh_of(devices: Sequence[Any] | None = None) -> Mesh | None:
+    """A row of devices, for `spread`.
+
+    Args:
+        devices: those of this process if None, unless `jax.default_device` names one. With
+            `jax.distributed`, `jax.devices()` are those of all processes; then every process must make the
+            same call with the same numbers.
+
+    Returns:
+        The mesh; None for a single device, which needs none.
+
+    >>> mesh_of(jax.devices()[:1]) is None
+    True
+    """
+    if devices is None and jax.config.values["jax_default_device"] is not None:
+        return None
+    chosen = jax.local_devices() if devices is None else list(devices)
+    return Mesh(np.array(chosen), (_ROWS,)) if len(chosen) > 1 else None
+
+
+def spread(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any]:
+    """The same function, each device with its part of the rows of the first argument.
+
+        spread(f, mesh)(rows, *shared) = f(rows, *shared)   to rounding
+
+    For use inside `jax.jit`, with `mesh` static. The rows must be independent, and `function`
+    must take any number of them. They are padded by the last one to a multiple of the devices, so a few
+    rows more than devices cost a second pass of all. Not for rows that take microseconds: sending
+    them costs more.
+
+    Devices of one process do not wait for each other where they divide the rows. Otherwise, and over several
+    processes, all get the whole at the end; XLA ends a program where one waits for another longer than a
+    minute, so such rows must take alike.
+
+    Args:
+        function: of rows (K, ...) and of what all rows share; its results have one entry a row, (K, ...).
+        mesh: from `mesh_of`; None leaves the function as it is.
+
+    Returns:
+        A function whose results every process has as a whole; between devices of one process they may lie in
+        parts.
+    """
+    if mesh is None:
+        return function
+
+    def run(rows: Any, *shared: Any) -> Any:
+        K = len(jax.tree.leaves(rows)[0])
+        full = jnp.minimum(jnp.arange(-(-K // mesh.size) * mesh.size), K - 1)
+        parts = jax.shard_map(
+            function,
+            mesh=mesh,
+            in_specs=(PartitionSpec(_ROWS), *(PartitionSpec() for _ in shared)),
+            out_specs=PartitionSpec(_ROWS),
+            check_vma=False,  # a scan inside begins with the same carry on all devices
+        )(jax.tree.map(lambda x: jnp.asarray(x)[full], rows), *shared)
+        alone = all(device.process_index == jax.process_index() for device in mesh.devices.flat)
+        if alone and len(full) == K:
+            return parts
+        whole = jax.lax.with_sharding_constraint(parts, NamedSharding(mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: x[:K], whole)
+
+    return run

@@ -1,0 +1,45 @@
+"""Files written whole or not at all."""
+
+import errno
+import os
+import shutil
+from pathlib import Path
+
+from rotflex_jax.errors import InputError
+
+
+def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
+    """Write a file beside its place and put it there in one step: an old file stays until then.
+
+    Args:
+        path: Of the file; a device or a pipe is written to as it is.
+        content: Text, written in UTF-8, or bytes.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: It cannot be written: a full disk, no such folder, no permission.
+    """
+    data = content if isinstance(content, bytes) else content.encode()
+    place = Path(os.path.realpath(path))  # a link goes on pointing to the file
+    part = place.with_name(f".{place.name[:100]}.{os.getpid()}.part")
+    try:
+        if place.exists() and not place.is_file():
+            place.write_bytes(data)
+            return Path(path)
+        try:
+            with part.open("wb") as file:
+                file.write(data)
+            if place.exists():
+                if not os.access(place, os.W_OK):
+                    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+                shutil.copymode(place, part)
+            part.replace(place)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be written ({error.strerror or error}); make room or name another place."
+        ) from error
+    return Path(path)

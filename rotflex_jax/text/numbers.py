@@ -1,0 +1,114 @@
+"""Numbers, units and equations as they are printed."""
+
+import math
+import re
+
+from rotflex_jax.parameters import Estimate
+
+
+def together(text: str) -> str:
+    r"""A text whose numbers stay on a line with their units, powers as in print.
+
+    >>> together("0.03 N m at 2 deg").split(" ")
+    ['0.03\xa0N\xa0m', 'at', '2\xa0deg']
+    """
+    text = unit_text(text).replace("N m", "N\xa0m").replace("kg m", "kg\xa0m")
+    return re.sub(r"(?<=\d) (?=(?:N|V|deg|rad|Hz|ms|s|kg|A|%)(?![a-zA-Z]))", "\xa0", text)
+
+
+def equation(text: str) -> str:
+    """An equation with the signs of print.
+
+    >>> equation("tau = -stiffness * position^3, holds while |tau| <= level")
+    'τ = −stiffness · position³, holds while |τ| ≤ level'
+    """
+    for plain, printed in (
+        ("->", "→"),
+        ("<=", "≤"),
+        (">=", "≥"),
+        (" * ", " · "),
+        ("^2", "²"),
+        ("^3", "³"),
+    ):
+        text = text.replace(plain, printed)
+    text = re.sub(r"\btau\b", "τ", text)
+    return text.replace("-", "−")
+
+
+def unit_text(unit: str) -> str:
+    """A unit with the signs of print.
+
+    >>> unit_text("N m/rad^3")
+    'N m/rad³'
+    """
+    return unit.replace("^2", "²").replace("^3", "³")
+
+
+def plain_number(value: float | None, digits: int = 3) -> str:
+    """A number of some significant digits, powers of ten as in print.
+
+    >>> plain_number(0.0123456), plain_number(1.5e-6), plain_number(None)
+    ('0.0123', '1.5 × 10⁻⁶', '–')
+    """
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value != 0 and not 1e-4 <= abs(value) < 1e6:
+        mantissa, power = f"{value:.{digits - 1}e}".split("e")
+        raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        return f"{float(mantissa):g} × 10{raised}".replace("-", "−")
+    if abs(value) >= 1000:
+        return f"{value:,.0f}".replace(",", "\u202f").replace("-", "−")
+    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+
+
+def digits(value: float | None, count: int = 3, missing: str = "-") -> str:
+    """A number of some significant digits in plain characters, for tables of a terminal.
+
+    >>> digits(0.0123456), digits(7052.3, 4), digits(None)
+    ('0.0123', '7052', '-')
+    """
+    return missing if value is None or not math.isfinite(value) else f"{value:.{count}g}"
+
+
+def value_and_interval(estimate: Estimate) -> tuple[str, str]:
+    """The value and its 95 % interval, with as many digits as the interval is worth.
+
+    >>> nan = float("nan")
+    >>> value_and_interval(Estimate("a", 0.0300069, 1e-5, (0.029987, 0.030027), "N m"))
+    ('0.030007', '0.029987 … 0.030027')
+    >>> value_and_interval(Estimate("a", 2.6, nan, (nan, nan), "ohm", free=False))
+    ('2.6', '')
+    """
+    low, high = estimate.ci95
+    if not (math.isfinite(low) and math.isfinite(high) and high > low):
+        return f"{estimate.value:.6g}".replace("-", "−"), ""
+    largest = max(abs(low), abs(high), abs(estimate.value))
+    half = (high - low) / 2
+    power = 0 if 1e-4 <= largest < 1e5 else math.floor(math.log10(largest))
+    scale = 10.0**power
+    digits = min(12, max(0, 1 - math.floor(math.log10(half / scale))))
+    value, low_text, high_text = (
+        f"{x / scale:.{digits}f}".replace("-", "−") for x in (estimate.value, low, high)
+    )
+    if not power:
+        return value, f"{low_text} … {high_text}"
+    raised = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{value} × 10{raised}", f"({low_text} … {high_text}) × 10{raised}"
+
+
+def ratio(value: float, floor: float | None) -> float:
+    """How many times the noise an error is; nan where no noise is known."""
+    return value / floor if floor and floor > 0 else math.nan
+
+
+def as_read(value: float, unit: str) -> tuple[float, str]:
+    """A value in the unit that people read: degrees for angles."""
+    if unit in ("rad", "rad/s"):
+        return math.degrees(value), unit.replace("rad", "deg")
+    return value, unit
+
+
+def readable(value: float, unit: str) -> tuple[float, str]:
+    """A value and its unit as people read them: degrees for angles."""
+    number, read = as_read(value, unit)
+    return number, unit_text(read)

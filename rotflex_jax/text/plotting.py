@@ -1,0 +1,207 @@
+"""The style of the figures, without global state of pyplot, and the figures of a page with their captions."""
+
+import base64
+import dataclasses
+import functools
+import inspect
+import io
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib
+import numpy as np
+from jaxtyping import Real
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from rotflex_jax.text.colours import AXIS, INK, MUTED
+
+P = ParamSpec("P")
+Drawn = TypeVar("Drawn", bound=Figure | None)
+Caption = str | Callable[..., str]
+
+_STYLE: Any = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.labelsize": 9.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": AXIS,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#e8ecf0",
+    "grid.linewidth": 0.7,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "text.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "rotflex",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.4,
+}
+
+
+def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
+    """A function that draws in this style and leaves matplotlib's settings as they were."""
+
+    @functools.wraps(draw)
+    def inside(*args: P.args, **kwargs: P.kwargs) -> Drawn:
+        with matplotlib.rc_context(_STYLE):
+            return draw(*args, **kwargs)
+
+    return inside
+
+
+class Drawing(Figure):
+    """A figure that a notebook shows by itself, whether or not a backend of pyplot is loaded there."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        with matplotlib.rc_context(_STYLE):
+            self.savefig(buffer, format="png", dpi=80)
+        return buffer.getvalue()
+
+
+def blank(width: float, height: float) -> Figure:
+    """An empty figure [inch]; 10 is the width of the page."""
+    figure = Drawing(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def legend_above(figure: Figure, axes: Iterable[Axes], columns: int = 6) -> None:
+    """One legend over the whole figure, where it covers no data."""
+    entries: dict[str, Any] = {}
+    for ax in axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(str(label), handle)
+    figure.legend(
+        list(entries.values()),
+        list(entries),
+        loc="outside upper left",
+        ncols=columns,
+        handlelength=1.8,
+        columnspacing=1.6,
+    )
+
+
+def thinned(
+    t: Real[np.ndarray, " N"], y: Real[np.ndarray, " N"], most: int = 1600
+) -> tuple[Real[np.ndarray, " M"], Real[np.ndarray, " M"]]:
+    """The same line with fewer points: the smallest and the largest of each group of neighbours."""
+    groups = len(y) // max(1, most // 2)
+    if groups < 4:
+        return t, y
+    rows = y[: len(y) // groups * groups].reshape(-1, groups)
+    first = np.arange(len(rows)) * groups
+    pick = np.sort(np.stack([rows.argmin(1), rows.argmax(1)], axis=1), axis=1) + first[:, None]
+    pick = np.append(pick.ravel(), len(y) - 1)
+    return t[pick], y[pick]
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Ticks as numbers without powers of ten."""
+    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:,g}".translate(_SIGNS)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+_SIGNS = str.maketrans({",": "\u202f", "-": "−"})
+
+
+def data_address(figure: Figure) -> str:
+    """The figure as an SVG image inside an address, so that a page needs no other file."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A figure with its words.
+
+    Attributes:
+        section: Of the page, where it stands.
+        figure: What is drawn.
+        caption: One or two sentences: what to see.
+        description: For those who cannot see it.
+    """
+
+    section: str
+    figure: Figure
+    caption: str
+    description: str
+
+    @property
+    def on_page(self) -> dict[str, Any]:
+        """What a template needs: address, width [% of the page], caption and description."""
+        width = round(10 * self.figure.get_figwidth())
+        texts = {"caption": self.caption, "description": self.description}
+        return {"address": data_address(self.figure), "width": width, **texts}
+
+
+class FigureRegistry:
+    """The figures of one kind of page: each stands with its caption where it is drawn."""
+
+    def __init__(self) -> None:
+        self._entries: list[tuple[str, str, Callable[..., Figure | None], Caption, str]] = []
+
+    def figure(
+        self, name: str, *, section: str, caption: Caption, description: str
+    ) -> Callable[[Callable[P, Drawn]], Callable[P, Drawn]]:
+        """Enter a function that draws a figure, or None where there is nothing to show.
+
+        Args:
+            name: Of the picture.
+            section: Of the page, where it stands, after those entered before it.
+            caption: What to see; or a function that says so of what is drawn.
+            description: For those who cannot see it.
+        """
+
+        def enter(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
+            drawing = styled(draw)
+            self._entries.append((name, section, drawing, caption, description))
+            return drawing
+
+        return enter
+
+    def pictures(self, *subjects: Any) -> dict[str, Picture]:
+        """All figures that have something to show, by name.
+
+        Args:
+            subjects: What is drawn. Functions and captions are given as many of them as they take.
+        """
+        drawn = {}
+        for name, section, draw, caption, description in self._entries:
+            figure = _given(draw, subjects)
+            if figure is not None:
+                text = caption if isinstance(caption, str) else _given(caption, subjects)
+                drawn[name] = Picture(section, figure, text, description)
+        return drawn
+
+
+def _given(function: Callable[..., Any], subjects: tuple[Any, ...]) -> Any:
+    return function(*subjects[: len(inspect.signature(function).parameters)])
+
+
+def by_section(pictures: Iterable[Picture]) -> dict[str, list[dict[str, Any]]]:
+    """Section -> what a template needs of its pictures; an empty list for a section that has none."""
+    sections: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for picture in pictures:
+        sections[picture.section].append(picture.on_page)
+    return sections

@@ -1,0 +1,97 @@
+"""A super-model of a few candidates on two short recordings, for tests of scores and refits."""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+import rotflex_jax.effects as fx
+from arena.records import make_record
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.refit import levenberg_marquardt
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, scales
+from rotflex_jax.discover.whitening import Whitener
+from rotflex_jax.fit.dataset import Dataset, prepare
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism import Exponential, Mechanism
+from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Transform
+from rotflex_jax.recording import Recording
+
+HUB = EffectLocation("coulomb", "hub")
+WANTED = ((fx.Coulomb, "hub"), (fx.Viscous, "hub"), (fx.CubicSpring, "joint"), (fx.Coulomb, "joint"))
+SOLVER = Exponential(substeps=2)
+NOISE = np.array([5.4e-4, 5.4e-4])
+
+
+@functools.cache
+def records(level: float = 0.0, seeds: tuple[int, ...] = (21, 22)) -> tuple[dict, ...]:
+    """The same machine twice, with friction of that level at the hub and offsets of +-20 mV."""
+    return tuple(
+        make_record(
+            {HUB: {"level": level}, ("voltage_offset", "input"): {"offset": 0.02 * (-1) ** k}},
+            seed=seed,
+            seconds=1.6,
+            fs=400.0,
+            perturb=0.0,
+            rms=1.5,
+        )
+        for k, seed in enumerate(seeds)
+    )
+
+
+def recordings(made: tuple[dict, ...]) -> tuple[Recording, ...]:
+    return tuple(Recording(u=r["u"], y=r["y"], Ts=r["Ts"], accept=("units",)) for r in made)
+
+
+def baseline() -> Mechanism:
+    """The true joint, whose damping at the hub is left to the back-EMF, which a fit may move."""
+    joint = paper(joint_damping=0.003, hub_damping=0.004).without("viscous", "hub")
+    return joint.release("hub.motor.back_emf")
+
+
+@functools.cache
+def supermodel() -> SuperModel:
+    """The same for all tests, so that it is compiled once."""
+    found = recordings(records())
+    return build(baseline(), WANTED, scales(Model(baseline()), found, dataset(found).torque_scale))
+
+
+def dataset(found: tuple[Recording, ...]) -> Dataset:
+    return dataclasses.replace(prepare(Model(baseline()), found), noise=NOISE)
+
+
+def problem(found: tuple[Recording, ...]) -> LikelihoodProblem:
+    return LikelihoodProblem.of(supermodel(), SOLVER, dataset(found), ("hub", "joint"))
+
+
+def start(at: LikelihoodProblem, wrong: float = 0.0, locations=None) -> Hypothesis:
+    """The baseline in a free run from rest, its free numbers wrong by a share."""
+    s = supermodel()
+    locations = s.calibrations if locations is None else locations
+    R = len(at.seen)
+    z = Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values)
+    z[s.local] = 0.0
+    # Friction that nobody left out: what the back-EMF has to make up for.
+    z[s.mechanism.parameter_names.index("hub.motor.back_emf")] = np.log(0.00767 * 1.04)
+    z[s.baseline_free] += np.log1p(wrong)
+    h = Hypothesis(
+        locations=locations,
+        free=tuple(s.baseline_free),
+        local=tuple(s.local),
+        z=z,
+        local_z=np.zeros((R, len(s.local))),
+        x0=np.zeros((R, 4)),
+        K=np.zeros((R, Layout.of(s.mechanism.structure).size, 2)),
+        process_noise={},
+        whitener=Whitener(np.ones((2, 1)), np.diag(1 / NOISE)),
+    )
+    return at.with_process_noise(h, {"hub": 0.0, "joint": 0.0})
+
+
+def fitted(at: LikelihoodProblem) -> Hypothesis:
+    """The baseline at its optimum, whitener and all."""
+    h = levenberg_marquardt(at, [start(at)])[0]
+    return levenberg_marquardt(at, [h])[0]

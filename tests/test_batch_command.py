@@ -1,0 +1,96 @@
+"""`rotflex discover --each`: what it accepts, what it refuses and how, what it prints."""
+
+import functools
+import importlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import batch_search
+import numpy as np
+import pytest
+
+from rotflex_jax.cli import app
+from rotflex_jax.runtime import xla
+from rotflex_jax.text.numbers import digits
+
+
+@pytest.fixture
+def run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[[str], tuple[int, str, str]]:
+    """The command line in this process, with a search that takes no time."""
+    fleet = importlib.import_module("rotflex_jax.batch")
+    monkeypatch.setattr(fleet, "fleet", functools.partial(fleet.fleet, search=batch_search.quick))
+    monkeypatch.setattr(xla, "enable_fast_start", lambda: None)  # global settings
+    monkeypatch.chdir(tmp_path)
+    for k, volts in enumerate((0.3, 3.0, 3.0)):
+        u = volts * np.random.default_rng(k).normal(size=200 + k)
+        columns = np.c_[0.002 * np.arange(len(u)), u, 0.1 * np.cumsum(u), 0.1 * u]
+        np.savetxt(f"run_{k}.csv", columns, delimiter=",", header="t,voltage,theta,alpha", comments="")
+    Path("torn.csv").write_text("t,voltage\n0,1\n")
+
+    def run(line: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as left:
+            app.main(line.split())
+        assert isinstance(left.value.code, int)
+        return left.value.code, *capsys.readouterr()
+
+    return run
+
+
+def test_every_file_is_searched_by_itself(run) -> None:
+    status, out, err = run("discover run_0.csv run_1.csv torn.csv run_2.csv --each --workers 0 --degrees")
+    assert status == 0
+    lines = {line.split()[0]: line for line in out.splitlines() if line}
+    assert "nothing missing" in lines["run_0"]
+    assert "coulomb@hub" in lines["run_1"]
+    # The sentence speaks of options, not of arguments.
+    assert lines["torn"].startswith("torn failed: ")
+    assert "--output" in lines["torn"]
+    table = np.loadtxt("run_1.csv", delimiter=",", skiprows=1)
+    last = table[round(0.7 * len(table)) :, 2]
+    assert digits(float(np.sqrt(np.mean(last**2)))) in lines["run_1"]
+    assert "4 of 4: run_2: found coulomb@hub" in err
+    assert Path("rotflex-each/summary.html").exists()
+    assert "rotflex-each/summary.html" in out
+
+
+def test_json_on_stdout_stands_alone_and_the_folder_can_be_chosen(run) -> None:
+    status, out, err = run("discover run_0.csv run_1.csv --each --workers 0 --degrees --report o --json -")
+    assert status == 0
+    found = json.loads(out)
+    assert (found["schema"], found["total"]) == (1, 2)
+    assert [r["verdict"] for r in found["recordings"]] == ["nothing_missing", "found"]
+    assert "o/summary.html" in err
+    run("discover run_0.csv run_1.csv --each --workers 0 --degrees --report o --json again.json")
+    again = json.loads(Path("again.json").read_text())
+    assert again["recordings"] == found["recordings"]
+
+
+REFUSED = {
+    "discover run_0.csv --scheduler tcp://127.0.0.1:1": "--each",
+    "discover run_0.csv --workers 2": "--each",
+    "discover run_0.csv --each --held-out run_1.csv": "--held-out",
+    "discover run_0.csv --each --save-model m.json": "--save-model",
+    "discover run_0.csv --each --workers -1": "0 or more",
+    "discover run_0.csv --each --workers many": "--workers",
+    "discover run_0.csv --each --workers 2 --scheduler tcp://127.0.0.1:1": "one of the two",
+    "discover run_0.csv missing.csv --each": "missing.csv",
+    "discover run_0.csv run_0.csv --each": "twice",
+    "discover --each": "FILE",
+    "discover torn.csv --each --workers 0": "No search of 1",
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_bad_arguments_are_refused_with_one_sentence(line, run) -> None:
+    status, out, err = run(line)
+    assert (status, out) == (2, "")
+    sentence = err.splitlines()[-1]
+    assert sentence.startswith("rotflex: ")
+    assert sentence[-1] in ".?"
+    assert REFUSED[line] in sentence
+    assert "Traceback" not in err
+    if "torn" not in line:
+        assert not Path("rotflex-each").exists()

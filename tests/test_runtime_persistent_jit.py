@@ -1,0 +1,216 @@
+"""Traced programs on disk: found again by another process, and only where nothing they depend on differs."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export
+
+import rotflex_jax as rf
+from rotflex_jax.effects import Coulomb, LuGre
+from rotflex_jax.effects.base import Force
+from rotflex_jax.mechanism import Exponential
+from rotflex_jax.parameters import parameter
+from rotflex_jax.runtime import persistent_jit
+from rotflex_jax.runtime.persistent_jit import PersistentJit, clear_compilation_caches, static_key
+from rotflex_jax.runtime.xla import double_precision
+
+traced = []
+
+
+def new() -> PersistentJit:
+    """The program of one function as a new process has it: nothing of it in memory."""
+
+    def line(slope: float, x: jax.Array) -> jax.Array:
+        traced.append(slope)
+        return slope * x
+
+    return PersistentJit(line, static=1)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty cache folder, and source files that are older than the process."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
+    traced.clear()
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def files(folder: Path) -> list[Path]:
+    return [f for f in folder.glob("programs/*/*") if f.is_file()]
+
+
+def test_a_second_process_does_not_trace(folder: Path) -> None:
+    x = np.arange(3.0)
+    with double_precision():
+        first = new()(2.0, x)
+        again = new()(2.0, x)  # nothing in memory, as in a new process
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first, [0.0, 2.0, 4.0])
+    assert traced == [2.0] and len(files(folder)) == 1
+
+
+def test_what_differs_is_another_program(folder: Path) -> None:
+    program = new()
+    with double_precision():
+        program(2.0, np.arange(3.0))
+        program(2.0, np.arange(4.0))
+        program(3.0, np.arange(3.0))
+        assert program(2.0, np.arange(3.0) + 1)[0] == 2.0  # other values are not
+    single = program(2.0, np.arange(3, dtype=np.float32))
+    assert single.dtype == np.float32
+    assert traced == [2.0, 2.0, 3.0, 2.0] and len(files(folder)) == len(program) == 4
+
+
+def test_a_torn_file_is_traced_anew(folder: Path) -> None:
+    x = np.arange(3, dtype=np.float32)
+    new()(2.0, x)
+    (file,) = files(folder)
+    file.write_bytes(file.read_bytes()[:40])
+    np.testing.assert_array_equal(new()(2.0, x), 2 * x)
+    assert len(traced) == 2
+
+
+def test_nothing_is_kept_of_source_that_changed_under_the_process(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(persistent_jit, "_LOADED", 0.0)
+    assert new()(2.0, np.ones(1))[0] == 2.0
+    assert not files(folder)
+
+
+def test_nothing_is_stored_without_a_folder(folder: Path) -> None:
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert new()(2.0, np.ones(1))[0] == 2.0
+    assert not files(folder)
+
+
+def test_old_versions_are_deleted(folder: Path) -> None:
+    for age in range(5):
+        old = folder / "programs" / f"version{age}"
+        old.mkdir(parents=True)
+        os.utime(old, (1e9 - age, 1e9 - age))
+    new()(2.0, np.ones(1))
+    left = {f.name for f in (folder / "programs").iterdir()}
+    assert {"version0", "version1"} < left and len(left) == 3
+
+
+def test_the_text_of_a_structure_identifies_it() -> None:
+    joint = rf.joints.paper()
+    mechanisms = [
+        joint,
+        joint + Coulomb(at="hub"),
+        joint + Coulomb(at="arm"),
+        joint + LuGre(at="hub"),
+        dataclasses.replace(joint, outputs=joint.outputs[:1]),
+    ]
+    texts = [static_key(m.structure) for m in mechanisms]
+    assert all(texts) and len(set(texts)) == len(texts)
+    numbers = joint.with_values(2 * joint.values)
+    assert static_key(numbers.structure) == texts[0]  # the numbers are no part of it
+    assert static_key(Exponential(order=2)) != static_key(Exponential(order=4))
+
+
+@dataclasses.dataclass(frozen=True)
+class Own(Force):
+    name = "own"
+    factor: float = parameter(1.0, unit="N m")
+
+    def force(self, position, speed, voltage):
+        return -self.factor * speed
+
+
+def test_nothing_is_kept_of_a_law_from_elsewhere() -> None:
+    assert not static_key((rf.joints.paper() + Own(at="hub")).structure)
+
+
+SECOND = """
+import json, sys
+import numpy as np
+import rotflex_jax as rf
+from rotflex_jax.runtime import persistent_jit
+persistent_jit._LOADED += 3600.0
+rf.enable_compilation_cache(sys.argv[1])
+u = np.random.default_rng(1).normal(size=300)
+model = rf.Model(rf.joints.paper())
+from rotflex_jax.mechanism import step
+count = []
+advance = step._advance
+step._advance = lambda *given: count.append(1) or advance(*given)
+recording = rf.Recording(u=u, y=np.stack([np.cumsum(u), u], axis=1), Ts=0.002)
+print(json.dumps([model.simulate(recording)[-1].tolist(), len(count)]))
+"""
+
+
+def test_a_simulation_in_a_second_process_is_the_same_and_traces_no_step(tmp_path: Path) -> None:
+    found = []
+    for _ in range(2):
+        run = subprocess.run(
+            [sys.executable, "-c", SECOND, str(tmp_path)], capture_output=True, text=True, check=True
+        )
+        found.append(json.loads(run.stdout))
+    (first, steps), (second, none) = found
+    assert first == second and steps > 0 and none == 0
+
+
+class Pair(NamedTuple):
+    twice: jax.Array
+    left: jax.Array | None
+
+
+export.register_namedtuple_serialization(Pair, serialized_name="test_runtime_persistent_jit.Pair")
+
+
+def test_a_named_tuple_comes_back_from_disk_as_one(folder: Path) -> None:
+    def pair(x: jax.Array) -> Pair:
+        return Pair(2 * x, None)
+
+    x = np.arange(3, dtype=np.float32)
+    PersistentJit(pair, static=0)(x)
+    assert len(files(folder)) == 1
+    found = PersistentJit(pair, static=0)(x)
+    assert isinstance(found, Pair) and found.left is None
+    np.testing.assert_array_equal(found.twice, 2 * x)
+
+
+def test_a_compiler_without_these_choices_compiles_as_it_likes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = persistent_jit._FOR_COMPILER
+    assert persistent_jit._options() == known  # this one has the choice
+    monkeypatch.setattr(persistent_jit, "_FOR_COMPILER", {"xla_no_such_option": False, **known})
+    persistent_jit._options.cache_clear()
+    assert persistent_jit._options() == known
+    np.testing.assert_array_equal(new()(2.0, np.ones(2, np.float32)), [2.0, 2.0])
+    persistent_jit._options.cache_clear()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells a process its maps")
+def test_compiled_code_is_released_and_compiled_again():
+    traces = []
+
+    @jax.jit
+    def double(x):
+        traces.append(x)
+        return 2 * x
+
+    double(jnp.ones(3))
+    assert not clear_compilation_caches(10**9)
+    double(jnp.ones(3))
+    assert len(traces) == 1
+    assert clear_compilation_caches(1)
+    assert double(jnp.ones(3)).tolist() == [2.0, 2.0, 2.0]
+    assert len(traces) == 2

@@ -1,0 +1,50 @@
+"""The architecture that docs/design.md draws is the one that the code has."""
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "docs"))  # for `generate`, which measures the package
+
+from generate.structure import Package, largest_circle, repeated, shapes  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def package() -> Package:
+    return Package(ROOT)
+
+
+def test_design_draws_the_layers_that_the_linter_checks() -> None:
+    drawn = re.search(r"<!-- layers -->\n```\n(.*?)```", (ROOT / "docs/design.md").read_text(), re.S)
+    assert drawn is not None
+    names = [re.split(r"\s{2,}", line)[0] for line in drawn[1].splitlines()]
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]
+    assert names == [layer for layer in contract["layers"] if layer != "__main__"]
+
+
+def test_only_the_result_of_a_search_imports_upwards() -> None:
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]
+    assert contract["ignore_imports"] == ["rotflex_jax.discover.discovery -> rotflex_jax.report"]
+
+
+def test_import_circles_are_small_and_stay_within_a_folder(package: Package) -> None:
+    """Imports inside functions and for type checking count, but for the one arrow that points up."""
+    graph = package.graph(origin=True)
+    up = {name for name in graph if name.startswith("rotflex_jax.report")}
+    circle = largest_circle(
+        {**graph, "rotflex_jax.discover.discovery": graph["rotflex_jax.discover.discovery"] - up}
+    )
+    assert len(circle) <= 4, circle
+    assert len({name.split(".")[1] for name in circle}) <= 1, circle
+
+
+def test_no_class_is_defined_twice(package: Package) -> None:
+    assert repeated(package)["classes"] == {}
+
+
+def test_public_functions_state_the_shapes_of_their_arrays(package: Package) -> None:
+    assert shapes(package)["missing"] == []
