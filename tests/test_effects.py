@@ -407,7 +407,7 @@ def test_every_file_registers_and_knows_no_sibling():
         (Gear, "rotor, stops"),
         (Actuation, "drive"),
         (Sensing, "measure"),
-        (Effect, "kind_label"),
+        (Effect, "a kind that it derives from"),
     ],
 )
 def test_a_class_without_the_methods_of_its_kind_cannot_be_defined(kind, missing):

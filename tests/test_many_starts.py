@@ -15,7 +15,7 @@ from rotflex_jax.fit.problem import directions, normal_equations
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate
 from rotflex_jax.mechanism.assembly import whole_state
-from rotflex_jax.mechanism.sensitivities import Numbers, Samples
+from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import double_precision
@@ -50,9 +50,9 @@ def test_one_pass_has_the_sums_that_differences_of_runs_have(effect) -> None:
     with double_precision():
         structure = joint.structure
         start = whole_state(structure, jnp.asarray(x0))
-        numbers = Numbers(jnp.asarray(joint.values), jnp.ones(len(joint.effects)), start, None)
+        numbers = RunParameters(jnp.asarray(joint.values), jnp.ones(len(joint.effects)), start, None)
         ways = directions(structure, jnp.asarray(joint.values), jnp.asarray(moved), 4)
-        samples = Samples(*(jnp.asarray(a) for a in (u, y, seen, Ts)))
+        samples = RecordingSamples(*(jnp.asarray(a) for a in (u, y, seen, Ts)))
         sums = jax.jit(normal_equations, static_argnums=(0, 1))
         got = jax.device_get(sums(structure, Exponential(), numbers, ways, samples, jnp.asarray(scale)))
     np.testing.assert_allclose(got.cost, e @ e / 2, rtol=1e-10)

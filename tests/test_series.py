@@ -27,7 +27,7 @@ def test_a_linear_series_is_a_convolution_of_the_input_alone() -> None:
 
 
 def test_zero_kernels_give_the_constant() -> None:
-    series = Series(Volterra(Delays(3)), [0.7, *np.zeros(9)], "alpha", 0.01)
+    series = Series(Volterra(Delays(3)), np.array([0.7, *np.zeros(9)]), "alpha", 0.01)
     np.testing.assert_array_equal(series.simulate(recording()), np.full((60, 1), 0.7))
 
 
@@ -50,7 +50,7 @@ def test_precision_follows_the_recording() -> None:
 
 
 def test_it_says_what_it_is() -> None:
-    series = Series(Volterra(Delays(1)), [0.1, 0.2, 0.3], "alpha", 0.01)
+    series = Series(Volterra(Delays(1)), np.array([0.1, 0.2, 0.3]), "alpha", 0.01)
     assert str(series).splitlines() == [
         "Series of alpha, 3 terms, every 0.01 s",
         "  1: 0.1 rad",

@@ -126,15 +126,14 @@ class Effect(abc.ABC):
         super().__init_subclass__(**given)
         if not hasattr(cls, "name"):  # a kind, or a base class of several effects
             return
-        missing = [n for n in ("title", "equation", "kind_label") if not hasattr(cls, n)]
+        missing = [] if hasattr(cls, "kind_label") else ["a kind that it derives from"]
         missing += [n for n in dir(cls) if getattr(getattr(cls, n, None), "__isabstractmethod__", False)]
         if cls.searched and cls.probes.__func__ is Effect.probes.__func__:
             missing.append("probes")
         if missing:
             raise InputError(
-                f"The effect {cls.__name__} was defined without {', '.join(missing)}, but it needs a name, a "
-                "title, an equation, a kind that it derives from, and the methods of this kind; add what is "
-                "missing."
+                f"The effect {cls.__name__} was defined without {', '.join(missing)}, but an effect derives "
+                "from a kind and has the methods of this kind; add what is missing."
             )
 
     def __post_init__(self) -> None:
