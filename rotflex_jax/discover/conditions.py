@@ -9,6 +9,7 @@ import scipy
 from jaxtyping import Bool, Float, Int
 
 from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.numbers import as_read
 
@@ -123,8 +124,8 @@ def _speed(
     """Smoothed speed of a channel, the standard deviation of its error, and its unit."""
     window = 2 * half_width(recording) + 1
     unit = recording.units[recording.channels.index(channel)]
-    known = dict(mechanism.outputs) if mechanism is not None else {}
-    is_speed = known.get(channel, ("", ""))[1] == "speed" or unit.endswith("/s")
+    known = dict(zip(mechanism.channels, mechanism.quantities, strict=True)) if mechanism is not None else {}
+    is_speed = known.get(channel) is Quantity.SPEED or unit.endswith("/s")
     order = 0 if is_speed else 1
     weights = scipy.signal.savgol_coeffs(window, 2, deriv=order, delta=recording.Ts)
     y = recording.channel(channel).astype(float)

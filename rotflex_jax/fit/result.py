@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.text.markup import card, picture, table
@@ -70,8 +71,7 @@ class Fit:
     def _repr_html_(self) -> str:
         """How the fit ended, its residuals, and every parameter with unit and interval."""
         residuals, estimates, widths = [], [], []
-        for channel, place in self.model.mechanism.outputs:
-            own = self.model.mechanism.units.motion + ("/s" if place[1] == "speed" else "")
+        for channel, own in output_units(self.model.mechanism).items():
             value, unit = readable(self.noise[channel], own)
             residuals.append((channel, unit, plain_number(value)))
         for e in sorted(self.parameters, key=lambda e: not e.free):
