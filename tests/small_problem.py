@@ -83,7 +83,7 @@ def start(at: LikelihoodProblem, wrong: float = 0.0, locations=None) -> Hypothes
         local=tuple(s.local),
         z=z,
         local_z=np.zeros((R, len(s.local))),
-        x0=np.zeros((R, 4)),
+        x0=np.zeros((R, 1, 4)),
         K=np.zeros((R, Layout.of(s.mechanism.structure).size, 2)),
         process_noise={},
         whitener=Whitener(np.ones((2, 1)), np.diag(1 / NOISE)),

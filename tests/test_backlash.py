@@ -298,7 +298,7 @@ def test_a_search_meets_play_at_its_size():
         local=(),
         z=Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values),
         local_z=np.zeros((1, 0)),
-        x0=np.zeros((1, 4)),
+        x0=np.zeros((1, 1, 4)),
         K=np.zeros((1, Layout.of(s.mechanism.structure).size, 2)),
         process_noise={},
         whitener=Whitener(np.ones((2, 1)), np.diag(1 / NOISE)),

@@ -310,7 +310,7 @@ class FakeSearch:
             verdict=Verdict.FOUND,
             sentence="The rounds explain the record.",
             train=train,
-            test=test,
+            validation=test,
             baseline=stage,
             rounds=[turn],
             noise_floor={"theta": 5e-4, "alpha": 5e-4},

@@ -8,10 +8,11 @@ import small_problem as sp
 
 from rotflex_jax.discover import selection
 from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.likelihood import in_blocks
 from rotflex_jax.discover.refit import levenberg_marquardt
 from rotflex_jax.discover.selection import admissible, choose, distinguished, paired_gain
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, in_blocks, validate
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.discover.whitening import Whitener
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.recording import Recording
@@ -40,10 +41,11 @@ def trial(
     pattern = np.random.default_rng(seed).normal(size=BLOCKS)
     pattern = scatter * (pattern - pattern.mean()) / pattern.std()
     blocks = COMMON + held_out / BLOCKS + pattern
-    densities = np.repeat((COMMON[::-1] + train / BLOCKS + pattern) / 25, 25)[None]
-    white = Whitener(np.ones((2, 1)), np.eye(2))
-    none = np.zeros((1, 0))
-    h = Hypothesis((), (), (), np.zeros(0), none, none, np.zeros((1, 0, 2)), {}, white, densities)
+    trained = COMMON[::-1] + train / BLOCKS + pattern
+    white, none = Whitener(np.ones((2, 1)), np.eye(2)), np.zeros((1, 0))
+    h = Hypothesis(
+        (), (), (), np.zeros(0), none, none[None], np.zeros((1, 0, 2)), {}, white, trained[None], trained
+    )
     return ValidatedHypothesis(h, blocks, h, windows * NOISE, location, numbers)
 
 
@@ -82,6 +84,42 @@ def test_blocks_of_half_a_second():
 
 
 GOOD = {"held_out": 200.0, "train": 200.0, "windows": 5.0, "scatter": 0.5}
+
+
+def at_both(prediction: dict, free_run: dict, location=None) -> ValidatedHypothesis:
+    """A hypothesis with leads at both horizons; those of free runs are logarithms of errors."""
+    return dataclasses.replace(trial(location, **prediction), free_run=trial(location, **free_run))
+
+
+NOTHING, FAR = {"windows": 10.0}, at_both({"windows": 10.0}, {"windows": 10.0})
+STRONG = {"held_out": 40.0, "train": 40.0, "windows": 5.0, "scatter": 0.3}
+
+
+def test_free_runs_alone_may_ask_for_an_effect():
+    """Predictions that follow the data within a few samples see nothing of what acts slowly."""
+    assert admissible(at_both(NOTHING, STRONG, COULOMB), FAR, DATA, NOISE)
+    assert not admissible(at_both(NOTHING, NOTHING, COULOMB), FAR, DATA, NOISE)
+    # They must be sure, on both sets, and the error must fall by more than a little.
+    for spoilt in ({"scatter": 4.0}, {"train": 0.0}, {"windows": 9.5}):
+        assert not admissible(at_both(NOTHING, STRONG | spoilt, COULOMB), FAR, DATA, NOISE), spoilt
+    # Near the sensor noise predictions have the power, and free runs alone do not count.
+    near = at_both({"windows": 1.1}, {"windows": 1.1})
+    assert not admissible(at_both({"windows": 1.1}, STRONG | {"windows": 0.9}, COULOMB), near, DATA, NOISE)
+
+
+def test_parameters_of_predictions_need_not_suit_free_runs():
+    """A candidate whose predictions gain is not refused for the free runs of its predictor's parameters."""
+    worse = GOOD | {"windows": 12.0}
+    assert not admissible(at_both(worse, NOTHING, COULOMB), FAR, DATA, NOISE)
+    assert admissible(at_both(worse, STRONG, COULOMB), FAR, DATA, NOISE)
+
+
+def test_what_both_horizons_want_wins():
+    """One leads as a predictor, another one in free runs, a third is near the top of both."""
+    predicts = at_both(GOOD | {"held_out": 400.0}, STRONG | {"held_out": 10.0}, ARM)
+    both = at_both(GOOD | {"held_out": 300.0}, STRONG | {"held_out": 38.0}, COULOMB)
+    runs = at_both(GOOD | {"held_out": 20.0}, STRONG, DRAG)
+    assert choose([predicts, both, runs], FAR, DATA, NOISE)[0] is both
 
 
 @pytest.mark.parametrize(
@@ -159,9 +197,9 @@ def test_both_sides_tell_apart():
     best = trial(DRAG, **GOOD | {"held_out": 201.0, "train": 400.0, "scatter": 1.0})
     close = trial(ARM, **GOOD | {"scatter": 1.0}, seed=2)
     assert paired_gain(best.blocks, close.blocks)[1] < selection.SEPARATE_Z
-    assert distinguished(best, close, DATA)
+    assert distinguished(best, close)
     same = trial(DRAG, **GOOD | {"held_out": 201.0, "scatter": 1.0})
-    assert not distinguished(same, close, DATA)
+    assert not distinguished(same, close)
 
 
 def test_the_simpler_effect_wins_unless_the_richer_earns_it():

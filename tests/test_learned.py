@@ -151,7 +151,7 @@ def mapped(found: MapEquations, weights: int, prior: float = 1e-3) -> FittedMap:
         (),
         full,
         np.zeros((1, 0)),
-        np.zeros((1, 0)),
+        np.zeros((1, 1, 0)),
         np.zeros((1, 0, 1)),
         {},
         Whitener(np.ones((1, 1)), np.eye(1)),

@@ -8,6 +8,7 @@ import small_problem as sp
 from scipy.optimize import least_squares
 
 from rotflex_jax.discover import refit as refit_module
+from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.refit import (
     EXTRA_ALTERNATIONS,
     MAX_COORDINATE_STEP,
@@ -15,10 +16,9 @@ from rotflex_jax.discover.refit import (
     choose_process_noise,
     levenberg_marquardt,
     refit,
-    whitened_sums,
 )
-from rotflex_jax.discover.score_test import _expanded
 from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.windows import Windows
 from rotflex_jax.parameters import Transform
 
 
@@ -51,11 +51,11 @@ def at(h, numbers: np.ndarray):
     z = h.z.copy()
     z[list(h.free)] = numbers[:shared]
     rest = numbers[shared:].reshape(R, -1)
-    return dataclasses.replace(h, z=z, local_z=rest[:, : len(h.local)], x0=rest[:, len(h.local) :])
+    return dataclasses.replace(h, z=z, local_z=rest[:, : len(h.local)], x0=rest[:, None, len(h.local) :])
 
 
 def numbers_of(h) -> np.ndarray:
-    return np.concatenate([h.z[list(h.free)], np.hstack([h.local_z, h.x0]).ravel()])
+    return np.concatenate([h.z[list(h.free)], np.hstack([h.local_z, h.x0[:, 0]]).ravel()])
 
 
 def cost(problem, h, whitener) -> float:
@@ -68,7 +68,7 @@ def test_slopes_are_those_of_the_innovations(rough):
     h = with_friction(rough, 0.02)
     h = rough.with_process_noise(h, {"hub": 1e-4 * rough.dataset.torque_scale**2 * 0.0025, "joint": 1e-9})
     own = np.array([[0.01, 0.002], [-0.02, 0.001]])
-    h = dataclasses.replace(h, local_z=own, x0=np.full((2, 4), 0.01))
+    h = dataclasses.replace(h, local_z=own, x0=np.full((2, 1, 4), 0.01))
     count = rough.direction_count
     _, J = rough.slopes([h], count)
     assert (J[0, h.moved :] == 0).all()
@@ -84,18 +84,46 @@ def test_slopes_are_those_of_the_innovations(rough):
         assert close.mean() > 0.98, k
 
 
-def test_whitened_sums_are_those_of_the_whole_matrix(plain):
+def blocks(h) -> tuple[Windows, list[list[slice]]]:
+    """Two recordings of 30 samples: two windows and one window."""
+    index = np.zeros((2, 30), np.int32)
+    index[0, 12:] = 1
+    windows = Windows(index, (2, 1), np.zeros((2, 2, h.x0.shape[-1])))
+    return windows, [[slice(0, 12), slice(12, 30)], [slice(0, 30)]]
+
+
+def every_row(h, W: np.ndarray) -> np.ndarray:
+    """Slopes along every coordinate of a fit (M, R N C), zero where a coordinate has no say."""
+    shared, local = len(h.free), len(h.local)
+    rows = [W[k] for k in range(shared)]
+    for r, slices in enumerate(blocks(h)[1]):
+        for k, samples in [(k, slice(None)) for k in range(shared, shared + local)] + [
+            (k, samples) for samples in slices for k in range(shared + local, h.moved)
+        ]:
+            one = np.zeros_like(W[k])
+            one[r, samples] = W[k, r, samples]
+            rows.append(one)
+    return np.array(rows).reshape(len(rows), -1)
+
+
+def test_sums_are_those_of_the_whole_matrix(plain):
     _, h = plain
     rng = np.random.default_rng(0)
     w, W = rng.normal(size=(2, 30, 2)), rng.normal(size=(h.moved, 2, 30, 2))
-    H, g = whitened_sums(h, w, W)
-    rows = _expanded(h, W)
-    shared, each = len(h.free), h.moved - len(h.free)
-    # `_expanded` has recordings innermost, the normal equations outermost.
-    order = [*range(shared), *(shared + 2 * k + r for r in range(2) for k in range(each))]
-    rows = rows[order]
+    coordinates, rows = FitCoordinates.of(h, blocks(h)[0]), every_row(h, W)
+    H, g = coordinates.sums(w, W)
     np.testing.assert_allclose(H, rows @ rows.T, atol=1e-10)
     np.testing.assert_allclose(g, rows @ w.ravel(), atol=1e-10)
+
+
+def test_the_projection_is_that_on_the_whole_matrix(plain):
+    _, h = plain
+    rng = np.random.default_rng(1)
+    W, signals = rng.normal(size=(h.moved, 2, 30, 2)), rng.normal(size=(3, 2, 30, 2))
+    found = FitCoordinates.of(h, blocks(h)[0]).orthogonal_to(W)(signals)
+    rows, flat = every_row(h, W), signals.reshape(3, -1)
+    left = flat - np.linalg.lstsq(rows.T, flat.T, rcond=None)[0].T @ rows
+    np.testing.assert_allclose(found, left, atol=1e-9)
 
 
 @pytest.mark.parametrize("intensity", [0.0, 1e-4], ids=["free run", "predictor"])
@@ -222,7 +250,7 @@ def test_grid_of_intensities():
 def test_a_start_from_which_nothing_is_finite_is_left_alone(rough):
     """Numbers that overflow stay the unlikeliest, and do not stop the others."""
     good, bad = with_friction(rough, 0.01), sp.start(rough)
-    bad = dataclasses.replace(bad, x0=np.full((2, 4), np.nan))
+    bad = dataclasses.replace(bad, x0=np.full((2, 1, 4), np.nan))
     one, other = levenberg_marquardt(rough, [good, bad])
     assert np.isfinite(one.log_likelihood)
     assert other.log_likelihood == -np.inf

@@ -134,7 +134,7 @@ def two_rounds() -> Discovery:
         verdict=Verdict.AMBIGUOUS,
         sentence="coulomb at hub and cubic_spring at joint explain the recording",
         train=(train,),
-        test=(test,),
+        validation=(test,),
         baseline=stages[0],
         rounds=rounds,
         ranking=(
@@ -154,7 +154,9 @@ def two_rounds() -> Discovery:
 def nothing() -> Discovery:
     full = two_rounds()
     base = full.final
-    even = locate(full.test[0], full.test[0].y - base.windowed[0], ("theta", "alpha"), full.noise_floor)
+    even = locate(
+        full.validation[0], full.validation[0].y - base.windowed[0], ("theta", "alpha"), full.noise_floor
+    )
     return dataclasses.replace(
         full,
         verdict=Verdict.NOTHING_MISSING,
@@ -493,7 +495,7 @@ def test_long_recordings_keep_the_page_small(discovery) -> None:
         for s in discovery.stages
     ]
     rounds = tuple(dataclasses.replace(r, stage=s) for r, s in zip(discovery.rounds, stages[1:], strict=True))
-    long = dataclasses.replace(discovery, test=(test,), baseline=stages[0], rounds=rounds)
+    long = dataclasses.replace(discovery, validation=(test,), baseline=stages[0], rounds=rounds)
     page = render(long)
     assert len(page) < 3e6
     assert "30 s of it are shown" in page

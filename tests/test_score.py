@@ -101,7 +101,7 @@ def test_switched_off_it_is_the_baseline(weak):
     assert plain.parameter_names == sp.baseline().parameter_names
     for r in range(2):
         data = problem.dataset.data
-        y_hat = simulate(plain, data.u[r], float(data.Ts[r]), x0=off.x0[r], solver=sp.SOLVER)
+        y_hat = simulate(plain, data.u[r], float(data.Ts[r]), x0=off.x0[r, 0], solver=sp.SOLVER)
         np.testing.assert_allclose(e[r], data.y[r] - y_hat, atol=1e-11)
 
 

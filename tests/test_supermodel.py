@@ -48,6 +48,10 @@ def supermodel() -> SuperModel:
     return build(baseline, WANTED, SCALES)
 
 
+# All samples of both recordings belong to one window each.
+ONE_RUN = np.zeros((2, N), np.int32)
+
+
 @functools.cache
 def predictor() -> BatchedPredictor:
     rng = np.random.default_rng(0)
@@ -68,13 +72,13 @@ def numbers(name: str) -> ParameterSet:
         K[r, s.baseline_states] = kalman_gains(s.baseline, [PROCESS], [5e-4, 5e-4], Ts)[0]
     gates = s.gates(s.calibrations + SETS[name])
     x0[:, list(s.active(gates).states)] = 0.1  # at rest what is off
-    return ParameterSet(values, x0 * rng.normal(size=x0.shape), gates, K)
+    return ParameterSet(values, (x0 * rng.normal(size=x0.shape))[:, None], gates, K)
 
 
 def parameter_set(name: str) -> ParameterSet:
     """The same as a bench takes it: the first state is that of the part that runs."""
     whole = numbers(name)
-    return whole._replace(x0=whole.x0[:, list(supermodel().active(whole.gates).states)])
+    return whole._replace(x0=whole.x0[..., list(supermodel().active(whole.gates).states)])
 
 
 @functools.cache
@@ -93,7 +97,7 @@ def program():
     def run(whole, dvalues, dgates):
         def e(values, gates):
             each = jax.vmap(functools.partial(predicted, gates))
-            return each(values, whole.x0, whole.K, *predictor().on_device())
+            return each(values, whole.x0[:, 0], whole.K, *predictor().on_device())
 
         at = (whole.values, whole.gates)
         return e(*at), jax.vmap(lambda dv, dg: jax.jvp(e, at, (dv, dg))[1])(dvalues, dgates)
@@ -113,7 +117,7 @@ def whole_run(whole: ParameterSet, along: Directions) -> tuple[np.ndarray, np.nd
 def directions(name: str, *names: str) -> Directions:
     """Along parameters by a tenth of their values, in the first state not at all; always five."""
     m, on = supermodel().mechanism, parameter_set(name)
-    sizes = ((2, len(m.values)), on.x0.shape[1:], on.gates.shape)
+    sizes = ((2, len(m.values)), on.x0.shape[-1:], on.gates.shape)
     d = Directions(*(np.zeros((5, *size)) for size in sizes))
     for row, parameter in enumerate(names):
         i = m.parameter_names.index(parameter)
@@ -182,7 +186,7 @@ def test_candidates_that_could_not_act_are_left_out():
 
 def test_innovations_on_parts_are_those_of_the_whole():
     names = ("nothing", "without states", "one memory", "a mode and dry friction")
-    found = predictor().innovations([parameter_set(name) for name in names])
+    found = predictor().innovations([parameter_set(name) for name in names], ONE_RUN)
     for name, mine in zip(names, found, strict=True):
         whole = whole_run(numbers(name), directions(name))[0]
         np.testing.assert_allclose(mine, whole, rtol=0, atol=1e-10, err_msg=name)
@@ -193,7 +197,7 @@ def test_slopes_on_parts_are_those_of_the_whole():
     name = "a mode and dry friction"
     along = directions(name, "hub.motor.torque_constant", "arm.second_mode.frequency", "joint.coulomb.level")
     along.gates[3] = supermodel().gates([EffectLocation("cubic_spring", "joint")])
-    e, J = predictor().slopes([parameter_set(name)], [along])
+    e, J = predictor().slopes([parameter_set(name)], [along], ONE_RUN)
     whole_e, whole_J = whole_run(numbers(name), along)
     np.testing.assert_allclose(e[0], whole_e, rtol=0, atol=1e-10)
     for mine, whole in zip(J[0], whole_J, strict=True):
@@ -213,7 +217,7 @@ def test_probes_are_the_slopes_of_the_whole():
     put = ParameterSet(values, now.x0, put_in, now.K)
     # A direction belongs to one family; in the programs of the others nothing moves along it.
     J = candidate_sensitivities(
-        predictor(), now, [InactiveCandidates(family, put, along) for family in families]
+        predictor(), now, [InactiveCandidates(family, put, along) for family in families], ONE_RUN
     ).sum(axis=0)
     assert len(families) == 4
     whole = whole_run(numbers("one memory")._replace(values=values, gates=put_in), along)[1]

@@ -74,7 +74,7 @@ def estimate_line(name: str, estimate: Any) -> str:
 def print_discovery(result: Any) -> None:
     """Verdict, rounds, errors on held-out data and where the model failed."""
     console = output()
-    units = {name: unit_of(result.test[0], name) for name in result.baseline.held_out_rmse}
+    units = {name: unit_of(result.validation[0], name) for name in result.baseline.held_out_rmse}
     console.print(result.verdict.label.upper(), style="bold", markup=False)
     console.print(result.sentence, markup=False)
     for count, added in enumerate(result.rounds, start=1):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from rotflex_jax.discover.supermodel import ReducedModel, SuperModel
 from rotflex_jax.fit.dataset import StackedRecordings
@@ -35,13 +35,13 @@ class ParameterSet(NamedTuple):
 
     Attributes:
         values: Parameter values of each recording.
-        x0: First states, of the effects that the gates switch on.
+        x0: First states of the windows of each recording, of the effects that the gates switch on.
         gates: One factor per effect.
         K: Gains of the predictor.
     """
 
     values: Float[Any, "*L R P"]
-    x0: Float[Any, "*L R m"]
+    x0: Float[Any, "*L R W m"]
     gates: Float[Any, "*L E"]
     K: Float[Any, "*L R n C"]
 
@@ -51,7 +51,7 @@ class Directions(NamedTuple):
 
     Attributes:
         values: Of the parameters of each recording.
-        x0: Of the first state, the same in every recording.
+        x0: Of the first state, the same in every window.
         gates: Of the gates.
     """
 
@@ -62,10 +62,14 @@ class Directions(NamedTuple):
 
 @persistent_jit(static=2)
 def _innovations(
-    structure: Mechanism, solver: Solver, parameter_sets: ParameterSet, data: StackedRecordings
+    structure: Mechanism,
+    solver: Solver,
+    parameter_sets: ParameterSet,
+    data: StackedRecordings,
+    window: jax.Array,
 ) -> jax.Array:
     def one(p: ParameterSet) -> jax.Array:
-        y_hat = predicted(structure, solver, p.values, p.x0, p.gates, data, p.K)
+        y_hat = predicted(structure, solver, p.values, p.x0, p.gates, data, p.K, window)
         return jnp.where(data.seen[:, :, None] > 0, data.y - y_hat, 0.0)
 
     return jax.vmap(one)(parameter_sets)
@@ -78,18 +82,20 @@ def _slopes(
     parameter_set: ParameterSet,
     directions: Directions,
     data: StackedRecordings,
+    window: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     x0 = whole_state(structure, parameter_set.x0)
-    x0_ways = jnp.pad(directions.x0, ((0, 0), (0, x0.shape[1] - parameter_set.x0.shape[1])))
+    x0_ways = jnp.pad(directions.x0, ((0, 0), (0, x0.shape[-1] - parameter_set.x0.shape[-1])))
 
     def one(recording: Any) -> tuple[jax.Array, jax.Array]:
-        values, x0, K, dvalues, samples = recording
+        values, x0, K, dvalues, (u, y, seen, Ts), window = recording
         numbers = RunParameters(values, parameter_set.gates, x0, K)
         ways = TangentDirections(dvalues, directions.gates, x0_ways)
-        y_hat, J = outputs_with_sensitivities(structure, solver, numbers, ways, RecordingSamples(*samples))
+        run = RecordingSamples(u, y, seen, Ts, window)
+        y_hat, J = outputs_with_sensitivities(structure, solver, numbers, ways, run)
         return y_hat, jnp.moveaxis(J, -1, 0)
 
-    rows = (parameter_set.values, x0, parameter_set.K, jnp.swapaxes(directions.values, 0, 1), data)
+    rows = (parameter_set.values, x0, parameter_set.K, jnp.swapaxes(directions.values, 0, 1), data, window)
     y_hat, J = jax.lax.map(one, rows)
     # Not a product: beyond its last sample a run may diverge.
     seen = data.seen[:, :, None] > 0
@@ -129,14 +135,17 @@ class BatchedPredictor:
     data: StackedRecordings
     compiled: set[Any] = dataclasses.field(default_factory=set)
 
-    def innovations(self, parameter_sets: list[ParameterSet]) -> Float[np.ndarray, "L R N C"]:
-        """Innovations of any number of parameter sets."""
+    def innovations(
+        self, parameter_sets: list[ParameterSet], window: Int[np.ndarray, "R N"]
+    ) -> Float[np.ndarray, "L R N C"]:
+        """Innovations of any number of parameter sets; `window` has the window of each sample."""
 
         def run(job: tuple[ReducedModel, list[int]]) -> np.ndarray:
             model, indices = job
             with double_precision():
                 batch = _stacked([restrict(parameter_sets[i], model) for i in indices])
-                e = _innovations(model.mechanism.structure, self.solver, batch, self.on_device())
+                data, index = self.on_device(), jnp.asarray(window)
+                e = _innovations(model.mechanism.structure, self.solver, batch, data, index)
                 return np.asarray(e)[: len(indices)]
 
         size = PARAMETER_SETS_PER_CALL
@@ -149,7 +158,10 @@ class BatchedPredictor:
         return out
 
     def slopes(
-        self, parameter_sets: list[ParameterSet], directions: list[Directions]
+        self,
+        parameter_sets: list[ParameterSet],
+        directions: list[Directions],
+        window: Int[np.ndarray, "R N"],
     ) -> tuple[Float[np.ndarray, "L R N C"], Float[np.ndarray, "L D R N C"]]:
         """Innovations and their slopes along the directions given for each parameter set."""
 
@@ -159,7 +171,8 @@ class BatchedPredictor:
             along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
             with double_precision():
                 structure, inputs = model.mechanism.structure, restrict(parameter_sets[i], model)
-                e, J = _slopes(structure, self.solver, inputs, along, self.on_device())
+                data, index = self.on_device(), jnp.asarray(window)
+                e, J = _slopes(structure, self.solver, inputs, along, data, index)
                 return np.asarray(e), np.asarray(J)
 
         gates = [np.vstack([p.gates, d.gates]) for p, d in zip(parameter_sets, directions, strict=True)]

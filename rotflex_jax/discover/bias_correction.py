@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 
 from rotflex_jax.discover.batched_predictor import BatchedPredictor
+from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import MIN_DECREASE_NATS, moved, step_limit, whitened_sums
+from rotflex_jax.discover.refit import MAX_COORDINATE_STEP, MIN_DECREASE_NATS
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
 
@@ -40,15 +41,21 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
         return h
     solver = dataclasses.replace(predictor.solver, substeps=SUBSTEP_FACTOR * predictor.solver.substeps)
     fine = dataclasses.replace(problem, predictor=BatchedPredictor(s, solver, predictor.data))
+    coordinates = FitCoordinates.of(h, problem.windows)
     _, J = problem.slopes([h])
     W = h.whitener(J[0, : h.moved], seen)
 
     def linearise(x: Hypothesis) -> NormalEquations:
         w = h.whitener(fine.innovations([x])[0], seen)
-        H, g = whitened_sums(h, w, W)
+        H, g = coordinates.sums(w, W)
         return NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H)
 
     found = minimise(
-        linearise, h, CORRECTION_RULES, limit=step_limit(h), move=moved, max_steps=MAX_CORRECTION_STEPS
+        linearise,
+        h,
+        CORRECTION_RULES,
+        limit=coordinates.step_limit(MAX_COORDINATE_STEP),
+        move=coordinates.moved,
+        max_steps=MAX_CORRECTION_STEPS,
     )
     return h if found.x is h else problem.evaluated(found.x, problem.innovations([found.x])[0])

@@ -38,7 +38,7 @@ class Discovery(SearchResult):
 
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
         """Torques that the baseline and the final model lack, on a fitted and a held-out recording."""
-        longest = [max(group, key=lambda r: r.N) for group in (self.train, self.test)]
+        longest = [max(group, key=lambda r: r.N) for group in (self.train, self.validation)]
         return compare_latent_torques(self.baseline, self.final if self.rounds else None, longest, progress)
 
     def learned_torque(
@@ -51,7 +51,9 @@ class Discovery(SearchResult):
             progress: Called with a line of text at each stage.
         """
         seconds = self.baseline.window_seconds
-        return learn_torque(self.model, self.train, self.test, at, window_seconds=seconds, progress=progress)
+        return learn_torque(
+            self.model, self.train, self.validation, at, window_seconds=seconds, progress=progress
+        )
 
     def explanation(self, learned: bool | None = None) -> Explanation:
         """Everything that a report needs beyond the search itself; takes about a minute.

@@ -30,8 +30,8 @@ def remaining_failures(found: SearchResult) -> tuple[Where, ...]:
     """Where the final model fails on the longest held-out recording, if something is left unexplained."""
     if found.verdict != Verdict.UNEXPLAINED or not found.rounds:
         return ()
-    i = max(range(len(found.test)), key=lambda k: found.test[k].N)
-    recording, final = found.test[i], found.final
+    i = max(range(len(found.validation)), key=lambda k: found.validation[k].N)
+    recording, final = found.validation[i], found.final
     mechanism = final.model.mechanism
     return locate(
         recording,

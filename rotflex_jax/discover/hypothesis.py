@@ -24,11 +24,13 @@ class Hypothesis:
         local: Parameters that each recording has for itself and that are fitted.
         z: Unconstrained values of all parameters.
         local_z: Unconstrained values of the local parameters of each recording.
-        x0: First states: positions, speeds, and what else the reduced model has.
-        K: Gains of the predictor.
+        x0: First states of the windows: positions, speeds, and what else the reduced model has.
+        K: Gains of the predictor; zero for free runs.
         process_noise: Port -> intensity that gave `K` [(N m)^2 s].
         whitener: Fixed while parameters move.
         densities: Log-likelihood of each sample [nat]; minus infinity before it is evaluated.
+        blocks: What each half second says for the hypothesis, to be compared with another one on the same
+            recordings: its log-likelihood [nat], or for free runs minus the logarithm of its error.
     """
 
     locations: tuple[EffectLocation, ...]
@@ -36,17 +38,18 @@ class Hypothesis:
     local: tuple[int, ...]
     z: Float[np.ndarray, " P"]
     local_z: Float[np.ndarray, "R L"]
-    x0: Float[np.ndarray, "R m"]
+    x0: Float[np.ndarray, "R W m"]
     K: Float[np.ndarray, "R n C"]
     process_noise: dict[str, float]
     whitener: Whitener
     densities: Float[np.ndarray, "R N"] | Float[np.ndarray, ""] = dataclasses.field(
         default_factory=lambda: np.array(-np.inf)
     )
+    blocks: Float[np.ndarray, " B"] = dataclasses.field(default_factory=lambda: np.zeros(0))
 
     def initial_state_for(
         self, s: SuperModel, locations: tuple[EffectLocation, ...]
-    ) -> Float[np.ndarray, "R m"]:
+    ) -> Float[np.ndarray, "R W m"]:
         """First states with other effects on: what both have as it is, the rest at rest."""
         return embed_initial_state(s, locations, self.x0, self.locations)
 
@@ -78,11 +81,11 @@ class Hypothesis:
     @property
     def moved(self) -> int:
         """Number of directions that a fit moves: common, then local, then first states."""
-        return len(self.free) + len(self.local) + self.x0.shape[1]
+        return len(self.free) + len(self.local) + self.x0.shape[-1]
 
     def directions(self, s: SuperModel, count: int) -> Directions:
         """Directions of all that a fit moves, in unconstrained coordinates, filled up with zeros."""
-        (R, m), P, E = self.x0.shape, len(self.z), len(s.mechanism.effects)
+        (R, _, m), P, E = self.x0.shape, len(self.z), len(s.mechanism.effects)
         derivative = self.physical(s)[1]
         d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
         for k, i in enumerate((*self.free, *self.local)):
@@ -95,9 +98,9 @@ class Hypothesis:
 def embed_initial_state(
     s: SuperModel,
     locations: tuple[EffectLocation, ...],
-    x0: Float[np.ndarray, "R k"],
+    x0: Float[np.ndarray, "*batch k"],
     of: tuple[EffectLocation, ...] = (),
-) -> Float[np.ndarray, "R m"]:
+) -> Float[np.ndarray, "*batch m"]:
     """First states with some effects on from those with other effects on.
 
     Args:
@@ -107,9 +110,9 @@ def embed_initial_state(
         of: What is switched on where they come from.
     """
     before, after = (list(s.active(s.gates(on)).states) for on in (of, locations))
-    full = np.tile(rest_state(s.mechanism.structure, np.float64), (len(x0), 1))
-    full[:, before[: x0.shape[1]]] = x0
-    return full[:, after]
+    full = np.tile(rest_state(s.mechanism.structure, np.float64), (*x0.shape[:-1], 1))
+    full[..., before[: x0.shape[-1]]] = x0
+    return full[..., after]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,6 +189,20 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
         free=tuple(i for i in h.free if i not in removed),
         local=tuple(h.local[k] for k in kept),
         local_z=h.local_z[:, kept],
+    )
+
+
+def with_all_calibrations(s: SuperModel, h: Hypothesis) -> Hypothesis:
+    """The hypothesis with every calibration of the super-model, those that it lacks at zero."""
+    missing = [p for p in s.calibrations if p not in h.locations]
+    added = tuple(i for p in missing for i in s.parameter_indices(p))
+    locations = (*h.locations, *missing)
+    return dataclasses.replace(
+        h,
+        locations=locations,
+        local=(*h.local, *added),
+        local_z=np.hstack([h.local_z, np.zeros((len(h.x0), len(added)))]),
+        x0=h.initial_state_for(s, locations),
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
+from rotflex_jax.discover.evaluation import evaluate
 from rotflex_jax.discover.formula import Formula, Term, read_formula
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.result import Stage
@@ -14,7 +15,7 @@ from rotflex_jax.discover.selection import paired_gain
 from rotflex_jax.discover.spline_map import fit_map, position_differences
 from rotflex_jax.discover.stepwise import fit_baseline
 from rotflex_jax.discover.supermodel import build, motion, scales
-from rotflex_jax.discover.validation import ValidationSet, evaluate, validate
+from rotflex_jax.discover.validation import ValidationSet, validate
 from rotflex_jax.effects import LearnedTorque, Viscous
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare, process_noise_ports

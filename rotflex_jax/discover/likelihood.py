@@ -1,19 +1,29 @@
-"""The likelihood of recordings under a hypothesis: gains of its predictor, whitener, log-likelihood."""
+"""The likelihood of recordings under a hypothesis: gains of its predictor, whitener, log-likelihood.
+
+Two horizons have a say in a search. The one-step prediction uses every sample, but where another part of the
+model is wrong its state follows the data within a few samples, and what acts slowly is no longer seen. A free
+run over a few seconds shows what acts slowly. It is a predictor with no gain, which starts again at each
+window; as its errors are alike from sample to sample, its likelihood is that of independent errors in name
+only, and gains of it count by their scatter between blocks of time.
+"""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from rotflex_jax.discover.batched_predictor import BatchedPredictor
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, ParameterSet
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.supermodel import SuperModel
-from rotflex_jax.discover.whitening import fit_whitener, log_likelihood
-from rotflex_jax.fit.dataset import Dataset
+from rotflex_jax.discover.whitening import Whitener, fit_whitener
+from rotflex_jax.discover.windows import Windows
+from rotflex_jax.fit.dataset import Dataset, StackedRecordings
 from rotflex_jax.mechanism import Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
 
+# Hypotheses are compared block by block, so that the scatter shows what is chance.
+BLOCK_SECONDS = 0.5
 # Least and largest process torque, as shares of the intensity that a torque as large as the motor's, drawn
 # again at each sample, would have.
 MIN_PROCESS_NOISE_SHARE, MAX_PROCESS_NOISE_SHARE = 1e-9, 1e-3
@@ -27,18 +37,51 @@ class LikelihoodProblem:
         predictor: Runs hypotheses on the dataset.
         dataset: The recordings, with the noise and the torque that scale the comparison.
         ports: Ports at which process torques act.
+        windows: Where runs start again.
+        free_run: Whether no measurement corrects the state.
     """
 
     predictor: BatchedPredictor
     dataset: Dataset
     ports: tuple[str, ...]
+    windows: Windows
+    free_run: bool = False
 
     @classmethod
     def of(
-        cls, supermodel: SuperModel, solver: Solver, dataset: Dataset, ports: tuple[str, ...]
+        cls,
+        supermodel: SuperModel,
+        solver: Solver,
+        dataset: Dataset,
+        ports: tuple[str, ...],
+        number: int = 1,
     ) -> "LikelihoodProblem":
-        """The problem of a super-model on a dataset."""
-        return cls(BatchedPredictor(supermodel, solver, dataset.data), dataset, ports)
+        """The one-step prediction of a dataset by a super-model; `number` as in `Windows.whole`."""
+        predictor = BatchedPredictor(supermodel, solver, dataset.data)
+        return cls(predictor, dataset, ports, Windows.whole(dataset, number))
+
+    def of_free_runs(self, windows: Windows) -> "LikelihoodProblem":
+        """The likelihood of free runs over windows, with the same compiled programs."""
+        return dataclasses.replace(self, windows=windows, free_run=True)
+
+    def first_seconds(self, seconds: float) -> "LikelihoodProblem":
+        """The same with the first seconds of each recording alone; nothing after them counts."""
+        data = self.dataset.data
+        return self.counting(np.arange(data.u.shape[1]) * data.Ts[:, None] < seconds)
+
+    def of_recordings(self, chosen: Sequence[int]) -> "LikelihoodProblem":
+        """The same with some recordings alone; the others stay in place, for the sake of compiled code."""
+        return self.counting(np.isin(np.arange(len(self.seen)), chosen)[:, None])
+
+    def counting(self, samples: Bool[np.ndarray, "R #N"]) -> "LikelihoodProblem":
+        """The same where only some samples count."""
+        data = self.dataset.data
+        data = data._replace(seen=data.seen * samples)
+        return dataclasses.replace(
+            self,
+            predictor=dataclasses.replace(self.predictor, data=data),
+            dataset=dataclasses.replace(self.dataset, data=data),
+        )
 
     @property
     def supermodel(self) -> SuperModel:
@@ -87,6 +130,9 @@ class LikelihoodProblem:
     ) -> list[Float[np.ndarray, "R n C"]]:
         """Gains of the baseline's linear part, one array per intensity."""
         s, periods = self.supermodel, np.asarray(self.dataset.data.Ts).tolist()
+        if self.free_run:
+            shape = (len(periods), Layout.of(s.mechanism.structure).size, len(self.noise))
+            return [np.zeros(shape) for _ in intensities]
         mechanism = s.clean(h.values(s).mean(axis=0), ())
         by_period = {Ts: kalman_gains(mechanism, intensities, self.noise, Ts) for Ts in set(periods)}
         K = np.stack([by_period[Ts] for Ts in periods], axis=1)
@@ -96,7 +142,11 @@ class LikelihoodProblem:
 
     def innovations(self, hypotheses: Sequence[Hypothesis]) -> Float[np.ndarray, "H R N C"]:
         """Innovations of hypotheses."""
-        return self.predictor.innovations([h.parameter_set(self.supermodel) for h in hypotheses])
+        return self.innovations_of([h.parameter_set(self.supermodel) for h in hypotheses])
+
+    def innovations_of(self, parameter_sets: list[ParameterSet]) -> Float[np.ndarray, "L R N C"]:
+        """Innovations of parameter sets."""
+        return self.predictor.innovations(parameter_sets, self.windows.index)
 
     def slopes(
         self, hypotheses: Sequence[Hypothesis], count: int = 0
@@ -104,14 +154,21 @@ class LikelihoodProblem:
         """Innovations and their slopes along all that a fit moves, padded to `count` directions at least."""
         s, count = self.supermodel, max(count, self.direction_count, *(h.moved for h in hypotheses))
         directions = [h.directions(s, count) for h in hypotheses]
-        return self.predictor.slopes([h.parameter_set(s) for h in hypotheses], directions)
+        parameter_sets = [h.parameter_set(s) for h in hypotheses]
+        return self.predictor.slopes(parameter_sets, directions, self.windows.index)
+
+    def whitener(self, e: Float[np.ndarray, "R N C"]) -> Whitener:
+        """The whitener that innovations give; of free runs the scale of each channel alone."""
+        return fit_whitener(e, self.seen, self.noise, channels_apart=self.free_run)
 
     def log_likelihood(self, e: Float[np.ndarray, "R N C"]) -> float:
         """Log-likelihood of innovations under the whitener that they give [nat].
 
         Minus infinity where a run diverges.
         """
-        return log_likelihood(e, self.seen, self.noise) if np.all(np.isfinite(e)) else -np.inf
+        if not np.all(np.isfinite(e)):
+            return -np.inf
+        return float(np.sum(self.whitener(e).log_densities(e, self.seen)))
 
     def log_likelihoods(self, hypotheses: Sequence[Hypothesis]) -> Float[np.ndarray, " H"]:
         """Log-likelihoods of hypotheses as they are [nat], each with the whitener that it gives."""
@@ -119,5 +176,33 @@ class LikelihoodProblem:
 
     def evaluated(self, h: Hypothesis, e: Float[np.ndarray, "R N C"]) -> Hypothesis:
         """The hypothesis with the whitener and the likelihood that its innovations give."""
-        whitener = fit_whitener(e, self.seen, self.noise)
-        return dataclasses.replace(h, whitener=whitener, densities=whitener.log_densities(e, self.seen))
+        if not np.all(np.isfinite(e)):
+            scale = Whitener(np.ones((len(self.noise), 1)), np.diag(1 / self.noise))
+            return dataclasses.replace(h, whitener=scale, densities=np.array(-np.inf))
+        whitener = self.whitener(e)
+        densities = whitener.log_densities(e, self.seen)
+        blocks = self._error_blocks(e) if self.free_run else in_blocks(densities, self.dataset.data)
+        return dataclasses.replace(h, whitener=whitener, densities=densities, blocks=blocks)
+
+    def _error_blocks(self, e: np.ndarray) -> np.ndarray:
+        """Minus the logarithm of the error of each block, mean over channels.
+
+        Errors of free runs are alike from sample to sample and large where the model drifts: as densities, a
+        few blocks would decide. What counts is by which factor the error falls, in every block alike.
+        """
+        data = self.dataset.data
+        counts = in_blocks(data.seen, data)
+        channels = np.moveaxis(e, -1, 0)
+        squares = np.array([in_blocks(c**2 * data.seen, data) / np.maximum(counts, 1) for c in channels])
+        return -0.5 * np.mean(np.log(squares + self.noise[:, None] ** 2), axis=0)
+
+
+def in_blocks(values: Float[np.ndarray, "R N"], data: StackedRecordings) -> Float[np.ndarray, " B"]:
+    """Sums over blocks; the last, shorter block of each recording joins its neighbour."""
+    out = []
+    for row, seen, Ts in zip(values, data.seen, data.Ts, strict=True):
+        N = int(seen.sum())
+        width = max(round(BLOCK_SECONDS / float(Ts)), 1)
+        edges = np.arange(0, max(N - width, 0) + 1, width)
+        out.append(np.add.reduceat(row[:N], edges) if N else np.zeros(0))
+    return np.concatenate(out)

@@ -37,7 +37,7 @@ def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
     pairs = [((r.effect, r.port), r.equivalent[0]) for r in found.rounds if r.equivalent]
     if not pairs:
         return None
-    recordings = (*found.train, *found.test)
+    recordings = (*found.train, *found.validation)
     longest = max(recordings, key=lambda r: r.N)
     first, second = pairs[0]
     settings: dict[str, Any] = {

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
@@ -22,43 +23,6 @@ MAX_STEPS = 12
 MAX_COORDINATE_STEP = 1.0
 # Alternations of a refit beyond the usual number, and what such a one has to gain [nat].
 EXTRA_ALTERNATIONS, EXTRA_ALTERNATION_NATS = 5, 10.0
-
-
-def whitened_sums(
-    h: Hypothesis, w: Float[np.ndarray, "R N C"], W: Float[np.ndarray, "D R N C"]
-) -> tuple[Float[np.ndarray, "M M"], Float[np.ndarray, " M"]]:
-    """`J'J` and `J'w` of whitened innovations and slopes, by the M coordinates of a fit.
-
-    Directions of local parameters and first states belong to one recording each: they make a block of
-    coordinates for each recording.
-    """
-    shared, R = len(h.free), w.shape[0]
-    each = h.moved - shared
-    size = shared + R * each
-    H, g = np.zeros((size, size)), np.zeros(size)
-    for r in range(R):
-        J = W[: h.moved, r].reshape(h.moved, -1)
-        G, b = J @ J.T, J @ w[r].ravel()
-        where = np.r_[:shared, shared + r * each : shared + (r + 1) * each]
-        H[np.ix_(where, where)] += G
-        g[where] += b
-    return H, g
-
-
-def moved(h: Hypothesis, step: Float[np.ndarray, " M"]) -> Hypothesis:
-    """The hypothesis after a step in its coordinates."""
-    shared, local = len(h.free), len(h.local)
-    z = h.z.copy()
-    z[list(h.free)] += step[:shared]
-    rest = step[shared:].reshape(len(h.x0), -1)
-    return dataclasses.replace(h, z=z, local_z=h.local_z + rest[:, :local], x0=h.x0 + rest[:, local:])
-
-
-def step_limit(h: Hypothesis) -> Float[np.ndarray, " M"]:
-    """Largest step of each coordinate of a fit: parameters have one, first states do not."""
-    each = np.full((len(h.x0), h.moved - len(h.free)), np.inf)
-    each[:, : len(h.local)] = MAX_COORDINATE_STEP
-    return np.concatenate([np.full(len(h.free), MAX_COORDINATE_STEP), each.ravel()])
 
 
 @dataclasses.dataclass
@@ -80,11 +44,14 @@ def levenberg_marquardt(
     """Fit all hypotheses with whiteners and process noise held; returns them with new whiteners."""
     seen, count = problem.seen, max(h.moved for h in hypotheses)
 
+    def coordinates(h: Hypothesis) -> FitCoordinates:
+        return FitCoordinates.of(h, problem.windows)
+
     def linearise(points: list[_Point]) -> list[NormalEquations]:
         equations = []
         for p, e, J in zip(points, *problem.slopes([p.hypothesis for p in points], count), strict=True):
             h, w = p.hypothesis, p.whitened(e, seen)
-            H, g = whitened_sums(h, w, h.whitener(J[: h.moved], seen))
+            H, g = coordinates(h).sums(w, h.whitener(J[: h.moved], seen))
             equations.append(NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H))
         return equations
 
@@ -97,9 +64,9 @@ def levenberg_marquardt(
         linearise,
         [_Point(h) for h in hypotheses],
         REFIT_RULES,
-        limit=lambda i: step_limit(hypotheses[i]),
+        limit=lambda i: coordinates(hypotheses[i]).step_limit(MAX_COORDINATE_STEP),
         costs=costs,
-        move=lambda p, step: _Point(moved(p.hypothesis, step)),
+        move=lambda p, step: _Point(coordinates(p.hypothesis).moved(p.hypothesis, step)),
         max_steps=max_steps,
     )
     return [problem.evaluated(m.x.hypothesis, m.x.innovations) for m in found]
@@ -125,6 +92,8 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
     Zero is a free run, a large intensity follows the data within a few samples. Where the model is right, the
     smallest value of the grid is the likeliest; where another one is, something is missing.
     """
+    if problem.free_run:
+        return h
     least, most = problem.process_noise_range
     tried: list[dict[str, float]] = []
     if wide:
@@ -145,7 +114,7 @@ def _likeliest(
     if not new:
         return h
     gains, parameter_set = problem.gains(h, new), h.parameter_set(problem.supermodel)
-    es = problem.predictor.innovations([parameter_set._replace(K=K) for K in gains])
+    es = problem.innovations_of([parameter_set._replace(K=K) for K in gains])
     likelihoods = [problem.log_likelihood(e) for e in es]
     best, first = int(np.argmax(likelihoods)), not tried
     tried += new

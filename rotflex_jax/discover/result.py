@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +12,18 @@ from rotflex_jax.experiment import Experiment
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
+
+
+class RunErrors(NamedTuple):
+    """Root mean square errors of free runs.
+
+    Attributes:
+        whole: Channel -> error of one free run over each recording.
+        windows: Channel -> error of free runs that start again every few seconds.
+    """
+
+    whole: dict[str, float]
+    windows: dict[str, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +41,14 @@ class Stage:
         process_noise: Port -> intensity of the process torque that the data ask for [(N m)^2 s]; small
             where the model is right.
         process_noise_nats: Log-likelihood that the process torque gains; near zero where the model is right.
-        log_likelihood: Of the validation recordings [nat].
+        log_likelihood: Of the validation recordings at this horizon [nat].
+        horizon: What the parameters were fitted to: "prediction", or "free_run" where short free runs over
+            the validation recordings are then clearly better.
+        calibrated: The validation errors where each recording has the offsets that its own first
+            `calibrate_seconds` give.
+        test: Errors on recordings that had no say in the choice of the model, if there are any.
+        test_calibrated: The same with each recording's own offsets.
+        calibrate_seconds: What a recording's own offsets are fitted to [s].
     """
 
     model: Model
@@ -42,16 +61,42 @@ class Stage:
     process_noise: dict[str, float]
     process_noise_nats: float
     log_likelihood: float
+    horizon: str = "prediction"
+    calibrated: RunErrors | None = None
+    test: RunErrors | None = None
+    test_calibrated: RunErrors | None = None
+    calibrate_seconds: float = 0.0
 
     def errors(self) -> dict[str, Any]:
-        """The two validation errors as plain JSON."""
-        return {
-            "held_out_rmse": plain(self.held_out_rmse),
-            "held_out_rmse_windows": {
-                "seconds": self.window_seconds,
-                **plain(self.held_out_rmse_windows),
-            },
+        """All errors as plain JSON."""
+        named = {
+            "held_out_rmse": (RunErrors(self.held_out_rmse, self.held_out_rmse_windows), ""),
+            "held_out_rmse_calibrated": (self.calibrated, "_calibrated"),
+            "test_rmse": (self.test, ""),
+            "test_rmse_calibrated": (self.test_calibrated, "_calibrated"),
         }
+        out: dict[str, Any] = {}
+        for name, (errors, suffix) in named.items():
+            if errors is not None:
+                windows = name.removesuffix(suffix) + "_windows" + suffix
+                out[name] = plain(errors.whole)
+                out[windows] = {"seconds": self.window_seconds, **plain(errors.windows)}
+        return out
+
+
+class HorizonGain(NamedTuple):
+    """What an effect gains on validation data at one horizon, with parameters fitted for it.
+
+    Attributes:
+        gain: Log-likelihood of predictions [nat], or for free runs the fall of the logarithm of the error,
+            summed over half seconds.
+        z: How many standard deviations of its scatter over half seconds that is.
+        error_ratio: Error of short free runs with the effect over that without it.
+    """
+
+    gain: float
+    z: float
+    error_ratio: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +113,9 @@ class Round:
         held_out_gain_nats: Gain in log-likelihood of the validation recordings [nat].
         sentence: What was found, in words.
         equation: Its equation.
+        doubt: Why the effect may stand in for something else; empty where nothing speaks for that.
+        prediction: What it gained as a predictor when it was added; None for a calibration.
+        free_run: What it gained in free runs.
     """
 
     effect: str
@@ -79,6 +127,14 @@ class Round:
     held_out_gain_nats: float
     sentence: str
     equation: str
+    doubt: str = ""
+    prediction: HorizonGain | None = None
+    free_run: HorizonGain | None = None
+
+    @property
+    def status(self) -> str:
+        """`established`, or `provisional` where the effect may stand in for something else."""
+        return "provisional" if self.doubt else "established"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""
@@ -91,7 +147,14 @@ class Round:
             "evidence": {
                 "score": _number(self.score),
                 "held_out_gain_nats": _number(self.held_out_gain_nats),
+                **{
+                    name: {"gain": _number(g.gain), "z": _number(g.z), "error_ratio": _number(g.error_ratio)}
+                    for name, g in (("prediction", self.prediction), ("free_run", self.free_run))
+                    if g is not None
+                },
             },
+            "status": self.status,
+            "doubt": self.doubt,
             "sentence": self.sentence,
             "equation": self.equation,
         }
@@ -108,6 +171,7 @@ class Ranked:
         excited: False where this recording could not have shown an effect of a plausible size.
         unconfounded: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
         smallest: Detection limit: factor of a plausible size that would just have been visible.
+        score_free_run: The same score of free runs over some seconds [nat]; None where there was none.
     """
 
     effect: str
@@ -116,6 +180,7 @@ class Ranked:
     excited: bool
     unconfounded: float
     smallest: float
+    score_free_run: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""
@@ -123,6 +188,7 @@ class Ranked:
             "effect": self.effect,
             "port": self.port,
             "score": _number(self.score),
+            "score_free_run": None if self.score_free_run is None else _number(self.score_free_run),
             "excited": self.excited,
             "unconfounded": _number(self.unconfounded),
         }
@@ -189,7 +255,7 @@ class SearchResult:
         verdict: Speaks of the end state.
         sentence: The verdict in words.
         train: Recordings that were fitted.
-        test: Validation recordings.
+        validation: Recordings that no fit saw, but that decided between models.
         baseline: The user's model, fitted.
         rounds: What was added, in order.
         ranking: All candidates in the score test of the baseline, best first.
@@ -198,12 +264,13 @@ class SearchResult:
         elapsed_s: Time taken [s].
         notes: Remarks for a reader.
         proposal: Where two effects remain: the standard input that distinguishes them best.
+        test: Recordings that had no say in anything.
     """
 
     verdict: Verdict
     sentence: str
     train: tuple[Recording, ...]
-    test: tuple[Recording, ...]
+    validation: tuple[Recording, ...]
     baseline: Stage
     rounds: tuple[Round, ...]
     ranking: tuple[Ranked, ...]
@@ -212,6 +279,7 @@ class SearchResult:
     elapsed_s: float
     notes: tuple[str, ...] = ()
     proposal: Experiment | None = None
+    test: tuple[Recording, ...] = ()
 
     @property
     def model(self) -> Model:

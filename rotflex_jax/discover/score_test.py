@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, restrict
+from rotflex_jax.discover.coordinates import FitCoordinates, Projection
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ReducedModel, SuperModel
@@ -37,14 +38,19 @@ from rotflex_jax.runtime.xla import double_precision
 
 @persistent_jit(static=2)
 def _run_slopes(
-    structure: Mechanism, solver: Solver, parameter_set: ParameterSet, data: StackedRecordings
+    structure: Mechanism,
+    solver: Solver,
+    parameter_set: ParameterSet,
+    data: StackedRecordings,
+    window: jax.Array,
 ) -> jax.Array:
     def one(values: Any, x0: Any, K: Any, *samples: Any) -> Any:
         return predictor_jacobians(
             structure, solver, RunParameters(values, parameter_set.gates, x0, K), RecordingSamples(*samples)
         )
 
-    return each_recording(one, (0,) * 7)(parameter_set.values, parameter_set.x0, parameter_set.K, *data)
+    p = parameter_set
+    return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
 
 
 @persistent_jit(static=2)
@@ -56,15 +62,16 @@ def _inactive_slopes(
     A: jax.Array,
     directions: Directions,
     data: StackedRecordings,
+    window: jax.Array,
 ) -> jax.Array:
     def one(values: Any, x0: Any, K: Any, A: Any, dvalues: Any, *samples: Any) -> Any:
-        rest = jnp.asarray(rest_state(structure, np.float64))
-        numbers = RunParameters(values, parameter_set.gates, rest.at[present].set(x0), K)
+        rest = jnp.broadcast_to(rest_state(structure, np.float64), (len(x0), K.shape[0]))
+        numbers = RunParameters(values, parameter_set.gates, rest.at[:, present].set(x0), K)
         slopes = (present, A, dvalues, directions.gates)
         return inactive_sensitivities(structure, solver, numbers, RecordingSamples(*samples), *slopes)
 
-    J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0), out_axes=1)(
-        parameter_set.values, parameter_set.x0, parameter_set.K, A, directions.values, *data
+    J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0, 0), out_axes=1)(
+        parameter_set.values, parameter_set.x0, parameter_set.K, A, directions.values, *data, window
     )
     return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
 
@@ -84,7 +91,10 @@ class InactiveCandidates(NamedTuple):
 
 
 def candidate_sensitivities(
-    predictor: BatchedPredictor, current: ParameterSet, batches: Sequence[InactiveCandidates]
+    predictor: BatchedPredictor,
+    current: ParameterSet,
+    batches: Sequence[InactiveCandidates],
+    window: Int[np.ndarray, "R N"],
 ) -> Float[np.ndarray, "B D R N C"]:
     """Slopes of innovations along candidates that are not active.
 
@@ -92,12 +102,13 @@ def candidate_sensitivities(
         predictor: Runs hypotheses.
         current: The hypothesis as it is.
         batches: What to probe.
+        window: Window of each sample.
     """
     s = predictor.supermodel
     active = s.active(current.gates)
     with double_precision():
         structure, inputs = active.mechanism.structure, restrict(current, active)
-        A = _run_slopes(structure, predictor.solver, inputs, predictor.on_device())
+        A = _run_slopes(structure, predictor.solver, inputs, predictor.on_device(), jnp.asarray(window))
 
     def run(job: tuple[ReducedModel, InactiveCandidates]) -> np.ndarray:
         model, (_, parameter_set, d) = job
@@ -106,7 +117,8 @@ def candidate_sensitivities(
             present = jnp.array([model.states.index(i) for i in active.states])
             structure, inputs = model.mechanism.structure, restrict(parameter_set, model)
             solver, data = predictor.solver, predictor.on_device()
-            return np.asarray(_inactive_slopes(structure, solver, inputs, present, A, along, data))
+            given = (present, A, along, data, jnp.asarray(window))
+            return np.asarray(_inactive_slopes(structure, solver, inputs, *given))
 
     jobs = [(s.with_family(current.gates, b.family), b) for b in batches]
     return np.stack(predictor.run_jobs(run, jobs, lambda job: ("probes", active.effects, job[0].effects)))
@@ -183,7 +195,7 @@ def _with_probes(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> Paramete
 
 def _directions(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> Directions:
     """Directions of probes: along amplitudes by their values, along effects without any by the gate."""
-    D, (R, m), P, E = PROBES_PER_BATCH, h.x0.shape, len(h.z), len(s.mechanism.effects)
+    D, (R, _, m), P, E = PROBES_PER_BATCH, h.x0.shape, len(h.z), len(s.mechanism.effects)
     d = Directions(np.zeros((D, R, P)), np.zeros((D, m)), np.zeros((D, E)))
     for row, p in enumerate(probes):
         c = p.candidate
@@ -206,25 +218,25 @@ def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
     batches = [(family, probes) for family in families for probes in _packed(family)]
     e, J = problem.slopes([h])
     w = h.whitener(e[0], seen)
-    nuisance = _expanded(h, h.whitener(J[0, : h.moved], seen))
+    coordinates = FitCoordinates.of(h, problem.windows)
+    orthogonal = coordinates.orthogonal_to(h.whitener(J[0, : h.moved], seen))
     jobs = [
         InactiveCandidates(family, _with_probes(s, h, probes), _directions(s, h, probes))
         for family, probes in batches
     ]
-    slopes = candidate_sensitivities(problem.predictor, h.parameter_set(s), jobs) if jobs else ()
-    Q = np.linalg.qr(nuisance.T / np.maximum(np.linalg.norm(nuisance, axis=1), 1e-300))[0]
-    r = w.ravel()
-    r = r - Q @ (Q.T @ r)
+    index = problem.windows.index
+    slopes = candidate_sensitivities(problem.predictor, h.parameter_set(s), jobs, index) if jobs else ()
     columns: dict[tuple[EffectLocation, int], list[np.ndarray]] = {}
     for (_, probes), J in zip(batches, slopes, strict=True):
-        W = h.whitener(J[: len(probes)], seen).reshape(len(probes), -1)
+        W = h.whitener(J[: len(probes)], seen)
         for p, column in zip(probes, W, strict=True):
             columns.setdefault((p.candidate.location, p.shape), []).append(column)
     for key, change in _changes(problem, h, e[0], [c for c in candidates if c.threshold]):
-        columns[key] = [h.whitener(change, seen).ravel()]
+        columns[key] = [h.whitener(change, seen)]
     headroom = float(np.exp(h.whitener.log_det / (2 * e.shape[-1])) / np.exp(np.mean(np.log(problem.noise))))
-    projection = _Projection(Q, r, columns, problem.measured_values, max(headroom, 1.0))
-    return sorted((_score(c, projection) for c in candidates), key=lambda found: -found.nats)
+    r = orthogonal(w[None])[0]
+    projected = _Projected(r, orthogonal, columns, problem.measured_values, max(headroom, 1.0))
+    return sorted((_score(c, projected) for c in candidates), key=lambda found: -found.nats)
 
 
 def _changes(
@@ -241,69 +253,57 @@ def _changes(
             x0 = h.initial_state_for(s, locations)
             parameter_sets.append(ParameterSet(values, x0, s.gates(locations), h.K))
     if parameter_sets:
-        yield from zip(keys, problem.predictor.innovations(parameter_sets) - e, strict=True)
-
-
-def _expanded(h: Hypothesis, W: np.ndarray) -> np.ndarray:
-    """Nuisance directions as rows (D', R N C); local ones once per recording."""
-    shared, R = len(h.free), W.shape[1]
-    rows = [W[k].ravel() for k in range(shared)]
-    for k in range(shared, h.moved):
-        for r in range(R):
-            one = np.zeros_like(W[k])
-            one[r] = W[k, r]
-            rows.append(one.ravel())
-    return np.array(rows)
+        yield from zip(keys, problem.innovations_of(parameter_sets) - e, strict=True)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Projection:
+class _Projected:
     """The innovations less what the hypothesis can still explain, and the slopes of all candidates.
 
     Attributes:
-        Q: Orthonormal basis of what the hypothesis can still move.
-        r: Whitened innovations less their projection on Q.
+        r: Whitened innovations less what the hypothesis can still explain.
+        orthogonal: Takes what the hypothesis can still explain away.
         columns: (location, shape) -> whitened slopes, one per probe.
         samples: How many values were measured.
         headroom: Innovations over sensor noise: how much smaller they would be if the model were right.
     """
 
-    Q: Float[np.ndarray, "M D"]
     r: Float[np.ndarray, " M"]
-    columns: dict[tuple[EffectLocation, int], list[Float[np.ndarray, " M"]]]
+    orthogonal: Projection
+    columns: dict[tuple[EffectLocation, int], list[Float[np.ndarray, "R N C"]]]
     samples: float
     headroom: float
 
 
-def _score(c: Candidate, projection: _Projection) -> Score:
+def _score(c: Candidate, projected: _Projected) -> Score:
     """The best shape of a candidate, with starts at the next best ones."""
-    shapes = [_score_of_shape(c, shape, projection) for shape in range(len(c.probes))]
+    shapes = [_score_of_shape(c, shape, projected) for shape in range(len(c.probes))]
     best, *rest = sorted(shapes, key=lambda s: -s.nats)
     others = tuple(s.start.values for s in rest[:EXTRA_SHAPES] if s.start.expected_gain > 0)
     return dataclasses.replace(best, start=dataclasses.replace(best.start, others=others))
 
 
-def _score_of_shape(c: Candidate, shape: int, projection: _Projection) -> Score:
+def _score_of_shape(c: Candidate, shape: int, projected: _Projected) -> Score:
     group = np.array(c.probes[shape], float)
-    J = np.array(projection.columns[(c.location, shape)]).T
+    J = np.array(projected.columns[(c.location, shape)])
     values = group[0].copy()
     if not np.all(np.isfinite(J)):
         start = CandidateStart(c.location, values, expected_gain=-np.inf)
         return Score(start, -np.inf, False, 0.0, np.inf)
-    full = np.linalg.norm(J, axis=0)
-    J = J - projection.Q @ (projection.Q.T @ J)
+    full = np.linalg.norm(J.reshape(len(J), -1), axis=1)
+    J = projected.orthogonal(J).T
     left = np.linalg.norm(J, axis=0)
-    a = _amplitudes(J, projection.r, c)
+    a = _amplitudes(J, projected.r, c)
     a = np.minimum(a, MAX_THRESHOLD_AMPLITUDE) if c.threshold else a
     explained = J @ a
-    gain = float(-explained @ projection.r - 0.5 * explained @ explained)
+    gain = float(-explained @ projected.r - 0.5 * explained @ explained)
     df = max(int(np.count_nonzero(a)), 1) + (1 if len(c.probes) > 1 else 0)
     if any(c.amplitudes):
         values = np.where(c.amplitudes, a @ group, values)
-    strongest = max(float(left.max()) * projection.headroom, 1e-300)
+    strongest = max(float(left.max()) * projected.headroom, 1e-300)
     return Score(
         CandidateStart(c.location, values, expected_gain=gain),
-        gain - 0.5 * df * float(np.log(projection.samples)),
+        gain - 0.5 * df * float(np.log(projected.samples)),
         excited=strongest**2 > DETECTABLE_CHI2,
         orthogonal_fraction=float((left / np.maximum(full, 1e-300)).max()),
         detection_limit=float(np.sqrt(DETECTABLE_CHI2) / strongest),
@@ -322,6 +322,25 @@ def _amplitudes(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:
         drop = np.flatnonzero(keep)[np.argmin(found)]
         keep[drop] = False
     return a
+
+
+def promising_at_both(prediction: list[Score], free_run: list[Score], most: int) -> list[tuple[Score, Score]]:
+    """Candidates worth a refit with their scores of predictions and of free runs, best first.
+
+    Where another part of the model is wrong, either horizon may be led astray: what counts is the share of
+    the best score, summed over both, and the best of each is always among them.
+    """
+    both = (prediction, free_run)
+    worth = [promising(listed, len(listed)) for listed in both]
+    highest = [max((s.nats for s in listed), default=1.0) for listed in worth]
+    share: dict[EffectLocation, float] = {}
+    for listed, best in zip(worth, highest, strict=True):
+        for s in listed:
+            share[s.location] = share.get(s.location, 0.0) + s.nats / best
+    order = sorted(share, key=lambda p: share[p], reverse=True)
+    chosen = [*order[:most], *(listed[0].location for listed in worth if listed)]
+    first, second = ({s.location: s for s in listed} for listed in both)
+    return [(first[p], second[p]) for p in dict.fromkeys(chosen)]
 
 
 def promising(listed: list[Score], most: int) -> list[Score]:

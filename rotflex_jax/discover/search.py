@@ -10,13 +10,31 @@ from jaxtyping import Float
 from rotflex_jax.discover.bias_correction import correct_discretisation_bias
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.end_state import end_state
+from rotflex_jax.discover.evaluation import (
+    Evaluation,
+    disagreement,
+    estimates_of_validation,
+    evaluate,
+    own_estimates,
+    process_noise_gain,
+)
+from rotflex_jax.discover.horizon import Horizon, Horizons, as_prediction, fit_free_runs
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, generalisations, is_physical
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.proposal import with_proposal
-from rotflex_jax.discover.result import Ranked, Round, Stage
-from rotflex_jax.discover.score_test import Score, promising, scores
-from rotflex_jax.discover.selection import choose, describe, validate_from_best_states
+from rotflex_jax.discover.refit import choose_process_noise
+from rotflex_jax.discover.result import HorizonGain, Ranked, Round, Stage
+from rotflex_jax.discover.score_test import Score, promising_at_both, scores
+from rotflex_jax.discover.selection import (
+    best_window_rmse,
+    choose,
+    describe,
+    helps,
+    horizon_gains,
+    runs_clearly_better,
+    validate_from_best_states,
+)
 from rotflex_jax.discover.stepwise import (
     assign_calibrations,
     calibration_notes,
@@ -26,15 +44,10 @@ from rotflex_jax.discover.stepwise import (
     nested_models,
     refit_candidates,
     remaining_rivals,
+    titled,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, build, scales
-from rotflex_jax.discover.validation import (
-    ValidatedHypothesis,
-    ValidationSet,
-    evaluate,
-    own_estimates,
-    validate,
-)
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import padded_length, prepare, process_noise_ports
@@ -42,6 +55,7 @@ from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 from rotflex_jax.runtime.xla import one_thread
@@ -110,11 +124,10 @@ class SearchState:
 
     Attributes:
         model: The user's model.
-        problem: The likelihood of the training recordings.
-        validation: The validation recordings.
+        horizons: The training and validation recordings as predictions and as free runs.
         say: Called with lines of progress.
-        current: The best model so far.
-        ranking: Scores of all candidates beside the baseline.
+        current: The best model so far, fitted at both horizons.
+        ranking: Scores of all candidates beside the baseline, of predictions and of free runs.
         scores: Effects that were added, in order -> the penalised score that put them forward [nat].
         rivals: Effects that were added -> those that were not distinguished from them.
         passed: Baseline and the models after each round.
@@ -122,27 +135,58 @@ class SearchState:
         order: Effects and calibrations of the machine, in order.
         own: Calibrations that belong to the training recordings alone.
         notes: Remarks for a reader.
+        gains: Effects that were added -> what they gained at both horizons.
+        final: The model that is reported, with the parameters of `reported`.
     """
 
     model: Model
-    problem: LikelihoodProblem
-    validation: ValidationSet
+    horizons: Horizons
     say: Progress
     current: ValidatedHypothesis
-    ranking: list[Score] = dataclasses.field(default_factory=list)
+    ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
-    passed: list[Hypothesis] = dataclasses.field(default_factory=list)
+    passed: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
     worth: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     order: list[EffectLocation] = dataclasses.field(default_factory=list)
     own: list[EffectLocation] = dataclasses.field(default_factory=list)
     notes: tuple[str, ...] = ()
+    gains: dict[EffectLocation, tuple[HorizonGain, HorizonGain | None]] = dataclasses.field(
+        default_factory=dict
+    )
+    final: Hypothesis | None = None
+
+    @property
+    def problem(self) -> LikelihoodProblem:
+        """The likelihood of predictions of the training recordings."""
+        return self.horizons.prediction.problem
+
+    @property
+    def validation(self) -> ValidationSet:
+        """Predictions of the validation recordings."""
+        return self.horizons.prediction.validation
+
+    @property
+    def reported(self) -> Horizon:
+        """The horizon whose parameters a user gets: that of predictions, unless free runs are clearly better.
+
+        Where the model is complete both give the same within their scatter, and predictions have the narrower
+        intervals.
+        """
+        runs = self.current.free_run
+        if runs is None or not runs_clearly_better(runs.window_rmse, self.current.window_rmse):
+            return self.horizons.prediction
+        return self.horizons.free_run
+
+    def at(self, horizon: Horizon, found: ValidatedHypothesis) -> ValidatedHypothesis:
+        """A validated structure with the parameters of one horizon."""
+        return found.free_run if horizon is self.horizons.free_run and found.free_run else found
 
     def reached(self, label: str) -> None:
         """Report the error of the current model."""
         channels, recording = self.model.mechanism.channels, self.validation.problem.dataset.recordings[0]
         units = {c: recording.units[recording.channels.index(c)] for c in channels}
-        self.say(milestone(label, channels, units, self.current.window_rmse, self.problem.noise))
+        self.say(milestone(label, channels, units, best_window_rmse(self.current), self.problem.noise))
 
 
 @one_thread
@@ -151,29 +195,36 @@ class SearchState:
 def discover(
     mechanism: Mechanism | Model,
     train: Recording | Sequence[Recording],
-    test: Recording | Sequence[Recording],
+    validation: Recording | Sequence[Recording] = (),
     *,
+    test: Recording | Sequence[Recording] = (),
     candidates: Iterable[tuple[type[Effect], str]] | None = None,
     rounds: int = ROUNDS,
     window_seconds: float = 2.0,
+    calibrate_seconds: float = 2.0,
     progress: Progress | None = None,
 ) -> Discovery:
     """Find the physical effects that a model lacks, and say how sure that is.
 
-    The baseline is fitted as a predictor whose process noise the data choose; all candidate effects are
-    scored at once by the slope of its innovations; the best are refitted; likelihood on validation data
-    decides, for one effect or for a set that the recordings cannot distinguish. Repeated until nothing is
-    gained, then every effect must show that the model is worse without it.
+    The baseline is fitted as a predictor whose process noise the data choose, and to free runs of a few
+    seconds; all candidate effects are scored at once by the slopes of its errors at both horizons; the best
+    are refitted at both; likelihood on validation data decides, for one effect or for a set that the
+    recordings cannot distinguish. Repeated until nothing is gained, then every effect must show that the
+    model is worse without it.
 
     Args:
         mechanism: The user's model; its parameter values are the start.
         train: Recordings to fit.
-        test: Validation recordings, which no fit sees; at most their own first state and offsets are adapted
-            when likelihoods are compared, and only the first `n_init` samples for the errors reported.
+        validation: Recordings that no fit sees and that decide between models; at most their own first state
+            and offsets are adapted when likelihoods are compared, and only the first `n_init` samples for the
+            errors reported. Without any, every training recording validates what was fitted to the others.
+        test: Recordings that have no say in anything; the errors on them are reported beside.
         candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
             answer to those of the flexible joint (`mechanism.roles`).
         rounds: Most effects to add.
-        window_seconds: Length of the windows of the short validation runs [s].
+        window_seconds: Length of short free runs [s].
+        calibrate_seconds: The errors reported as calibrated allow each recording that no fit saw the offsets
+            that its own first seconds give [s]; 0 for none.
         progress: Called with a line of text at each stage.
 
     Returns:
@@ -185,23 +236,24 @@ def discover(
     started, say = time.perf_counter(), progress or (lambda _: None)
     clear_compilation_caches()
     model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
-    problem, validation = _prepare(model, _several(train), _several(test), candidates, window_seconds)
+    horizons = _prepare(model, _several(train), _several(validation), candidates, window_seconds)
     say("fitting the model as it is")
-    state = _fit_as_it_is(model, problem, validation, say)
+    state = _fit_as_it_is(model, horizons, say)
     for number in range(rounds):
-        left = len(problem.supermodel.candidates) - len(state.scores)
+        left = len(state.problem.supermodel.candidates) - len(state.scores)
         say(f"round {number + 1}: scoring {left} candidates")
-        promising_scores, starts = _score_candidates(state)
+        promising_scores, starts, runs_starts = _score_candidates(state)
         if not starts:
             break
         say("refitting " + ", ".join(str(start.location) for start in starts))
-        refitted = _refit(state, starts)
+        refitted = _refit(state, starts, runs_starts)
         if not _decide(state, refitted, promising_scores):
             break
     say("checking that each effect is needed")
     _simplify(state)
     say("simulating the validation recordings")
-    return with_proposal(_report(state, started))
+    evaluation = Evaluation.of(model, horizons, _several(test), calibrate_seconds)
+    return with_proposal(_report(state, evaluation, started))
 
 
 def _several(recordings: Recording | Sequence[Recording]) -> tuple[Recording, ...]:
@@ -214,11 +266,16 @@ def _prepare(
     held_back: tuple[Recording, ...],
     candidates: Iterable[tuple[type[Effect], str]] | None,
     window_seconds: float,
-) -> tuple[LikelihoodProblem, ValidationSet]:
-    """The likelihood of training and of validation recordings under one super-model."""
+) -> Horizons:
+    """Training and validation recordings under one super-model, at both horizons."""
     m = model.mechanism
     if not m.free_names:
         raise InputError("All parameters are trusted, but discovery fits the model; release one.")
+    if not held_back and len(train) < 2:
+        raise InputError(
+            "One recording was given for training and none for validation, but a search decides on data that "
+            "no fit has seen; give a second recording, or the two parts of recording.split(0.7)."
+        )
     check_signs(model, (*train, *held_back))
     dataset = prepare(model, train, length=padded_length(train), noise_of=held_back)
     wanted = list(search_places(m) if candidates is None else candidates)
@@ -227,44 +284,65 @@ def _prepare(
     # The super-model has friction contacts at every port, of which few are ever switched on.
     solver = model.solver
     solver = dataclasses.replace(solver, passes=2) if isinstance(solver, Exponential) else solver
+    problem = LikelihoodProblem.of(supermodel, solver, dataset, ports)
+    if not held_back:
+        return Horizons.of(model, problem, None, window_seconds)
     # One length for both, where that makes no run on training data longer, is compiled for once.
     length = max(padded_length(train), padded_length(held_back))
     of_validation = prepare(model, held_back, length=length, like=dataset)
-    problem = LikelihoodProblem.of(supermodel, solver, dataset, ports)
     other = LikelihoodProblem.of(supermodel, solver, of_validation, ports)
-    return problem, ValidationSet(other, window_seconds)
+    return Horizons.of(model, problem, other, window_seconds)
 
 
-def _fit_as_it_is(
-    model: Model, problem: LikelihoodProblem, validation: ValidationSet, say: Progress
-) -> SearchState:
+def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress) -> SearchState:
     """The user's model, fitted and validated."""
-    current = validate(validation, fit_baseline(problem))
-    state = SearchState(model, problem, validation, say, current, passed=[current.hypothesis])
+    h = fit_baseline(horizons.prediction.problem)
+    current = horizons.validated(h, fit_free_runs(horizons.free_run.problem, h))
+    state = SearchState(model, horizons, say, current, passed=[current])
     state.reached("as it is")
     return state
 
 
-def _score_candidates(state: SearchState) -> tuple[list[Score], list[CandidateStart]]:
-    """Scores worth a refit, and all starts: theirs, and effects that contain one that is on."""
-    listed = scores(state.problem, state.current.hypothesis)
-    state.ranking = state.ranking or listed
-    chosen = promising(listed, REFITTED)
-    further = generalisations(state.problem.supermodel, state.current.hypothesis)
-    known = {s.location for s in chosen}
-    return chosen, [*(s.start for s in chosen), *(c for c in further if c.location not in known)]
-
-
-def _refit(state: SearchState, starts: list[CandidateStart]) -> list[ValidatedHypothesis]:
-    """The current model with each candidate, refitted and validated; those that are not physical left out."""
+def _score_candidates(
+    state: SearchState,
+) -> tuple[list[Score], list[CandidateStart], list[CandidateStart]]:
+    """Scores worth a refit, and starts at both horizons: theirs, and effects that contain one that is on."""
     current, s = state.current, state.problem.supermodel
+    assert current.free_run
+    listed = scores(state.problem, current.hypothesis)
+    runs = scores(state.horizons.free_run.problem, current.free_run.hypothesis)
+    if not state.ranking:
+        by_runs = {x.location: x.nats for x in runs}
+        state.ranking = [(x, by_runs[x.location]) for x in listed]
+    chosen = promising_at_both(listed, runs, REFITTED)
+    known = {x.location for x, _ in chosen}
+    further = [c for c in generalisations(s, current.hypothesis) if c.location not in known]
+    return (
+        [x for x, _ in chosen],
+        [*(x.start for x, _ in chosen), *further],
+        [*(y.start for _, y in chosen), *further],
+    )
+
+
+def _refit(
+    state: SearchState, starts: list[CandidateStart], runs_starts: list[CandidateStart]
+) -> list[ValidatedHypothesis]:
+    """The current model with each candidate, refitted and validated; those that are not physical left out."""
+    current, s, horizons = state.current, state.problem.supermodel, state.horizons
+    assert current.free_run
     grown = refit_candidates(state.problem, current.hypothesis, starts)
+    # A shape that predictions have found is worth a start of free runs.
+    informed = [
+        dataclasses.replace(y, others=(*y.others, h.mean_values(s)[s.parameter_indices(y.location)]))
+        for y, h in zip(runs_starts, grown, strict=True)
+    ]
+    runs = refit_candidates(horizons.free_run.problem, current.free_run.hypothesis, informed)
     validated = [
         dataclasses.replace(
-            validate(state.validation, h, current), location=c.location, parameter_count=len(c.values)
+            horizons.validated(h, f, current), location=c.location, parameter_count=len(c.values)
         )
-        for h, c in zip(grown, starts, strict=True)
-        if is_physical(s, h, c.location)
+        for h, f, c in zip(grown, runs, starts, strict=True)
+        if is_physical(s, h, c.location) and is_physical(s, f, c.location)
     ]
     return validate_from_best_states(state.validation, validated)
 
@@ -273,62 +351,79 @@ def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: l
     """Add the candidate that validation data prefer; False where they prefer none."""
     data, current = state.problem.dataset.data, state.current
     for candidate in candidates:
-        state.say("  " + describe(candidate, current, data))
+        state.say("  " + describe(candidate, current))
     winner, rivals = choose(candidates, current, data, state.problem.noise)
     if winner is None or winner.location is None:
         return False
     location = winner.location
     state.scores[location] = next((s.nats for s in scored if s.location == location), 0.0)
     state.rivals[location] = [r.location for r in rivals if r.location]
+    state.gains[location] = horizon_gains(winner, current)
     state.current = dataclasses.replace(winner, location=None, parameter_count=0)
-    state.passed.append(winner.hypothesis)
+    state.passed.append(state.current)
     state.reached(f"+ {location}")
     return True
 
 
 def _simplify(state: SearchState) -> None:
     """Leave out what is not needed, assign calibrations, merge effects, correct the discretisation bias."""
-    problem, validation, added = state.problem, state.validation, list(state.scores)
-    final, state.worth = eliminate(problem, state.current.hypothesis, added)
+    horizons, added = state.horizons, list(state.scores)
+    assert state.current.free_run
+    final, runs, state.worth = eliminate(
+        horizons, state.current.hypothesis, state.current.free_run.hypothesis, added
+    )
+    state.current = horizons.validated(final, runs, state.current)
     order = [p for p in added if p in final.locations]
     order += sorted(set(final.locations) - set(order), key=lambda p: -state.worth[p])
-    assigned = assign_calibrations(problem, validation, final, order)
+    reported = state.reported
+    problem, validation = reported.problem, reported.validation
+    assigned = assign_calibrations(problem, validation, state.at(reported, state.current).hypothesis, order)
     final, order, notes = assigned.final, assigned.order, assigned.notes
     found = [p for p in order if p in state.scores]
     rivals = remaining_rivals(problem, validation, final, state.rivals, found)
     if one := merge_effects(problem, validation, final, order):
         final, notes = one.final, (*notes, one.note)
         state.scores[one.effect] = state.scores[one.simpler]
+        state.gains[one.effect] = state.gains[one.simpler]
         order = [one.effect if p == one.simpler else p for p in order if p not in one.replaced[1:]]
         rivals[one.effect] = [*rivals.get(one.simpler, []), *(one.replaced if one.same_count else ())]
     state.order, state.own, state.notes, state.rivals = order, assigned.own, notes, rivals
-    final = correct_discretisation_bias(problem, final)
-    state.current = dataclasses.replace(state.current, hypothesis=final)
+    state.final = correct_discretisation_bias(problem, final)
 
 
-def _report(state: SearchState, started: float) -> Discovery:
+def _report(state: SearchState, evaluation: Evaluation, started: float) -> Discovery:
     """Every nested model evaluated, the error of the baseline localised, and the verdict."""
-    problem, validation, model, order = state.problem, state.validation, state.model, state.order
-    models = nested_models(problem, state.current.hypothesis, order, state.own, state.passed)
-    validated = [validate(validation, h, state.current) for h in models]
-    stages = [evaluate(problem, validation, model.solver, v, order[:k]) for k, v in enumerate(validated)]
+    reported, model, order = state.reported, state.model, state.order
+    problem, validation, final = reported.problem, reported.validation, state.final
+    assert final
+    passed = [state.at(reported, v).hypothesis for v in state.passed]
+    models = nested_models(problem, final, order, state.own, passed)
+    near = state.at(reported, state.current)
+    validated = [validate(validation, h, near) for h in models]
+    stages = []
+    for k, v in enumerate(validated):
+        stage = evaluate(problem, validation, model.solver, v, order[:k])
+        stage = _with_process_noise(state, stage, v.hypothesis)
+        stages.append(evaluation.of_stage(stage, v, order[:k]))
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
     longest, channels = max((*train, *held_back), key=lambda r: r.N), model.mechanism.channels
     seconds, noise = validation.window_seconds, problem.noise
     residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
     floor = dict(zip(channels, noise.tolist(), strict=True))
-    rounds = _rounds(state, stages)
-    verdict, sentence = end_state(rounds, stages[-1], floor, state.ranking, held_back)
+    rounds = _rounds(state, stages, estimates_of_validation(reported, validated[-1]))
+    listed = [s for s, _ in state.ranking]
+    verdict, sentence = end_state(rounds, stages[-1], floor, listed, held_back)
     return Discovery(
         verdict=verdict,
         sentence=sentence,
         train=train,
-        test=held_back,
+        validation=held_back,
+        test=evaluation.recordings,
         baseline=stages[0],
         rounds=rounds,
         ranking=tuple(
-            Ranked(*s.location, s.nats, s.excited, s.orthogonal_fraction, s.detection_limit)
-            for s in state.ranking
+            Ranked(*s.location, s.nats, s.excited, s.orthogonal_fraction, s.detection_limit, runs)
+            for s, runs in state.ranking
         ),
         where=locate(longest, residual, channels, noise, model.mechanism, window_seconds=seconds),
         noise_floor=floor,
@@ -337,8 +432,27 @@ def _report(state: SearchState, started: float) -> Discovery:
     )
 
 
-def _rounds(state: SearchState, stages: Sequence[Stage]) -> tuple[Round, ...]:
-    """What was added, in order, each effect with the stage that it led to."""
+def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stage:
+    """A stage with the process noise that predictions with its parameters ask for."""
+    problem = state.problem
+    if stage.horizon == "prediction":
+        return stage
+    h = as_prediction(problem, h, state.current.hypothesis.process_noise)
+    h = choose_process_noise(problem, h, wide=True)
+    gain = process_noise_gain(problem, h)
+    return dataclasses.replace(stage, process_noise=h.process_noise, process_noise_nats=gain)
+
+
+def _rounds(
+    state: SearchState, stages: Sequence[Stage], others: Sequence[Sequence[Estimate]]
+) -> tuple[Round, ...]:
+    """What was added, in order, each effect with the stage that it led to.
+
+    Args:
+        state: What was found.
+        stages: Models, each with one effect more.
+        others: The parameters of the last one fitted to the validation recordings, together or one by one.
+    """
     mechanism = stages[-1].model.mechanism
     return tuple(
         Round(
@@ -351,6 +465,26 @@ def _rounds(state: SearchState, stages: Sequence[Stage]) -> tuple[Round, ...]:
             held_out_gain_nats=stage.log_likelihood - before.log_likelihood,
             sentence=mechanism.sentence(mechanism.effect(*location)),
             equation=mechanism.effect(*location).equation,
+            doubt=_doubt(state, location, stages[-1], others),
+            prediction=state.gains.get(location, (None, None))[0],
+            free_run=state.gains.get(location, (None, None))[1],
         )
         for location, before, stage in zip(state.order, stages, stages[1:], strict=False)
     )
+
+
+def _doubt(
+    state: SearchState, location: EffectLocation, final: Stage, others: Sequence[Sequence[Estimate]]
+) -> str:
+    """Why an effect may stand in for something else, in words; empty where nothing speaks for that."""
+    reasons = []
+    if rivals := state.rivals.get(location):
+        reasons.append("these recordings do not distinguish it from " + " or ".join(map(titled, rivals)))
+    prediction, runs = state.gains.get(location, (None, None))
+    if prediction is not None and not helps(prediction):
+        reasons.append("predictions on validation data are no better with it")
+    if runs is not None and not helps(runs):
+        reasons.append("free runs over validation data are no better with it")
+    differ = [d for other in others if (d := disagreement(final.estimates, other, location))]
+    reasons += differ[:1]
+    return "; ".join(reasons)

@@ -2,14 +2,21 @@
 
 Two candidates whose validation log-likelihoods differ by less than their scatter over half-second blocks
 are reported together; a richer effect must beat the simpler one that it contains beyond doubt.
+
+Every candidate is compared at two horizons, each with parameters fitted for it: as a predictor and in short
+free runs. Where another part of the model is wrong, the likeliest predictor follows the data within a few
+samples, and its parameters are no good for a free run; a free run alone has less power where the model is
+nearly right. So both propose, and what only free runs want counts if they want it strongly.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, in_blocks, validate
+from rotflex_jax.discover.result import HorizonGain
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.dataset import StackedRecordings
 
@@ -22,6 +29,9 @@ WINDOWS_WORSE, WINDOWS_BETTER = 0.02, 0.01
 # Two effects are distinguished by this many standard deviations of their paired block differences, or by free
 # runs over short windows whose errors differ by more than this (mean log ratio).
 SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
+# What predictions do not want, free runs must want by so many standard deviations of their block gains, on
+# validation and on training data, with an error that falls by so much (mean log ratio).
+FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
 
 
 def paired_gain(a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"]) -> tuple[float, float]:
@@ -31,15 +41,40 @@ def paired_gain(a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"]) -> tuple
     return float(d.sum()), float(d.sum()) / max(spread, 1e-12)
 
 
-def describe(candidate: ValidatedHypothesis, current: ValidatedHypothesis, data: StackedRecordings) -> str:
+def horizon_gains(
+    candidate: ValidatedHypothesis, current: ValidatedHypothesis
+) -> tuple[HorizonGain, HorizonGain | None]:
+    """What a candidate gains on validation data, as a predictor and in free runs."""
+    nats, z = paired_gain(candidate.blocks, current.blocks)
+    ratio = float(np.exp(_log_error_ratio(candidate, current)))
+    prediction = HorizonGain(nats, z, ratio)
+    runs, before = candidate.free_run, current.free_run
+    if runs is None or before is None:
+        return prediction, None
+    gain, z = paired_gain(runs.blocks, before.blocks)
+    return prediction, HorizonGain(gain, z, float(np.exp(_log_error_ratio(runs, before))))
+
+
+def helps(gain: HorizonGain) -> bool:
+    """Whether a gain at one horizon is there beyond doubt."""
+    return gain.z > HELD_OUT_Z and gain.gain > 0
+
+
+def describe(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> str:
     """One line: what a candidate gained."""
     nats, z = paired_gain(candidate.blocks, current.blocks)
-    train, train_z = _training_gain(candidate, current, data)
+    train, train_z = _training_gain(candidate, current)
     ratio = float(np.exp(_log_error_ratio(candidate, current)))
-    return (
+    line = (
         f"{candidate.location}: {nats:.0f} nats on validation data (z {z:.1f}), {train:.0f} "
         f"on training data (z {train_z:.1f}), {error_ratio(ratio)}"
     )
+    runs, before = candidate.free_run, current.free_run
+    if runs is None or before is None:
+        return line
+    z, train_z = paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1]
+    ratio = float(np.exp(_log_error_ratio(runs, before)))
+    return f"{line}; fitted to free runs {ratio:.2g} times (z {z:.1f}, training {train_z:.1f})"
 
 
 def error_ratio(ratio: float) -> str:
@@ -51,10 +86,8 @@ def error_ratio(ratio: float) -> str:
     return f"free-run error {ratio:.2g} times as large"
 
 
-def _training_gain(
-    a: ValidatedHypothesis, b: ValidatedHypothesis, data: StackedRecordings
-) -> tuple[float, float]:
-    return paired_gain(in_blocks(a.hypothesis.densities, data), in_blocks(b.hypothesis.densities, data))
+def _training_gain(a: ValidatedHypothesis, b: ValidatedHypothesis) -> tuple[float, float]:
+    return paired_gain(a.hypothesis.blocks, b.hypothesis.blocks)
 
 
 def _log_error_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
@@ -77,15 +110,42 @@ def admissible(
         noise: Standard deviation of the sensor noise of each channel.
     """
     nats, z = paired_gain(candidate.blocks, current.blocks)
-    train, train_z = _training_gain(candidate, current, data)
+    train, train_z = _training_gain(candidate, current)
     measured = float(np.sum(data.seen)) * data.y.shape[-1]
     needed = TRAIN_NATS + 0.5 * candidate.parameter_count * float(np.log(measured))
     # Likelihood is about the next samples, a user's free runs are about many: both must agree. Far from the
     # sensor noise, an effect that leaves free runs as they were is flexibility, not a discovery.
-    far = bool(np.any(current.window_rmse > 2 * noise))
+    far = bool(np.any(best_window_rmse(current) > 2 * noise))
     limit = -WINDOWS_BETTER if far else WINDOWS_WORSE
     enough = nats > HELD_OUT_NATS and z > HELD_OUT_Z and train > needed and train_z > TRAIN_Z
-    return enough and _log_error_ratio(candidate, current) < limit
+    runs, before = candidate.free_run, current.free_run
+    if runs is None or before is None:
+        return enough and _log_error_ratio(candidate, current) < limit
+    ratio = _log_error_ratio(runs, before)
+    certainty = min(paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1])
+    as_trained = _log_error_ratio(candidate, current)
+    if enough and min(ratio, as_trained) < limit:
+        return not far or certainty > HELD_OUT_Z or as_trained < -FREE_RUN_BETTER
+    return far and _free_runs_insist(candidate, current)
+
+
+def best_window_rmse(t: ValidatedHypothesis) -> Float[np.ndarray, " C"]:
+    """Errors of short free runs with the parameters, of predictions or of free runs, that suit them best."""
+    if t.free_run is None or runs_clearly_better(t.window_rmse, t.free_run.window_rmse):
+        return t.window_rmse
+    return t.free_run.window_rmse
+
+
+def shares_of_gain(
+    candidates: Sequence[ValidatedHypothesis], current: ValidatedHypothesis
+) -> Float[np.ndarray, " K"]:
+    """What each candidate gains on validation data as a share of the most, summed over the horizons."""
+    total = np.zeros(len(candidates))
+    for at in (lambda t: t, lambda t: t.free_run):
+        if all(at(t) is not None for t in (*candidates, current)):
+            gains = np.array([at(t).log_likelihood - at(current).log_likelihood for t in candidates])
+            total += np.maximum(gains, 0.0) / max(float(gains.max()), 1e-9)
+    return total
 
 
 def choose(
@@ -102,19 +162,18 @@ def choose(
     able = [t for t in candidates if admissible(t, current, data, noise)]
     if not able:
         return None, []
-    winner = max(able, key=lambda t: t.log_likelihood)
+    shares = {t.location: share for t, share in zip(able, shares_of_gain(able, current), strict=True)}
+    winner = max(able, key=lambda t: shares[t.location])
     simpler = [t for t in able if _contained(t, winner) and not _clearly_better(winner, t, current)]
     if simpler:
-        winner = max(simpler, key=lambda t: t.log_likelihood)
+        winner = max(simpler, key=lambda t: shares[t.location])
     rivals = [
         t for t in candidates if t is not winner and not _contained(winner, t) and not _contained(t, winner)
     ]
     gains = [
-        t
-        for t in rivals
-        if t.log_likelihood > current.log_likelihood and _training_gain(t, current, data)[0] > 0
+        t for t in rivals if t.log_likelihood > current.log_likelihood and _training_gain(t, current)[0] > 0
     ]
-    return winner, [t for t in gains if not distinguished(winner, t, data)]
+    return winner, [t for t in gains if not distinguished(winner, t)]
 
 
 def validate_from_best_states(
@@ -130,17 +189,19 @@ def validate_from_best_states(
         if richer:
             best = max(richer, key=lambda r: r.log_likelihood)
             again = validate(validation, t.hypothesis, best)
-            again = dataclasses.replace(again, location=t.location, parameter_count=t.parameter_count)
+            again = dataclasses.replace(
+                again, location=t.location, parameter_count=t.parameter_count, free_run=t.free_run
+            )
             t = max(t, again, key=lambda x: x.log_likelihood)
         out.append(t)
     return out
 
 
-def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis, data: StackedRecordings) -> bool:
+def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
     """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
-    if _log_error_ratio(rival, winner) > WINDOWS_APART:
+    if float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART:
         return True
-    a, b = (np.concatenate([t.blocks, in_blocks(t.hypothesis.densities, data)]) for t in (winner, rival))
+    a, b = (np.concatenate([t.blocks, t.hypothesis.blocks]) for t in (winner, rival))
     return paired_gain(a, b)[1] >= SEPARATE_Z
 
 
@@ -158,7 +219,18 @@ def _clearly_better(
     nats, z = paired_gain(rich.blocks, simple.blocks)
     train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
     share = nats / max(paired_gain(rich.blocks, current.blocks)[0], 1e-9)
-    return nats > 10 and z > 2.5 and train > 20 and share > 0.003
+    runs_as_well = float(np.mean(np.log(best_window_rmse(rich) / best_window_rmse(simple)))) < WINDOWS_BETTER
+    return _free_runs_insist(rich, simple) or (
+        nats > 10 and z > 2.5 and train > 20 and share > 0.003 and runs_as_well
+    )
+
+
+def _free_runs_insist(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> bool:
+    """Whether free runs alone show beyond doubt that a candidate is better."""
+    runs, before = candidate.free_run, current.free_run
+    if runs is None or before is None or _log_error_ratio(runs, before) > -FREE_RUN_BETTER:
+        return False
+    return min(paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1]) > FREE_RUN_Z
 
 
 def runs_clearly_better(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> bool:

@@ -6,9 +6,10 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
+from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import MAX_COORDINATE_STEP, choose_process_noise, moved, whitened_sums
+from rotflex_jax.discover.refit import MAX_COORDINATE_STEP, choose_process_noise
 from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, after_trial, begin
 
@@ -65,7 +66,7 @@ def map_equations(problem: LikelihoodProblem, h: Hypothesis, weights: list[int])
     seen = problem.seen
     e, J = problem.slopes([h])
     w, W = h.whitener(e[0], seen), h.whitener(J[0, : h.moved], seen)
-    H, g = whitened_sums(h, w, W)
+    H, g = FitCoordinates.of(h, problem.windows).sums(w, W)
     own = np.array([h.free.index(i) for i in weights])
     rest = np.setdiff1d(np.arange(len(g)), own)
     width = max(round(INDEPENDENT_SECONDS / float(problem.dataset.data.Ts[0])), 1)
@@ -224,7 +225,7 @@ def _step(
     progress = begin(before, MAP_RULES._replace(damping=damping))
     for _ in range(TRIALS_PER_STEP):
         step, _ = penalised.step(float(progress.damping), limit)
-        tried = moved(h, free @ step)
+        tried = FitCoordinates.of(h, problem.windows).moved(h, free @ step)
         e = problem.innovations([tried])[0]
         new = tried.z[weights]
         cost = 0.5 * float(np.sum(h.whitener(e, seen) ** 2)) + 0.5 * float(new @ penalty @ new)

@@ -1,10 +1,12 @@
 """The stepwise search: fit the baseline, add, remove, swap and merge effects, assign calibrations."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 
+from rotflex_jax.discover.horizon import Horizons
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -18,6 +20,8 @@ from rotflex_jax.discover.hypothesis import (
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import levenberg_marquardt, refit
 from rotflex_jax.discover.selection import (
+    FREE_RUN_BETTER,
+    FREE_RUN_Z,
     TRAIN_NATS,
     TRAIN_Z,
     WINDOWS_BETTER,
@@ -26,7 +30,7 @@ from rotflex_jax.discover.selection import (
     runs_clearly_better,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
-from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, in_blocks, validate
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.discover.whitening import Whitener
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism.assembly import Layout
@@ -34,7 +38,7 @@ from rotflex_jax.mechanism.assembly import Layout
 
 def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
     """The user's model with calibrations, fitted from a short, a middle and an endless prediction horizon."""
-    s, noise, first = problem.supermodel, problem.noise, problem.dataset.first_states
+    s, noise, first = problem.supermodel, problem.noise, problem.windows.first_states
     R, C = len(first), len(s.mechanism.channels)
     z = s.transform.unconstrain(s.mechanism.values)
     for i in s.local:
@@ -130,17 +134,24 @@ def _best_shapes(
 
 
 def eliminate(
-    problem: LikelihoodProblem, h: Hypothesis, added: list[EffectLocation]
-) -> tuple[Hypothesis, dict[EffectLocation, float]]:
-    """Drop, one at a time, effects without which the model is as good.
+    horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[EffectLocation]
+) -> tuple[Hypothesis, Hypothesis, dict[EffectLocation, float]]:
+    """Drop, one at a time, effects without which the model is as good at both horizons.
 
     The effect added last has just shown that it is needed; earlier ones may have become needless, and
     calibrations have shown nothing yet.
 
+    Args:
+        horizons: With the training recordings.
+        h: The model fitted to predictions.
+        runs: The same fitted to free runs.
+        added: Effects in the order they were added.
+
     Returns:
-        The model with what is needed, and what each effect that was tested gains [nat].
+        The model with what is needed at both horizons, and what each effect that was tested gains [nat].
     """
-    s = problem.supermodel
+    problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
+    s, runs_need = problem.supermodel, functools.cache(lambda p: _needed_in_free_runs(runs_problem, runs, p))
     while tested := [p for p in h.locations if p not in added[-1:]]:
         rivals = refit(problem, [without(s, h, p) for p in tested], alternations=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
@@ -151,14 +162,25 @@ def eliminate(
             if p in s.calibrations:
                 continue
             # An effect that gains in a few moments of the recording only is not needed.
-            blocks = (in_blocks(x.densities, problem.dataset.data) for x in (h, r))
-            if paired_gain(*blocks)[1] < TRAIN_Z:
+            if paired_gain(h.blocks, r.blocks)[1] < TRAIN_Z:
                 surplus[p] = min(surplus[p], -1.0)
-        weakest = min(surplus, key=lambda p: surplus[p])
-        if surplus[weakest] >= 0:
-            return h, worth
-        h = rivals[tested.index(weakest)]
-    return h, {}
+        needless = [p for p in tested if surplus[p] < 0 and not (p in added and runs_need(p))]
+        if not needless:
+            break
+        h = rivals[tested.index(min(needless, key=lambda p: surplus[p]))]
+    else:
+        worth = {}
+    dropped = set(runs.locations) - set(h.locations)
+    for p in dropped:
+        runs = without(s, runs, p)
+    return h, refit(runs_problem, [runs])[0] if dropped else runs, worth
+
+
+def _needed_in_free_runs(problem: LikelihoodProblem, runs: Hypothesis, location: EffectLocation) -> bool:
+    """Whether free runs over the training recordings are clearly worse without an effect."""
+    less = refit(problem, [without(problem.supermodel, runs, location)], alternations=1)[0]
+    gain, z = paired_gain(runs.blocks, less.blocks)
+    return z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER
 
 
 def remaining_rivals(
@@ -184,8 +206,7 @@ def remaining_rivals(
         swapped.append(with_effect(s, without(s, final, p), start, 0.4))
     best = validate(validation, final)
     validated = [validate(validation, h) for h in refit(problem, swapped)]
-    data = problem.dataset.data
-    alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(best, t, data)}
+    alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(best, t)}
     return {p: [r for r in remaining[p] if (p, r) in alike] for p in found}
 
 

@@ -104,7 +104,7 @@ def _meanings(stages: tuple[Stage, ...]) -> dict[str, str]:
 
 def channel_units(discovery: SearchResult) -> dict[str, str]:
     """Channel of the model -> its unit."""
-    first = discovery.test[0]
+    first = discovery.validation[0]
     return {c: first.units[first.channels.index(c)] for c in discovery.baseline.held_out_rmse_windows}
 
 

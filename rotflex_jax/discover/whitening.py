@@ -57,6 +57,7 @@ def fit_whitener(
     seen: Float[np.ndarray, "R N"],
     floor: Float[np.ndarray, " C"],
     order: int = WHITENER_ORDER,
+    channels_apart: bool = False,
 ) -> Whitener:
     """Whitener fitted to innovations.
 
@@ -65,6 +66,7 @@ def fit_whitener(
         seen: One where a sample counts.
         floor: Standard deviation below which nothing is believed; guards noise-free data.
         order: Of the autoregressions; 0 for none.
+        channels_apart: Whether the innovations of different channels count as uncorrelated.
     """
     C = e.shape[-1]
     a = np.zeros((C, order + 1))
@@ -80,6 +82,7 @@ def fit_whitener(
     filtered = Whitener(a, np.eye(C))(e, seen).reshape(-1, C)
     count = max(float(np.sum(seen[:, order:])), 1.0)
     covariance = filtered.T @ filtered / count + np.diag((0.05 * floor) ** 2)
+    covariance = np.diag(np.diag(covariance)) if channels_apart else covariance
     return Whitener(a, np.linalg.inv(np.linalg.cholesky(covariance)))
 
 

@@ -126,10 +126,11 @@ def predicted(
     structure: Mechanism,
     solver: Solver,
     values: Float[Array, "R P"],
-    x0: Float[Array, "R s"],
+    x0: Float[Array, "R *W s"],
     gates: Float[Array, " E"],
     data: StackedRecordings,
     K: Float[Array, "R n C"],
+    window: Int[Array, "R N"] | None = None,
 ) -> Float[Array, "R N C"]:
     """Outputs of R recordings, predicted with gain `K`; a free run where it is zero.
 
@@ -141,11 +142,14 @@ def predicted(
         gates: One factor per effect.
         data: The recordings.
         K: Gains.
+        window: Window of each sample, where runs start again at each; `x0` is then (R, W, s).
     """
     run = functools.partial(predictor_run, structure, solver)
-    return each_recording(run, in_axes=(0, None, 0, 0, 0, 0, 0, 0))(
-        values, gates, whole_state(structure, x0), data.u, data.y, data.seen, K, data.Ts
-    )[1]
+    rows = (values, gates, whole_state(structure, x0), data.u, data.y, data.seen, K, data.Ts)
+    axes: tuple[int | None, ...] = (0, None, 0, 0, 0, 0, 0, 0)
+    if window is not None:
+        rows, axes = (*rows, window), (*axes, 0)
+    return each_recording(run, axes)(*rows)[1]
 
 
 def each_recording(run: Callable[..., Any], in_axes: tuple[int | None, ...], out_axes: int = 0) -> Callable:

@@ -28,7 +28,15 @@ from rotflex_jax.effects.base import Actuation, Gear, Memory
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import forcing, state_jacobians, states, tangent_recursion
-from rotflex_jax.mechanism.simulate import FreeStep, PredictorStep, Solver, prepared_run, read_outputs
+from rotflex_jax.mechanism.simulate import (
+    FreeStep,
+    PredictorStep,
+    Solver,
+    prepared_run,
+    read_outputs,
+    restarts,
+    started_again,
+)
 from rotflex_jax.mechanism.step import Exponential
 
 
@@ -38,7 +46,7 @@ class RunParameters(NamedTuple):
     Attributes:
         values: Parameter values.
         gates: One factor per effect.
-        x0: First state.
+        x0: First state, or that of each window.
         K: Gain; None for a free run.
     """
 
@@ -56,12 +64,22 @@ class RecordingSamples(NamedTuple):
         y: Measured outputs.
         seen: One where a sample may correct the state, zero where it may not.
         Ts: Sampling period [s].
+        window: Window of each sample, where the run starts again at each; None for one run.
     """
 
     u: Float[Array, "*batch N"]
     y: Float[Array, "*batch N C"]
     seen: Float[Array, "*batch N"]
     Ts: Float[Array, "*batch"]
+    window: Integer[Array, "*batch N"] | None = None
+
+    def started_at(self, x0: Float[Array, "*W n"]) -> tuple[Float[Array, " n"], tuple[Any, ...]]:
+        """The first state of a run, and the measured inputs of its step."""
+        measured = (self.y, self.seen)
+        if self.window is None:
+            return x0, measured
+        first, restart = restarts(x0, self.window)
+        return first, (*measured, *restart)
 
 
 def predictor_jacobians(
@@ -77,8 +95,9 @@ def predictor_jacobians(
     """
     step = PredictorStep(structure, solver)
     _, v, c = prepared_run(structure, solver, parameters.values, parameters.gates, samples.u, samples.Ts)
-    inputs, constants = (v, samples.y, samples.seen), (c, parameters.K)
-    return state_jacobians(step, states(step, parameters.x0, inputs, constants), inputs, constants)
+    x0, measured = samples.started_at(parameters.x0)
+    inputs, constants = (v, *measured), (c, parameters.K)
+    return state_jacobians(step, states(step, x0, inputs, constants), inputs, constants)
 
 
 def inactive_sensitivities(
@@ -109,16 +128,17 @@ def inactive_sensitivities(
         return prepared_run(structure, solver, values, gates, samples.u, samples.Ts)[1:]
 
     v, c = prepared(parameters.values, parameters.gates)
-    inputs, constants = (v, samples.y, samples.seen), (c, parameters.K)
-    X = states(step, parameters.x0, inputs, constants)
-    still = (jnp.zeros_like(samples.y), jnp.zeros_like(samples.seen))
+    x0, measured = samples.started_at(parameters.x0)
+    inputs, constants = (v, *measured), (c, parameters.K)
+    X = states(step, x0, inputs, constants)
+    still = tuple(jnp.zeros_like(a) for a in measured)
 
     def derivative(dv: Array, dg: Array) -> Array:
         direction = (parameters.values, parameters.gates), (dv, dg)
         dvoltage, dc = jax.jvp(prepared, *direction)[1]
         dK = jax.tree.map(jnp.zeros_like, parameters.K)
         b = forcing(step, X, inputs, (dvoltage, *still), constants, (dc, dK))
-        dx = tangent_recursion(A, b[:, active], jnp.zeros_like(parameters.x0[active]))
+        dx = tangent_recursion(A, b[:, active], jnp.zeros_like(x0[active]))
         dX = jnp.zeros_like(X).at[:, active].set(dx)
         read = lambda x, values, gates: read_outputs(structure.with_values(values), gates, x)  # noqa: E731
         return jax.jvp(read, (X.T, *direction[0]), (dX.T, *direction[1]))[1].T
@@ -136,7 +156,7 @@ class TangentDirections(NamedTuple):
     Attributes:
         values: In the parameter values.
         gates: In the gates.
-        x0: In the first state.
+        x0: In the first state, the same in every window.
     """
 
     values: Float[Array, "*batch D P"]
@@ -194,7 +214,7 @@ def accumulate_outputs(
 
     def step(v: Any, x: Array, c: Any, sample: Any) -> Array:
         if K is None:
-            return free(x, v, c)
+            return started_again(free(x, v, c), sample[2:])
         return predictor(x, (v, *sample), (c, repeated(K) if repeats else K))
 
     def later(x: Array, dx: Array, v: Any, dv: Any, sample: Any) -> tuple[Array, Array]:
@@ -210,14 +230,19 @@ def accumulate_outputs(
         dend = jax.vmap(lambda *tangent: jax.jvp(f, at, tangent)[1], in_axes=-1, out_axes=-1)(*tangents)
         return f(*at), dend
 
+    x0_directions = jnp.asarray(directions.x0).T
+
     def advance(carry: Any, sample: Any) -> Any:
         (x, dx, sums), (v, dv, here) = carry, sample
         J = jax.jvp(read, repeated((x, values, gates)), (dx, directions.values.T, directions.gates.T))[1]
-        sums, stored = accumulate(sums, read(x, values, gates), J, here)
-        return (*later(x, dx, v, dv, here), sums), stored
+        sums, stored = accumulate(sums, read(x, values, gates), J, here[:2])
+        x, dx = later(x, dx, v, dv, here)
+        if samples.window is not None:
+            dx = jnp.where(here[2] > 0, x0_directions, dx)
+        return (x, dx, sums), stored
 
-    measured = (samples.y, samples.seen)
-    carry = (jnp.asarray(x0), jnp.asarray(directions.x0).T, start)
+    first, measured = samples.started_at(jnp.asarray(x0))
+    carry = (first, x0_directions, start)
     (_, _, sums), stored = jax.lax.scan(advance, carry, (drive(values, gates), dv, measured))
     return sums, stored
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float, Integer, Real
 
 from rotflex_jax.effects.base import Sensing
 from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_voltage, rest_state
@@ -81,7 +81,10 @@ class FreeStep:
 
 @dataclasses.dataclass(frozen=True)
 class PredictorStep:
-    """State to state, corrected by the measured output first: `x+ = F(x + K (y - h(x)), v)`."""
+    """State to state, corrected by the measured output first: `x+ = F(x + K (y - h(x)), v)`.
+
+    Where the next sample begins a window of its own, the state there is the first state of that window.
+    """
 
     structure: Mechanism
     solver: Solver
@@ -89,13 +92,41 @@ class PredictorStep:
     def __call__(
         self, x: Float[Array, "n *S"], w: tuple[Float[Array, "..."], ...], constants: Any
     ) -> Float[Array, "n *S"]:
-        """State one sample later; `w` is voltage, outputs, and whether they may correct the state."""
-        v, y, seen = w
+        """State one sample later.
+
+        Args:
+            x: State.
+            w: Voltage, outputs, whether they may correct the state; and where a run has windows, whether one
+                ends here and the first state of the next one.
+            constants: Of the solver, and the gain.
+        """
+        v, y, seen, *restart = w
         c, K = constants
         mechanism = self.structure.with_values(c.values)
         read, sign = readings_with_slope_sign(mechanism, c.gates, x)
         e = (y - read) * sign * seen[None]
-        return self.solver.advance(self.structure, x + matvec(K, e), v, c)
+        return started_again(self.solver.advance(self.structure, x + matvec(K, e), v, c), restart)
+
+
+def started_again(x: Float[Array, "n *S"], restart: Sequence[Float[Array, "..."]]) -> Float[Array, "n *S"]:
+    """The state, or the first state of the next window where one ends; `restart` as `restarts` gives it."""
+    if not restart:
+        return x
+    ends, start = restart
+    return jnp.where(ends[None] > 0, start, x)
+
+
+def restarts(
+    x0: Float[Array, "W n"], window: Integer[Array, " N"]
+) -> tuple[Float[Array, " n"], tuple[Float[Array, " N"], Float[Array, "N n"]]]:
+    """The first state of a run that starts again at each window, and what its step needs at each sample.
+
+    Args:
+        x0: First states of the windows.
+        window: Index of the window of each sample.
+    """
+    following = jnp.concatenate([window[1:], window[-1:]])
+    return x0[window[0]], ((following != window).astype(x0.dtype), x0[following])
 
 
 def prepared_run(
@@ -142,12 +173,13 @@ def predictor_run(
     solver: Solver,
     values: Real[Array, " P"],
     gates: Float[Array, " E"],
-    x0: Float[Array, " n"],
+    x0: Float[Array, "*W n"],
     u: Float[Array, " N"],
     y: Float[Array, "N C"],
     seen: Float[Array, " N"],
     K: Float[Array, "n C"],
     Ts: Float[Array, ""],
+    window: Integer[Array, " N"] | None = None,
 ) -> tuple[Float[Array, "N n"], Float[Array, "N C"]]:
     """States before correction and outputs predicted one step ahead.
 
@@ -162,9 +194,11 @@ def predictor_run(
         seen: One where a sample may correct the state, zero where it may not.
         K: Gain; zero for a free run.
         Ts: Sampling period [s].
+        window: Window of each sample, where the run starts again at each; `x0` is then (W, n).
     """
     mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
-    X = states(PredictorStep(structure, solver), x0, (v, y, seen), (c, K))
+    x0, restart = (x0, ()) if window is None else restarts(x0, window)
+    X = states(PredictorStep(structure, solver), x0, (v, y, seen, *restart), (c, K))
     return X, read_outputs(mechanism, gates, X.T).T
 
 

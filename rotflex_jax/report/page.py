@@ -65,7 +65,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "recordings": _recordings(discovery),
         "settings": _settings(discovery),
         "model": str(discovery.model.mechanism),
-        "source": next((r.source for r in discovery.test if r.source), ""),
+        "source": next((r.source for r in discovery.validation if r.source), ""),
     }
 
 
@@ -143,7 +143,7 @@ def _ranked(r: Ranked, outcome: Outcome) -> dict[str, str]:
 
 
 def _recordings(discovery: SearchResult) -> list[dict[str, Any]]:
-    parts = [("fitted", r) for r in discovery.train] + [("held out", r) for r in discovery.test]
+    parts = [("fitted", r) for r in discovery.train] + [("held out", r) for r in discovery.validation]
     return [
         {
             "use": use,
@@ -163,7 +163,7 @@ def _signals(r: Recording) -> str:
 
 
 def _settings(discovery: SearchResult) -> list[tuple[str, str]]:
-    seen = sorted({r.n_init for r in discovery.test})
+    seen = sorted({r.n_init for r in discovery.validation})
     rows = [
         ("Windows of the short held-out runs", f"{discovery.baseline.window_seconds:g} s"),
         (

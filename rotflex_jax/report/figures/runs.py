@@ -42,8 +42,8 @@ class Shown:
 
 def shown(discovery: SearchResult) -> Shown:
     """What the figures of runs are drawn from."""
-    i = max(range(len(discovery.test)), key=lambda k: discovery.test[k].N)
-    recording, base = discovery.test[i], discovery.baseline
+    i = max(range(len(discovery.validation)), key=lambda k: discovery.validation[k].N)
+    recording, base = discovery.validation[i], discovery.baseline
 
     def run(stage: Stage) -> np.ndarray:
         return np.asarray(stage.windowed[i], float)

@@ -1,0 +1,161 @@
+"""What a fit of a hypothesis adjusts, and the block structure of its least-squares problem.
+
+The coordinates are the parameters that all recordings share, then for each recording its own parameters and
+the first states of its windows. A first state acts within its window alone and an own parameter within its
+recording, so that products and projections are formed block by block.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.windows import Windows
+
+# A direction of which no more than this share is left after a projection has none of its own.
+RANK_TOLERANCE = 1e-10
+
+
+@dataclasses.dataclass(frozen=True)
+class FitCoordinates:
+    """The M coordinates of a fit.
+
+    Attributes:
+        shared: How many parameters all recordings share; zero where these are held.
+        local: How many each recording has for itself.
+        states: How many entries a first state has.
+        windows: Where runs start again.
+    """
+
+    shared: int
+    local: int
+    states: int
+    windows: Windows
+
+    @classmethod
+    def of(cls, h: Hypothesis, windows: Windows) -> "FitCoordinates":
+        """Those of a hypothesis."""
+        return cls(len(h.free), len(h.local), h.x0.shape[-1], windows)
+
+    @property
+    def directions(self) -> int:
+        """Number of directions of a run, which windows and recordings share."""
+        return self.shared + self.local + self.states
+
+    @property
+    def size(self) -> int:
+        """M."""
+        return self._start(len(self.windows.counts))
+
+    def _start(self, recording: int) -> int:
+        """First column of what belongs to a recording alone."""
+        counts = self.windows.counts[:recording]
+        return self.shared + len(counts) * self.local + sum(counts) * self.states
+
+    def local_columns(self, recording: int) -> Int[np.ndarray, " L"]:
+        """Columns of a recording's own parameters."""
+        return self._start(recording) + np.arange(self.local)
+
+    def state_columns(self, recording: int, window: int) -> Int[np.ndarray, " m"]:
+        """Columns of a window's first state."""
+        return self._start(recording) + self.local + window * self.states + np.arange(self.states)
+
+    def columns(self, recording: int, window: int) -> Int[np.ndarray, " D"]:
+        """Columns of all directions within a window."""
+        own = self.local_columns(recording), self.state_columns(recording, window)
+        return np.concatenate([np.arange(self.shared), *own])
+
+    def of_recording(self, recording: int) -> Int[np.ndarray, " O"]:
+        """Columns of what belongs to one recording alone."""
+        return np.arange(self._start(recording), self._start(recording + 1))
+
+    def sums(
+        self, w: Float[np.ndarray, "R N C"], W: Float[np.ndarray, "D R N C"]
+    ) -> tuple[Float[np.ndarray, "M M"], Float[np.ndarray, " M"]]:
+        """`J'J` and `J'w` of whitened innovations and of their slopes along the directions."""
+        H, g = np.zeros((self.size, self.size)), np.zeros(self.size)
+        for r in range(len(w)):
+            for k, samples in self.windows.of(r):
+                J, columns = W[: self.directions, r, samples].reshape(self.directions, -1), self.columns(r, k)
+                H[np.ix_(columns, columns)] += J @ J.T
+                g[columns] += J @ w[r, samples].ravel()
+        return H, g
+
+    def moved(self, h: Hypothesis, step: Float[np.ndarray, " M"]) -> Hypothesis:
+        """The hypothesis after a step in these coordinates."""
+        z, local_z, x0 = h.z.copy(), h.local_z.copy(), h.x0.copy()
+        z[list(h.free[: self.shared])] += step[: self.shared]
+        for r, count in enumerate(self.windows.counts):
+            local_z[r] += step[self.local_columns(r)]
+            for k in range(count):
+                x0[r, k] += step[self.state_columns(r, k)]
+        return dataclasses.replace(h, z=z, local_z=local_z, x0=x0)
+
+    def step_limit(self, largest: float) -> Float[np.ndarray, " M"]:
+        """Largest step of each coordinate: parameters have one, first states do not."""
+        most = np.full(self.size, np.inf)
+        most[: self.shared] = largest
+        for r in range(len(self.windows.counts)):
+            most[self.local_columns(r)] = largest
+        return most
+
+    def orthogonal_to(self, W: Float[np.ndarray, "D R N C"]) -> "Projection":
+        """The projection on what slopes along the directions cannot move."""
+        return Projection(self, W[: self.directions])
+
+
+class Projection:
+    """Signals less their projection on the slopes along all coordinates of a fit.
+
+    First states are projected out within each window, then own parameters within each recording, then what
+    all share, each from what the ones before have left: together the projection on all of them (theorem of
+    Frisch, Waugh and Lovell).
+    """
+
+    def __init__(self, coordinates: FitCoordinates, W: Float[np.ndarray, "D R N C"]) -> None:
+        self._windows, (shared, local) = coordinates.windows, (coordinates.shared, coordinates.local)
+        left = W.copy()
+        self._states = [
+            [_basis(left[shared + local :, r, samples]) for _, samples in self._windows.of(r)]
+            for r in range(W.shape[1])
+        ]
+        self._local: list[np.ndarray] = []
+        self._shared = np.zeros((0, left[0].size))
+        self._remove_states(left)
+        self._local = [_basis(left[shared : shared + local, r]) for r in range(W.shape[1])]
+        self._remove_local(left)
+        self._shared = _basis(left[:shared])
+
+    def __call__(self, signals: Float[np.ndarray, "K R N C"]) -> Float[np.ndarray, "K M"]:
+        """What is left of some signals, as rows."""
+        left = np.array(signals, float)
+        self._remove_states(left)
+        self._remove_local(left)
+        rows = left.reshape(len(left), -1)
+        return rows - (rows @ self._shared.T) @ self._shared
+
+    def _remove_states(self, left: np.ndarray) -> None:
+        for r, bases in enumerate(self._states):
+            for basis, (_, samples) in zip(bases, self._windows.of(r), strict=True):
+                _remove(left[:, r, samples], basis)
+
+    def _remove_local(self, left: np.ndarray) -> None:
+        for r, basis in enumerate(self._local):
+            _remove(left[:, r], basis)
+
+
+def _basis(rows: np.ndarray) -> np.ndarray:
+    """Orthonormal rows (B, M) that span some signals (K, ...)."""
+    flat = rows.reshape(len(rows), -1)
+    size = np.linalg.norm(flat, axis=1)
+    if not len(flat) or not size.max(initial=0.0) > 0:
+        return np.zeros((0, flat.shape[1]))
+    Q, R = np.linalg.qr((flat[size > 0] / size[size > 0, None]).T)
+    return Q[:, np.abs(np.diag(R)) > RANK_TOLERANCE].T
+
+
+def _remove(signals: np.ndarray, basis: np.ndarray) -> None:
+    """Take the projection on a basis away from signals (K, ...), in place."""
+    flat = signals.reshape(len(signals), -1)
+    signals -= ((flat @ basis.T) @ basis).reshape(signals.shape)

@@ -1,0 +1,313 @@
+"""Reported of fitted models: errors of free runs, with and without a run's own offsets, and estimates.
+
+No choice of the search rests on anything here.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rotflex_jax.discover.coordinates import FitCoordinates
+from rotflex_jax.discover.horizon import Horizon, Horizons
+from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state, with_all_calibrations
+from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem
+from rotflex_jax.discover.refit import refit
+from rotflex_jax.discover.result import RunErrors, Stage
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, adapted_to_recordings
+from rotflex_jax.discover.windows import Windows
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.fit import inference
+from rotflex_jax.fit.dataset import padded_length, prepare
+from rotflex_jax.fit.inference import Combination, RecordingSlopes, curvature, sandwich
+from rotflex_jax.fit.signs import check_signs
+from rotflex_jax.mechanism import Solver
+from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Estimate
+from rotflex_jax.recording import Recording
+
+# Amplitudes of an effect that differ by no more than this share are alike, however narrow their intervals.
+SAME_SIZE = 0.25
+# How often the offsets of a recording are fitted, each time with the size of the errors that are left.
+CALIBRATIONS = 8
+
+
+def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypothesis:
+    """A trained hypothesis with the offsets that the beginning of each recording gives.
+
+    Offsets belong to a run, not to the machine: an amplifier's offset of 0.04 V moves a servo by degrees
+    within seconds. Free runs over the first seconds determine them, together with the first state, while all
+    else is as trained. Errors of a free run are alike for half a second or so: a block of that length counts
+    as one measurement against what offsets usually are.
+
+    Args:
+        problem: Free runs over recordings that the hypothesis was not fitted to.
+        h: Trained.
+        seconds: How much of each recording may be used [s].
+    """
+    s, R = problem.supermodel, len(problem.seen)
+    start = dataclasses.replace(
+        h,
+        x0=embed_initial_state(s, h.locations, problem.windows.first_states),
+        local_z=np.tile(h.local_z.mean(axis=0), (R, 1)),
+        K=np.zeros((R, *h.K.shape[1:])),
+        densities=np.array(-np.inf),
+    )
+    start = with_all_calibrations(s, start)
+    early = problem.first_seconds(seconds)
+    samples = BLOCK_SECONDS / float(np.min(problem.dataset.data.Ts))
+    own = start
+    # Errors that an offset makes are no measure of how well it is determined.
+    for _ in range(CALIBRATIONS):
+        e = early.innovations([own])[0]
+        if not np.all(np.isfinite(e)):
+            return start
+        own = adapted_to_recordings(early, early.evaluated(own, e), prior=samples)
+    return own
+
+
+def errors_of_runs(validation: ValidationSet, models: Sequence[Model]) -> RunErrors:
+    """Errors of free runs over recordings, each with a model of its own."""
+    recordings, channels = validation.problem.dataset.recordings, models[0].mechanism.channels
+    pairs = list(zip(models, recordings, strict=True))
+    whole = [(m.simulate(r) - m.measured(r))[r.n_init :] for m, r in pairs]
+    windows = validation.window_rmse([m.simulate_windows(r, validation.window_seconds) for m, r in pairs])
+    total = np.sqrt(np.mean(np.concatenate(whole) ** 2, axis=0))
+    return RunErrors(
+        dict(zip(channels, total.tolist(), strict=True)), dict(zip(channels, windows.tolist(), strict=True))
+    )
+
+
+def errors_with_own_calibration(
+    validation: ValidationSet, found: ValidatedHypothesis, locations: Sequence[EffectLocation], seconds: float
+) -> RunErrors:
+    """Errors over recordings where each has the offsets that its own first seconds give.
+
+    Args:
+        validation: Free runs over the recordings.
+        found: Trained, or trained without each of them.
+        locations: What its model has.
+        seconds: How much of each recording its offsets may be fitted to [s].
+    """
+    s, every = validation.problem.supermodel, range(len(validation.problem.seen))
+    on = list(dict.fromkeys([*locations, *s.calibrations]))
+    parts = [(f.validation.problem, h) for f, h in zip(validation.folds, found.folds, strict=True)]
+    if not parts:
+        own = calibrate(validation.problem, found.hypothesis, seconds)
+        return errors_of_runs(validation, [validation.model_of(own, on, i) for i in every])
+    own = [calibrate(problem, h, seconds) for problem, h in parts]
+    return errors_of_runs(validation, [validation.model_of(h, on, i) for i, h in enumerate(own)])
+
+
+def errors_as_trained(
+    validation: ValidationSet, h: Hypothesis, locations: Sequence[EffectLocation]
+) -> RunErrors:
+    """Errors over recordings with the trained model as it is; arguments as before."""
+    trained = dataclasses.replace(
+        h, local_z=h.local_z.mean(axis=0, keepdims=True), x0=h.x0[:1], densities=np.array(-np.inf)
+    )
+    model = validation.model_of(trained, locations, 0)
+    return errors_of_runs(validation, [model] * len(validation.problem.dataset.recordings))
+
+
+def evaluate(
+    problem: LikelihoodProblem,
+    validation: ValidationSet,
+    solver: Solver,
+    validated: ValidatedHypothesis,
+    locations: Sequence[EffectLocation],
+) -> Stage:
+    """What is reported of a hypothesis: estimates with intervals, its free runs and their errors.
+
+    Args:
+        problem: With the training recordings.
+        validation: The validation recordings.
+        solver: Of the model that a user gets.
+        validated: The hypothesis with its validation likelihood.
+        locations: What the stage's model has; calibrations that belong to the training recordings alone
+            are in the hypothesis, but not here.
+    """
+    h, s, seconds = validated.hypothesis, problem.supermodel, validation.window_seconds
+    recordings, trained = validation.problem.dataset.recordings, validated.with_trained_calibrations
+    models = [validation.model_of(trained, locations, i) for i in range(len(recordings))]
+    pairs = list(zip(models, recordings, strict=True))
+    simulated = tuple(m.simulate(r) for m, r in pairs)
+    windowed = tuple(m.simulate_windows(r, seconds) for m, r in pairs)
+    errors = errors_of_runs(validation, models)
+    return Stage(
+        model=Model(s.clean(h.mean_values(s), locations), solver),
+        estimates=estimates(problem, h),
+        held_out_rmse=errors.whole,
+        held_out_rmse_windows=errors.windows,
+        simulated=simulated,
+        windowed=windowed,
+        window_seconds=seconds,
+        process_noise=h.process_noise,
+        process_noise_nats=0.0 if problem.free_run else process_noise_gain(problem, h),
+        log_likelihood=validated.log_likelihood,
+        horizon="free_run" if problem.free_run else "prediction",
+    )
+
+
+def process_noise_gain(problem: LikelihoodProblem, h: Hypothesis) -> float:
+    """Log-likelihood that process torques gain over a free run with the same parameters [nat]."""
+    free_run = problem.with_process_noise(h, dict.fromkeys(problem.ports, problem.process_noise_range[0]))
+    with_noise, without = problem.log_likelihoods([h, free_run])
+    return with_noise - without
+
+
+def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]:
+    """Parameters of the baseline and of what was added, intervals robust to correlated residuals."""
+    s, seen = problem.supermodel, problem.seen
+    e, J = problem.slopes([h])
+    w = h.whitener(e[0], seen)
+    W = h.whitener(J[0, : h.moved], seen)
+    R, coordinates = len(h.x0), FitCoordinates.of(h, problem.windows)
+    parts = []
+    for r in range(R):
+        for k, samples in problem.windows.of(r):
+            inside = seen[r, samples] > 0
+            if not inside.any():  # a recording that does not count
+                continue
+            slopes = np.moveaxis(W[:, r, samples], 0, -1)[inside]
+            parts.append(RecordingSlopes(slopes, w[r, samples][inside], coordinates.columns(r, k)))
+    covariance = sandwich(parts, curvature(parts, coordinates.size))
+    values, derivative = h.physical(s)
+    clean = s.clean(values.mean(axis=0), h.locations)
+    indices = [s.mechanism.parameter_names.index(name) for name in clean.parameter_names]
+
+    def combination(i: int) -> Combination | None:
+        if i in h.free:
+            return Combination([h.free.index(i)], derivative[:1, i])
+        if i in h.local:
+            return Combination(
+                [int(coordinates.local_columns(r)[h.local.index(i)]) for r in range(R)], derivative[:, i] / R
+            )
+        return None
+
+    def note(i: int) -> str:
+        differs = i in h.local and R > 1
+        return "mean of " + ", ".join(f"{v:.3g}" for v in values[:, i]) if differs else ""
+
+    return inference.estimates(
+        clean.parameter_names,
+        values.mean(axis=0)[indices],
+        clean.parameter_specifications,
+        [combination(i) for i in indices],
+        covariance,
+        [note(i) for i in indices],
+    )
+
+
+def disagreement(
+    training: Sequence[Estimate], validation: Sequence[Estimate], location: EffectLocation
+) -> str | None:
+    """Which amplitude of an effect differs between recordings, in words; None where all agree.
+
+    Amplitudes fitted to two sets of recordings agree where their difference lies within the intervals, or
+    where it is no more than `SAME_SIZE` of the larger one.
+
+    Args:
+        training: Estimates from the training recordings.
+        validation: Estimates from the validation recordings.
+        location: The effect.
+    """
+    head = f"{location.port}.{location.effect}."
+    other = {e.name: e for e in validation}
+    for e in training:
+        short = e.name.removeprefix(head)
+        if not e.name.startswith(head) or short not in CATALOG[location.effect].amplitudes:
+            continue
+        if e.name not in other:
+            continue
+        a, b = e, other[e.name]
+        spread = np.nan_to_num(np.hypot(a.std, b.std), nan=np.inf)
+        difference = abs(a.value - b.value)
+        if difference > 2 * spread and difference > SAME_SIZE * max(abs(a.value), abs(b.value)):
+            return f"{short} is {a.value:.3g} {a.unit} here and {b.value:.3g} {b.unit} in the validation data"
+    return None
+
+
+def own_estimates(stage: Stage, location: EffectLocation) -> dict[str, Estimate]:
+    """Estimates of one effect of a stage, by short name."""
+    head = f"{location.port}.{location.effect}."
+    return {e.name.removeprefix(head): e for e in stage.estimates if e.name.startswith(head)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Recordings on which finished models are evaluated, with and without offsets of their own.
+
+    Attributes:
+        validation: Free runs over the validation recordings.
+        test: Free runs over recordings that had no say; None without any.
+        calibrate_seconds: How much of a recording its own offsets may be fitted to [s].
+    """
+
+    validation: ValidationSet
+    test: ValidationSet | None
+    calibrate_seconds: float
+
+    @classmethod
+    def of(
+        cls, model: Model, horizons: Horizons, test: Sequence[Recording], calibrate_seconds: float
+    ) -> "Evaluation":
+        """What the recordings of a search and further ones are evaluated with."""
+        validation, other = horizons.free_run.validation, None
+        if test:
+            check_signs(model, test)
+            problem, seconds = validation.problem, validation.window_seconds
+            length = max(problem.seen.shape[1], padded_length(test))
+            dataset = prepare(model, test, length=length, like=problem.dataset)
+            s, solver, number = problem.supermodel, problem.predictor.solver, problem.windows.number
+            whole = LikelihoodProblem.of(s, solver, dataset, problem.ports)
+            cut = whole.of_free_runs(Windows.of_seconds(model, dataset, seconds, number))
+            other = ValidationSet(cut, seconds)
+        return cls(validation, other, calibrate_seconds)
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """Those that had no say."""
+        return self.test.problem.dataset.recordings if self.test else ()
+
+    def of_stage(
+        self, stage: Stage, validated: ValidatedHypothesis, locations: Sequence[EffectLocation]
+    ) -> Stage:
+        """A stage with the errors on test recordings, and with the calibrated ones.
+
+        Args:
+            stage: With the errors on validation recordings.
+            validated: Its parameters.
+            locations: What its model has.
+        """
+        trained = dataclasses.replace(validated, folds=())
+        found: dict[str, Any] = {"calibrate_seconds": self.calibrate_seconds}
+        if self.calibrate_seconds:
+            found["calibrated"] = errors_with_own_calibration(
+                self.validation, validated, locations, self.calibrate_seconds
+            )
+        if self.test:
+            found["test"] = errors_as_trained(self.test, validated.hypothesis, locations)
+            if self.calibrate_seconds:
+                found["test_calibrated"] = errors_with_own_calibration(
+                    self.test, trained, locations, self.calibrate_seconds
+                )
+        return dataclasses.replace(stage, **found)
+
+
+def estimates_of_validation(horizon: Horizon, found: ValidatedHypothesis) -> tuple[tuple[Estimate, ...], ...]:
+    """The parameters of a model fitted to the validation recordings, from where training has left them.
+
+    What agrees with the training recordings is a property of the machine; no choice rests on these fits.
+    Where runs validate each other, each is fitted alone.
+    """
+    sets = [f.validation for f in horizon.validation.folds] or [horizon.validation]
+    starts = [found.hypothesis] * len(sets) if horizon.validation.folds else [found.adapted]
+    out = []
+    for problem, h in zip((v.problem for v in sets), starts, strict=True):
+        start = problem.evaluated(h, problem.innovations([h])[0])
+        if np.isfinite(start.log_likelihood):
+            out.append(estimates(problem, refit(problem, [start], alternations=1)[0]))
+    return tuple(out)
