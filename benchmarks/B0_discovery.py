@@ -38,6 +38,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -131,21 +132,33 @@ def again(row: Job) -> dict[str, Any]:
 def rows(
     todo: list[Job], workers: int, task: Callable[[Job], dict[str, Any]] = one
 ) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Rows as they are ready; a process that dies takes only its own records with it."""
+    """Rows as they are ready; what was running when a process died is begun again."""
     if workers == 1:
         prepare()
         yield from ((job, task(job)) for job in todo)
         return
     context = get_context("spawn")
     started = context.Value("i", 0)
-    with ProcessPoolExecutor(workers, context, initializer=prepare, initargs=(started,)) as pool:
-        running = {pool.submit(task, job): job for job in todo}
-        for done in as_completed(running):
-            job = running[done]
-            try:
-                yield job, done.result()
-            except Exception as problem:  # a dead process is a row too
-                yield job, {**job, "error": f"{type(problem).__name__}: {problem}", "lines": []}
+    left = todo
+    while left:
+        broken = list[Job]()
+        with ProcessPoolExecutor(workers, context, initializer=prepare, initargs=(started,)) as pool:
+            running = {pool.submit(task, job): job for job in left}
+            for done in as_completed(running):
+                job = running[done]
+                try:
+                    row = done.result()
+                except BrokenProcessPool:
+                    broken.append(job)
+                    continue
+                except Exception as problem:  # a failure is a row too
+                    row = {**job, "error": f"{type(problem).__name__}: {problem}", "lines": []}
+                yield job, row
+        if len(broken) == len(left):  # none got through
+            for job in broken:
+                yield job, {**job, "error": "its process died", "lines": []}
+            return
+        left = broken
 
 
 def provenance() -> dict[str, Any]:
@@ -162,6 +175,7 @@ def provenance() -> dict[str, Any]:
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "commit": git("rev-parse", "--short", "HEAD"),
         "changed": bool(git("status", "--porcelain", "--", "../rotflex_jax")),
+        "clean": not git("status", "--porcelain"),
         "code": code.hexdigest()[:12],
         "arena": arena.hexdigest()[:12],
         "python": platform.python_version(),

@@ -208,7 +208,8 @@ def test_marks_of_a_world():
 
 def test_page_of_worlds(tmp_path):
     error = {"theta": 0.02, "alpha": None}
-    stages = {"baseline": {"whole": error, "windows": error}, "final": {"whole": error, "windows": error}}
+    kinds = ("whole", "windows", "whole_calibrated", "windows_calibrated")
+    stages = {stage: dict.fromkeys(kinds, error) for stage in ("baseline", "final")}
     rounds = [{"effect": "coulomb", "port": "hub", "equivalent": [], "status": "provisional"}]
     row = {
         "world": 300,

@@ -37,7 +37,7 @@ def said(row: Row) -> str:
 
 def degrees(row: Row, recording: str, kind: str) -> str:
     """Errors of theta and alpha on a recording, before and after the search [deg]."""
-    pair = lambda e: " / ".join("-" if v is None else f"{math.degrees(v):.2f}" for v in e.values())  # noqa: E731
+    pair = lambda e: " / ".join("-" if v is None else f"{math.degrees(v):.2f}" for v in (e or {}).values())  # noqa: E731
     stages = row["errors"][recording]
     return f"{pair(stages['baseline'][kind])} -> {pair(stages['final'][kind])}"
 
@@ -57,7 +57,9 @@ def show_worlds(console: Console, records: list[Row]) -> None:
         answered = said(row).replace("[", "(").replace("]", ")")
         marks = (mark(row["named"]), mark(row["first"]), wrong, row["verdict"])
         times = (f"{row['wall_s']:.0f}", f"{row['cpu_s']:.0f}")
-        table.add_row(*head, besides_in(row), answered, *marks, degrees(row, "test", "windows"), *times)
+        table.add_row(
+            *head, besides_in(row), answered, *marks, degrees(row, "test", "windows_calibrated"), *times
+        )
     console.print(table)
     console.print(summary(records), markup=False)
 
@@ -104,7 +106,7 @@ def count(rows: list[Row], key: str) -> str:
     return f"{sum(found)} in {sum(n > 0 for n in found)}/{len(rows)} worlds"
 
 
-def ratios(rows: list[Row], recording: str = "test", kind: str = "windows") -> str:
+def ratios(rows: list[Row], recording: str = "test", kind: str = "windows_calibrated") -> str:
     """Median of final over baseline error, theta / alpha."""
     parts = []
     for channel in ("theta", "alpha"):
@@ -145,7 +147,8 @@ def written(records: list[Row]) -> str:
         "Feedback, counted angles, wrong trusted constants, an offset of each run, and things besides that",
         "no candidate has. Named: found, or listed as equivalent to what was found. Wrong: neither hidden",
         "nor a right name of something besides. Errors in degrees, theta / alpha, free runs of 2 s and",
-        "whole runs, before -> after the search; the test record had no say.",
+        "whole runs, before -> after the search, with the voltage offset found on the first 2 s of the",
+        "record that is run; the test record had no say.",
         "",
         "| worlds | count | named | of it established | named first | wrong, established | wrong, "
         "provisional | test windows, after / before | test whole |",
@@ -156,7 +159,7 @@ def written(records: list[Row]) -> str:
         part = lambda key, rows=hidden: f"{sum(bool(r[key]) for r in rows)}/{len(rows)}"  # noqa: E731
         cells = [name, str(len(rows)), *map(part, ("named", "named_established", "first"))]
         cells += [count(rows, "wrong_established"), count(rows, "wrong_provisional")]
-        cells += [ratios(rows), ratios(rows, kind="whole")]
+        cells += [ratios(rows), ratios(rows, kind="whole_calibrated")]
         lines.append("| " + " | ".join(cells) + " |")
     lines += [
         "",
@@ -168,7 +171,7 @@ def written(records: list[Row]) -> str:
     for r in sorted(good(records), key=lambda r: r["world"]):
         cells = [str(r["world"]), hidden_in(r), besides_in(r), said(r), word[r["named"]], word[r["first"]]]
         cells += [
-            degrees(r, "validation", "windows"),
+            degrees(r, "validation", "windows_calibrated"),
             degrees(r, "test", "windows"),
             degrees(r, "test", "whole"),
         ]

@@ -9,28 +9,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-import rotflex_jax as rf
 from arena.laws import Place
 from arena.scoring import alike
-from arena.trial import WINDOW, windows_error
 from arena.wrong_worlds import World, world
-
-ESTABLISHED, PROVISIONAL = "established", "provisional"
-
-
-def rounds_of(result: rf.Discovery) -> list[dict[str, Any]]:
-    """What a search found, as its JSON has it; a search without the word calls all of it established."""
-    return [
-        {
-            "effect": r["effect"],
-            "port": r["port"],
-            "equivalent": [[e["effect"], e["port"]] for e in r["equivalent"]],
-            "status": r.get("status", ESTABLISHED),
-            "nats": r["evidence"]["held_out_gain_nats"],
-            "score": r["evidence"]["score"],
-        }
-        for r in result.to_dict()["rounds"]
-    ]
+from judged import ESTABLISHED, PROVISIONAL, errors, named, searched
 
 
 def marks(
@@ -87,13 +69,6 @@ def told(w: World) -> dict[str, Any]:
     }
 
 
-def errors(model: rf.Model, recording: rf.Recording) -> dict[str, dict[str, float | None]]:
-    """Root mean square errors of one free run and of runs of two seconds [rad]."""
-    whole = rf.metrics.rmse(recording, model.simulate(recording))
-    plain = lambda e: {c: float(v) if math.isfinite(v) else None for c, v in e.items()}  # noqa: E731
-    return {"whole": plain(whole), "windows": plain(windows_error(model, recording))}
-
-
 def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Searches one world and marks the answer; a failure is a row with its error.
 
@@ -115,10 +90,10 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
         w = world(job["world"])
         row.update(told(w))
         wall, cpu = time.perf_counter(), time.process_time()
-        result = rf.discover(w.model, w.train, w.validation, window_seconds=WINDOW, progress=say)
+        result = searched(w.model, [w.train], [w.validation], [w.test], say)
         row["wall_s"] = time.perf_counter() - wall
         row["cpu_s"] = time.process_time() - cpu
-        rounds = rounds_of(result)
+        rounds = named(result)
         row.update(
             marks(w.hidden, [b.names for b in w.besides], rounds),
             rounds=rounds,
@@ -131,7 +106,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
             noise_floor=dict(result.noise_floor),
             errors={
                 name: {
-                    stage: errors(model, recording)
+                    stage: errors(model, [recording])
                     for stage, model in (("baseline", result.baseline.model), ("final", result.model))
                 }
                 for name, recording in (("validation", w.validation), ("test", w.test))
