@@ -182,6 +182,8 @@ def test_a_world_is_three_runs_of_one_machine_and_always_the_same(seed):
     }
     assert len(w.besides) >= 3
     json.dumps(told(w))  # a row of results
+    assert w.model.free_names == rf.joints.paper().free_names
+    assert w.truth["plant"]["R_m"] != Plant.R_m  # which the model trusts
 
 
 def test_marks_of_a_world():
@@ -230,9 +232,3 @@ def test_page_of_worlds(tmp_path):
     assert "(coulomb@hub)" in text and "1.15 / - -> 1.15 / -" in text
     assert "failed 1" in summary([row, failed])
     assert publish_worlds([failed], tmp_path / "no.json") == []
-
-
-def test_the_model_of_a_world_is_the_textbook_joint():
-    w = world(404)
-    assert w.model.free_names == rf.joints.paper().free_names
-    assert w.truth["plant"]["R_m"] != Plant.R_m  # which the model trusts

@@ -90,11 +90,25 @@ def together(runs: Sequence[rf.Recording]) -> Direction:
 
 
 def crossed(runs: Mapping[str, rf.Recording]) -> list[Direction]:
-    """From each run to all others, then all together."""
-    ways = []
-    for name, run in runs.items():
-        others = {k: r for k, r in runs.items() if k != name}
-        ways.append(learnt(f"{name} to {' and '.join(others)}", [run], list(others.values())))
+    """From each run to the others, then all together.
+
+    Of two runs, the end of the one that is learnt from decides, or else the first half of the other one,
+    whose second half judges. Of three, the next one decides and the third judges.
+    """
+    names, ways = list(runs), list[Direction]()
+    for k, name in enumerate(names):
+        run, following = runs[name], names[(k + 1) % len(names)]
+        if len(names) == 2:
+            other = runs[following]
+            ways.append(learnt(f"{name} to {following}", [run], [other]))
+            decides, judges = other.split(0.5)
+            ways.append(
+                Direction(f"{name} and half of {following} to the rest", (run,), (decides,), (judges,))
+            )
+        else:
+            last = {n: r for n, r in runs.items() if n not in (name, following)}
+            title = f"{name}, decided on {following}, to {' and '.join(last)}"
+            ways.append(Direction(title, (run,), (runs[following],), tuple(last.values())))
     return [*ways, together(list(runs.values()))]
 
 
