@@ -172,8 +172,8 @@ def written(records: list[Row]) -> str:
         cells = [str(r["world"]), hidden_in(r), besides_in(r), said(r), word[r["named"]], word[r["first"]]]
         cells += [
             degrees(r, "validation", "windows_calibrated"),
-            degrees(r, "test", "windows"),
-            degrees(r, "test", "whole"),
+            degrees(r, "test", "windows_calibrated"),
+            degrees(r, "test", "whole_calibrated"),
         ]
         lines.append("| " + " | ".join([*cells, f"{r['wall_s']:.0f}"]) + " |")
     failed = [r for r in records if "error" in r]
