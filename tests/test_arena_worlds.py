@@ -212,7 +212,7 @@ def test_page_of_worlds(tmp_path):
     error = {"theta": 0.02, "alpha": None}
     kinds = ("whole", "windows", "whole_calibrated", "windows_calibrated")
     stages = {stage: dict.fromkeys(kinds, error) for stage in ("baseline", "final")}
-    stages["final"] |= dict.fromkeys(kinds[:2], {"theta": 9.0, "alpha": 9.0})  # another offset: not compared
+    stages["final"] |= {k: {"theta": 9.0, "alpha": 9.0} for k in kinds[:2]}  # another offset: not compared
     rounds = [{"effect": "coulomb", "port": "hub", "equivalent": [], "status": "provisional"}]
     row = {
         "world": 300,
