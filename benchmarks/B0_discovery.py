@@ -14,6 +14,12 @@ report seeds.
 
     python benchmarks/B0_discovery.py --oracles
 
+    python benchmarks/B0_discovery.py --wrong-worlds 96 --workers 16
+    python benchmarks/B0_discovery.py --wrong-worlds 24 --tuning
+
+Wrong worlds (`arena.wrong_worlds`) are what laboratories record, of machines whose model is wrong in more
+than one way. They have seeds, results and a page of their own (`results/B0_wrong_worlds.json`).
+
 Records that the file has already are skipped unless `--fresh` is given; every run adds to the file, and
 the tables and figures beside it are of all its records.
 """
@@ -32,6 +38,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -48,6 +55,8 @@ from arena.hidden import DEFAULTS, OUTSIDE
 from arena.pages import publish
 from arena.records import INPUTS
 from arena.table import answer, label, show
+from arena.wrong_seeds import REPORT as WORLDS_REPORT, TUNING as WORLDS_TUNING
+from arena.wrong_table import publish_worlds, show_worlds
 
 TUNING, REPORT = tuple(range(100, 120)), tuple(range(1000, 1020))
 Job = dict[str, Any]
@@ -80,19 +89,35 @@ def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job
 
 def key(job: Job) -> str:
     """Name of a record in the results."""
+    if "world" in job:
+        return f"wrong world|{job['world']}"
     return f"{label(job)}|{job['kind']}|{job['seed']}|{job['seconds']:g}s"
 
 
-def prepare() -> None:
-    """Settings of a process, ahead of JAX."""
-    from rotflex_jax.runtime.xla import enable_fast_loops
+def prepare(started: Any = None) -> None:
+    """Settings of a process, ahead of JAX.
+
+    Args:
+        started: counter of the processes that share this machine; each keeps to one core then, and JAX starts
+            as many threads as it has cores. None for a process that is alone.
+    """
+    from rotflex_jax.runtime.xla import bind_to_cores, cores, enable_fast_loops
 
     enable_fast_loops()
+    if started is not None:
+        with started.get_lock():
+            place = started.value
+            started.value += 1
+        every = cores()
+        bind_to_cores(place % every, every)
 
 
 def one(job: Job) -> dict[str, Any]:
     """A job in a process of its own; imports late, after the settings."""
-    from arena.trial import trial
+    if "world" in job:
+        from arena.wrong_trial import trial
+    else:
+        from arena.trial import trial
 
     return trial(job)
 
@@ -107,26 +132,42 @@ def again(row: Job) -> dict[str, Any]:
 def rows(
     todo: list[Job], workers: int, task: Callable[[Job], dict[str, Any]] = one
 ) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Rows as they are ready; a process that dies takes only its own records with it."""
+    """Rows as they are ready; what was running when a process died is begun again."""
     if workers == 1:
         prepare()
         yield from ((job, task(job)) for job in todo)
         return
-    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=prepare) as pool:
-        running = {pool.submit(task, job): job for job in todo}
-        for done in as_completed(running):
-            job = running[done]
-            try:
-                yield job, done.result()
-            except Exception as problem:  # a dead process is a row too
-                yield job, {**job, "error": f"{type(problem).__name__}: {problem}", "lines": []}
+    context = get_context("spawn")
+    started = context.Value("i", 0)
+    left = todo
+    while left:
+        broken = list[Job]()
+        with ProcessPoolExecutor(workers, context, initializer=prepare, initargs=(started,)) as pool:
+            running = {pool.submit(task, job): job for job in left}
+            for done in as_completed(running):
+                job = running[done]
+                try:
+                    row = done.result()
+                except BrokenProcessPool:
+                    broken.append(job)
+                    continue
+                except Exception as problem:  # a failure is a row too
+                    row = {**job, "error": f"{type(problem).__name__}: {problem}", "lines": []}
+                yield job, row
+        if len(broken) == len(left):  # none got through
+            for job in broken:
+                yield job, {**job, "error": "its process died", "lines": []}
+            return
+        left = broken
 
 
 def provenance() -> dict[str, Any]:
     """What produced the numbers."""
-    code = hashlib.sha256()
+    code, arena = hashlib.sha256(), hashlib.sha256()
     for file in sorted((HERE.parent / "rotflex_jax").rglob("*.py")):
         code.update(file.read_bytes())
+    for file in sorted((HERE / "arena").glob("*.py")):
+        arena.update(file.read_bytes())
     git = lambda *a: subprocess.run(  # noqa: E731
         ["git", "-C", str(HERE), *a], capture_output=True, text=True, check=False
     ).stdout.strip()
@@ -134,7 +175,9 @@ def provenance() -> dict[str, Any]:
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "commit": git("rev-parse", "--short", "HEAD"),
         "changed": bool(git("status", "--porcelain", "--", "../rotflex_jax")),
+        "clean": not git("status", "--porcelain"),
         "code": code.hexdigest()[:12],
+        "arena": arena.hexdigest()[:12],
         "python": platform.python_version(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "versions": {n: importlib.metadata.version(n) for n in ("jax", "numpy", "scipy")},
@@ -164,6 +207,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a record [s]")
     parser.add_argument("--quick", action="store_true", help="one seed, one input, 10 s, 5 nulls")
     parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument(
+        "--wrong-worlds", type=int, default=0, metavar="COUNT", help="so many wrong worlds, instead"
+    )
     parser.add_argument("--oracles", action="store_true", help="of all known records anew, no search")
     parser.add_argument("--fresh", action="store_true", help="do not reuse records in the file")
     parser.add_argument("--out", type=Path, default=None, help="results file")
@@ -173,22 +219,28 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     """Run what is missing, save after each record, print the table."""
     a = arguments()
-    seeds = [int(s) for s in a.seeds.split(",") if s] or list((TUNING if a.tuning else REPORT)[:2])
+    of = {True: (WORLDS_TUNING, WORLDS_REPORT), False: (TUNING, REPORT)}[bool(a.wrong_worlds)]
+    known_seeds, first = of[0] if a.tuning else of[1], a.wrong_worlds or 2
+    seeds = [int(s) for s in a.seeds.split(",") if s] or list(known_seeds[:first])
     inputs = [k for k in a.inputs.split(",") if k]
     if set(inputs) - set(INPUTS):
         raise SystemExit(f"--inputs was given {a.inputs}; choose from {', '.join(INPUTS)}.")
-    wrong = [s for s in seeds if s not in (TUNING if a.tuning else REPORT)]
+    wrong = [s for s in seeds if s not in known_seeds]
     if wrong:
         kind = "tuning" if a.tuning else "report"
         raise SystemExit(f"--seeds was given {wrong}, which are no {kind} seeds.")
     if a.quick:
         seeds, inputs, a.seconds = seeds[:1], inputs[:1], 10.0
         a.nulls = min(5 if a.nulls is None else a.nulls, 5)
-    suffix = ("_tuning" if a.tuning else "") + ("_quick" if a.quick else "")
+    if a.wrong_worlds and (a.quick or a.oracles):
+        raise SystemExit("--wrong-worlds has neither --quick nor --oracles; give a smaller COUNT.")
+    suffix = "_wrong_worlds" if a.wrong_worlds else ""
+    suffix += ("_tuning" if a.tuning else "") + ("_quick" if a.quick else "")
     path = a.out or HERE / "results" / f"B0{suffix}.json"
-    wanted = jobs(a, seeds, inputs)
+    wanted = [{"world": s} for s in seeds] if a.wrong_worlds else jobs(a, seeds, inputs)
     made = provenance()
-    results: dict[str, Any] = {"benchmark": "B0", "runs": [], "records": {}}
+    title = "B0, wrong worlds" if a.wrong_worlds else "B0"
+    results: dict[str, Any] = {"benchmark": title, "runs": [], "records": {}}
     if path.exists() and not a.fresh:
         results = json.loads(path.read_text())
     results["runs"].append({**made, "arguments": sys.argv[1:]})
@@ -210,11 +262,11 @@ def main() -> int:
         text = f"{count}/{len(todo)} {key(job)} -> {got} ({left:.0f} s left)"
         console.print(text, markup=False, soft_wrap=True)
     shown = [known[key(j)] for j in wanted]
-    show(console, shown)
+    (show_worlds if a.wrong_worlds else show)(console, shown)
     codes = {r.get("code") for r in shown}
     if len(codes) > 1:
         console.print(f"[yellow]These records come from {len(codes)} versions of the package.[/]")
-    for file in (path, *publish(list(known.values()), path)):
+    for file in (path, *(publish_worlds if a.wrong_worlds else publish)(list(known.values()), path)):
         console.print(f"saved: {file}", markup=False, soft_wrap=True)
     return int(any("error" in r for r in shown))
 

@@ -11,5 +11,8 @@ nothing of the fitted parametrisation.
 * `arena.hidden` - names, ports, default sizes, and what no recording can tell apart;
 * `arena.laws` - from a name and parameters to the plant's tables;
 * `arena.excite` - the input voltages;
-* `arena.records` - `make_record`: plant + hidden effects + input -> a recording and its truth.
+* `arena.records` - `make_record`: plant + hidden effects + input -> a recording and its truth;
+* `arena.closed_loop` - the same plant under a controller (`control`), with a laboratory's sensors;
+* `arena.wrong_worlds` - `world`: three such runs of a machine that is wrong in more than one way;
+  `seen` says whether what it hides is visible.
 """

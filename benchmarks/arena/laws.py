@@ -31,6 +31,7 @@ _TORQUE: dict[str, dict[str, tuple[int, ...]]] = {
     "patchy_friction": {"level": (t.PATCHY,), "share": (t.PATCHY_SHARE,)},
     "drifting_spring": {"drift": (t.DRIFT,)},
     "shaking": {"amplitude": (t.SHAKE,), "frequency": (t.SHAKE_RATE,)},
+    "push": {"amplitude": (t.PUSH,), "centre": (t.PUSH_AT,), "width": (t.PUSH_WIDTH,)},
 }
 _VOLTAGE: dict[str, dict[str, tuple[int, ...]]] = {
     "dead_zone": {"width": (t.DEAD_PLUS, t.DEAD_MINUS)},

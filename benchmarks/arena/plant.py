@@ -95,23 +95,95 @@ class Course(NamedTuple):
 
 
 @compiled
-def _run(drive, h, tables, start):
-    """States at the start of every sample."""
+def working_space():
+    """Memory of `arena.motion.step`, friction impulses at zero."""
+    return Space(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+
+
+@compiled
+def sample(x, new, side, drive, first, h, tables, space):
+    """Carry `x` over one sample.
+
+    Args:
+        x: state; receives the one at the end.
+        new: memory of the same size and content.
+        side: contact of the gear, as in `arena.gear.geared_step`.
+        drive: torque of the cold motor at rest in every step of the sample.
+        first: number of its first step, which tells the time.
+        h: length of a step [s].
+        tables: `arena.tables.Tables`.
+        space: `arena.motion.Space`.
+
+    Returns:
+        The contact at the end.
+    """
+    play = tables.motor[GEAR_PLAY] > 0
+    for i in range(drive.size):
+        t = (first + i) * h
+        if play:
+            side = geared_step(x, new, side, drive[i], t, h, tables, space)
+        else:
+            step(x, new, drive[i], t + 0.5 * h, h, True, tables, space)
+            x[:] = new
+    return side
+
+
+@compiled
+def run(drive, h, tables, start, first):
+    """States at the start of every sample.
+
+    Args:
+        drive: torque of the cold motor at rest, ``(N, substeps)``.
+        h: length of a step [s].
+        tables: `arena.tables.Tables`.
+        start: whole state at the first sample.
+        first: number of the first step, which tells the time.
+    """
     N, substeps = drive.shape
     x, new = start.copy(), start.copy()
     out = np.empty((N, x.size))
-    space = Space(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    play, side = tables.motor[GEAR_PLAY] > 0, 0
+    space, side = working_space(), 0
     for k in range(N):
         out[k] = x
-        for i in range(substeps):
-            t = (k * substeps + i) * h
-            if play:
-                side = geared_step(x, new, side, drive[k, i], t, h, tables, space)
-            else:
-                step(x, new, drive[k, i], t + 0.5 * h, h, True, tables, space)
-                x, new = new, x
+        side = sample(x, new, side, drive[k], first + k * substeps, h, tables, space)
     return out
+
+
+def tables_of(plant: Plant, laws: Laws) -> Tables:
+    """Constants and laws as the compiled loops read them."""
+    emf = plant.torque_per_volt * plant.k_m * plant.K_g
+    free = laws.torque.copy()
+    free[JOINT, VISCOUS] += plant.B_joint
+    free[JOINT, STIFFNESS] += plant.K
+    engaged = free.copy()
+    engaged[HUB, VISCOUS] += plant.B_hub + emf
+    free[HUB, VISCOUS] += plant.B_hub
+    J = np.array([plant.J_hub, plant.J_arm, ROTOR_SHARE * plant.J_hub])
+    return Tables(J, emf, engaged, free, rough(free), laws.hysteresis, laws.modes, laws.motor)
+
+
+def state_of(laws: Laws, start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)) -> Array:
+    """Whole state with these angles and speeds, everything else as `course` says."""
+    x = np.zeros(MEMORY + len(laws.hysteresis))
+    theta, alpha, hub, joint = start
+    arm = hub + joint
+    x[[THETA, ALPHA, W_HUB, W_ARM]] = theta, alpha, hub, arm
+    x[[R_ANGLE, R_SPEED]] = theta, hub
+    x[MODES:MEMORY] = theta, hub, theta + alpha, arm
+    return x
+
+
+def course_of(states: Array) -> Course:
+    """States of `run` by name."""
+    motion = states[:, [THETA, ALPHA, W_HUB, W_ARM]]
+    motion[:, 3] -= motion[:, 2]
+    return Course(
+        motion,
+        states[:, [R_ANGLE, R_SPEED]],
+        states[:, HEAT],
+        states[:, MODES:MEMORY],
+        states[:, MEMORY:],
+    )
 
 
 def course(
@@ -136,26 +208,9 @@ def course(
         step: longest integration step [s].
     """
     substeps = max(1, round(Ts / step))
-    h, gain = Ts / substeps, plant.torque_per_volt
-    free, emf = laws.torque.copy(), gain * plant.k_m * plant.K_g
-    free[JOINT, VISCOUS] += plant.B_joint
-    free[JOINT, STIFFNESS] += plant.K
-    engaged = free.copy()
-    engaged[HUB, VISCOUS] += plant.B_hub + emf
-    free[HUB, VISCOUS] += plant.B_hub
-    J = np.array([plant.J_hub, plant.J_arm, ROTOR_SHARE * plant.J_hub])
-    tables = Tables(J, emf, engaged, free, rough(free), laws.hysteresis, laws.modes, laws.motor)
-    x = np.zeros(MEMORY + len(laws.hysteresis))
-    theta, alpha, hub, joint = start
-    arm = hub + joint
-    x[[THETA, ALPHA, W_HUB, W_ARM]] = theta, alpha, hub, arm
-    x[[R_ANGLE, R_SPEED]] = theta, hub
-    x[MODES:MEMORY] = theta, hub, theta + alpha, arm
-    drive = gain * supply(np.ascontiguousarray(u, dtype=np.float64), laws.volts, substeps, h)
-    out = _run(drive, h, tables, x)
-    motion = out[:, [THETA, ALPHA, W_HUB, W_ARM]]
-    motion[:, 3] -= motion[:, 2]
-    return Course(motion, out[:, [R_ANGLE, R_SPEED]], out[:, HEAT], out[:, MODES:MEMORY], out[:, MEMORY:])
+    h = Ts / substeps
+    path = supply(np.ascontiguousarray(u, dtype=np.float64), laws.volts, substeps, h)
+    return course_of(run(plant.torque_per_volt * path, h, tables_of(plant, laws), state_of(laws, start), 0))
 
 
 def simulate(

@@ -32,7 +32,9 @@ COGGING, COGGING_PHASE, PERIODS, PLAY = 11, 12, 13, 14
 # Of these the package has no counterpart: friction that depends on the angle, a stiffness that
 # grows in proportion to time, a torque that is a sine of time.
 PATCHY, PATCHY_SHARE, DRIFT, SHAKE, SHAKE_RATE = 15, 16, 17, 18, 19
-LAWS = 20
+# Nor for a push ``P exp(-((z - c) / w)^2)`` that is felt around one position only.
+PUSH, PUSH_AT, PUSH_WIDTH = 20, 21, 22
+LAWS = 23
 
 # Entries of the voltage table, in the order in which the voltage meets them.
 LIMIT, OFFSET, DEAD_PLUS, DEAD_MINUS, DELAY, LAG = 0, 1, 2, 3, 4, 5

@@ -21,6 +21,9 @@ from arena.tables import (
     PERIODS,
     PHASE,
     PLAY,
+    PUSH,
+    PUSH_AT,
+    PUSH_WIDTH,
     QUADRATIC,
     RATE,
     RISE,
@@ -48,6 +51,8 @@ def of_the_moment(c, z, s, t):
         f -= c[STIFFNESS] * c[DRIFT] * t * z
     if c[SHAKE] != 0.0:
         f += c[SHAKE] * np.sin(c[SHAKE_RATE] * t)
+    if c[PUSH] != 0.0:
+        f += c[PUSH] * np.exp(-(((z - c[PUSH_AT]) / c[PUSH_WIDTH]) ** 2))
     return f
 
 

@@ -18,14 +18,19 @@ def amplified(u: Array, volts: Array) -> Array:
     )
 
 
+def _split(steps: float) -> tuple[int, float]:
+    """Whole steps of a delay, and the rest."""
+    whole = int(np.floor(steps + 1e-9))
+    rest = steps - whole
+    return whole, rest if rest > 1e-9 else 0.0
+
+
 def delayed(v: Array, steps: float, before: float) -> Array:
     """Mean over each step of a voltage that comes `steps` steps late, `before` until then."""
-    whole = int(np.floor(steps + 1e-9))
-    part = max(steps - whole, 0.0)
-    part = part if part > 1e-9 else 0.0
-    padded = np.concatenate([np.full(whole + 1, before), v])
+    whole, rest = _split(steps)
     # A change inside a step counts for the part of the step that it is there.
-    return (1 - part) * padded[1 : v.size + 1] + part * padded[: v.size]
+    padded = np.concatenate([np.full(whole + 1, before), v])
+    return (1 - rest) * padded[1 : v.size + 1] + rest * padded[: v.size]
 
 
 @compiled
@@ -36,12 +41,12 @@ def _lagged(v, ratio, state):
     for k in range(v.size):
         out[k] = v[k] + (state - v[k]) * mean
         state = v[k] + (state - v[k]) * left
-    return out
+    return out, state
 
 
 def lagged(v: Array, ratio: float, before: float) -> Array:
     """Mean over each step of ``dx/dt = (v - x) / time``, `ratio` being step over time."""
-    return _lagged(v, ratio, before)
+    return _lagged(v, ratio, before)[0]
 
 
 def supply(u: Array, volts: Array, substeps: int, h: float) -> Array:
@@ -65,3 +70,32 @@ def supply(u: Array, volts: Array, substeps: int, h: float) -> Array:
     if volts[LAG] > 0:
         v = lagged(v, h / volts[LAG], before)
     return v.reshape(u.size, substeps)
+
+
+class Path:
+    """The same way, where the next voltage is known only after the last sample: rows of `supply`.
+
+    Args:
+        volts: coefficients of the path.
+        substeps: integration steps per sample.
+        h: length of a step [s].
+    """
+
+    def __init__(self, volts: Array, substeps: int, h: float):
+        self.volts, self.substeps, self.h = volts, substeps, h
+        before = float(amplified(np.zeros(1), volts)[0])
+        self.late = volts[DELAY] / h
+        self.past = np.full(_split(self.late)[0] + 1, before)
+        self.lagging = before
+
+    def __call__(self, u: float) -> Array:
+        """Voltage at the motor in every step of the next sample [V], ``(substeps,)``."""
+        v = np.repeat(amplified(np.array([u]), self.volts), self.substeps)
+        if self.volts[DELAY] > 0:
+            n, rest = self.substeps, _split(self.late)[1]
+            line = np.concatenate([self.past, v])
+            v = (1 - rest) * line[1 : n + 1] + rest * line[:n]
+            self.past = line[n:]
+        if self.volts[LAG] > 0:
+            v, self.lagging = _lagged(v, self.h / self.volts[LAG], self.lagging)
+        return v

@@ -30,10 +30,11 @@ OWN = "from speed.machine import SmoothFriction; joint = joint + SmoothFriction(
 END = "\nrf.fit(joint, rf.Recording(u=kept['u'], y=kept['y'], Ts=float(kept['Ts'])))"
 
 
-def process(code: str, *arguments: str, cache: str) -> dict[str, Any]:
+def process(code: str, *arguments: str, cache: str, show: bool = False) -> dict[str, Any]:
     """A new Python: its seconds by the clock and of the processor, and the JSON of its last line, if any.
 
-    It may keep the byte code of what it imports, as an installed package does.
+    It may keep the byte code of what it imports, as an installed package does. With `show` its errors and
+    progress go where those of this process go.
     """
     known = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     known["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
@@ -41,7 +42,12 @@ def process(code: str, *arguments: str, cache: str) -> dict[str, Any]:
     used = lambda: sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])  # noqa: E731
     began, worked = time.perf_counter(), used()
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True, env=known
+        [sys.executable, "-c", code, *arguments],
+        check=True,
+        stdout=subprocess.PIPE,
+        stderr=None if show else subprocess.PIPE,
+        text=True,
+        env=known,
     )
     last = done.stdout.splitlines()[-1:]
     said = json.loads(last[0]) if last and last[0].startswith("{") else {}

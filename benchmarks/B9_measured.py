@@ -1,0 +1,135 @@
+"""B9: every measured machine, every direction, judged on recordings that had no say.
+
+    python benchmarks/B9_measured.py
+    python benchmarks/B9_measured.py --only rotflex two_dof_link_1
+    python benchmarks/B9_measured.py --only "rotflex: A to B" --fresh
+    python benchmarks/B9_measured.py --list
+
+The ends of the runs that are learnt from decide (validation); the test recordings are for judging alone. Free
+runs over the whole test and over windows of 2 s, with and without the voltage offset that the first 2 s of a
+test ask for. A search runs in a new process with nothing compiled, and once more in another one with what the
+first has compiled. Beside it is the best of the other methods (`rotflex_jax.compare`) on the same data.
+
+Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B9.json` after each
+direction, and the page `results/B9.md`; directions that the file has are kept unless `--fresh` is given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+if str(HERE) not in sys.path:
+    sys.path.insert(0, str(HERE))
+
+import rotflex_jax as rf
+from B0_discovery import provenance, save
+from measured_machines.machines import MACHINES
+from measured_machines.page import page
+from rotflex_jax.compare import QUICK
+from speed.processes import process
+
+CHILD = "from measured_machines.child import main; main()"
+NO_MODEL = "no model of its name in rotflex_jax.joints"
+
+
+def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
+    """All (machine, direction) that are wanted, and machines that are left out with the reason."""
+    wanted, left_out = list[tuple[str, str]](), dict[str, str]()
+    for name, machine in MACHINES.items():
+        chosen = [o for o in only if o == name or o.startswith(f"{name}: ")]
+        if only and not chosen:
+            continue
+        try:
+            if machine.model() is None:
+                left_out[name] = NO_MODEL
+                continue
+            ways = [w.name for w in machine.ways()]
+        except (rf.InputError, OSError) as problem:
+            left_out[name] = str(problem)
+            continue
+        wanted += [(name, w) for w in ways if not only or name in chosen or f"{name}: {w}" in chosen]
+    return wanted, left_out
+
+
+def measured(machine: str, direction: str, methods: list[str], warm: bool) -> dict[str, Any]:
+    """One direction: everything in a new process, then the search again in another; a failure is a row."""
+    with tempfile.TemporaryDirectory() as cache:
+        try:
+            first = process(CHILD, machine, direction, "cold", *methods, cache=cache, show=True)
+            again = process(CHILD, machine, direction, "warm", cache=cache, show=True) if warm else None
+        except subprocess.CalledProcessError as problem:
+            return {"error": f"the process ended with {problem.returncode}"}
+    times = lambda found: {k: found.pop(k) for k in ("clock_s", "processor_s")}  # noqa: E731
+    for found in (first, again or {}):  # of the whole process
+        found.pop("clock", None)
+        found.pop("processor", None)
+    row = {"machine": machine, "direction": direction, "cold": times(first), **first}
+    if again is not None:
+        row["warm"] = times(again)
+        answers = [[(r["effect"], r["port"], r["status"]) for r in f["rounds"]] for f in (first, again)]
+        row["same_again"] = answers[0] == answers[1]
+    return row
+
+
+def arguments() -> argparse.Namespace:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help='as rotflex or "rotflex: A to B"'
+    )
+    parser.add_argument("--list", action="store_true", help="Name all directions and end.")
+    parser.add_argument(
+        "--methods", nargs="*", default=None, help="of the comparison; the quick ones if omitted"
+    )
+    parser.add_argument("--cold-only", action="store_true", help="No second search of each direction.")
+    parser.add_argument("--fresh", action="store_true", help="Run again what the results have already.")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "B9.json")
+    return parser.parse_args()
+
+
+def main() -> int:
+    """Run what is missing, save after each direction."""
+    a = arguments()
+    wanted, left_out = directions(a.only)
+    if a.only and not wanted and not left_out:
+        raise SystemExit(f"--only was given {', '.join(a.only)}; --list names what there is.")
+    for name, reason in left_out.items():
+        print(f"{name}: left out, {reason}", flush=True)
+    if a.list:
+        print("\n".join(f"{machine}: {direction}" for machine, direction in wanted))
+        return 0
+    methods = list(QUICK) if a.methods is None else a.methods
+    results: dict[str, Any] = {"benchmark": "B9", "runs": [], "rows": {}}
+    if a.out.is_file():
+        results = json.loads(a.out.read_text())
+    made = provenance()
+    results["runs"].append({**made, "arguments": sys.argv[1:]})
+    results["left_out"] = {**results.get("left_out", {}), **left_out}
+    rows = results["rows"]
+    for count, (machine, direction) in enumerate(wanted, 1):
+        key = f"{machine}: {direction}"
+        if key in rows and "error" not in rows[key] and not a.fresh:
+            continue
+        row = measured(machine, direction, methods, not a.cold_only)
+        head = {"machine": machine, "direction": direction}
+        rows[key] = head | row | {k: made[k] for k in ("commit", "clean", "code")}
+        results["left_out"].pop(machine, None)
+        save(a.out, results)
+        a.out.with_suffix(".md").write_text(page(results))
+        print(f"{count}/{len(wanted)} {key}: {row.get('error') or row['sentence']}", flush=True)
+    save(a.out, results)
+    a.out.with_suffix(".md").write_text(page(results))
+    print(page(results))
+    print(f"saved: {a.out}")
+    return int(any("error" in r for r in rows.values()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

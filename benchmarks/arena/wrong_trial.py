@@ -1,0 +1,119 @@
+"""One wrong world of the benchmark: search, marks. Imports JAX, so workers import it."""
+
+from __future__ import annotations
+
+import math
+import time
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from arena.laws import Place
+from arena.scoring import alike
+from arena.wrong_worlds import World, world
+from judged import ESTABLISHED, PROVISIONAL, errors, named, searched
+
+
+def marks(
+    hidden: Place | None, besides: Iterable[Sequence[Place]], rounds: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """How an answer compares with a world.
+
+    Args:
+        hidden: what should be named.
+        besides: right names of each thing that is wrong besides.
+        rounds: answers with `effect`, `port`, `equivalent` and `status`.
+
+    Returns:
+        `named`: the hidden effect, or what no recording tells from it, is found or listed as equivalent to
+        what is found, None where nothing is hidden; `named_established`: the same among established
+        rounds; `first`: it is the first round that is no right name of something besides; `wrong`: rounds
+        that neither name it, alone or by an equivalent, nor anything besides, by status.
+    """
+    wanted = set() if hidden is None else alike(hidden)
+    # A part of an asymmetric law is not wrong, but an equivalent of nothing is.
+    forgiven = {p for names in besides for p in names}
+    wrong: dict[str, list[list[str]]] = {ESTABLISHED: [], PROVISIONAL: []}
+    hits, first = [], None
+    for r in rounds:
+        said = {(r["effect"], r["port"]), *(tuple(p) for p in r["equivalent"])}
+        hit = bool(said & wanted)
+        hits += [r["status"]] * hit
+        if not hit and not said & forgiven:
+            wrong[r["status"]].append([r["effect"], r["port"]])
+        # What is besides may come first: it is true.
+        if first is None and (hit or not said & forgiven):
+            first = hit
+    return {
+        "named": None if hidden is None else bool(hits),
+        "named_established": None if hidden is None else ESTABLISHED in hits,
+        "first": None if hidden is None else bool(first),
+        "wrong_established": wrong[ESTABLISHED],
+        "wrong_provisional": wrong[PROVISIONAL],
+    }
+
+
+def told(w: World) -> dict[str, Any]:
+    """A world as a row of the results begins."""
+    return {
+        "world": w.seed,
+        "kind": w.kind,
+        "hidden": None if w.hidden is None else list(w.hidden),
+        "parameters": w.parameters,
+        "besides": [asdict(b) for b in w.besides],
+        "visible": w.visible,
+        "samples": w.train.N,
+        "Ts": w.train.Ts,
+        **w.truth,
+    }
+
+
+def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Searches one world and marks the answer; a failure is a row with its error.
+
+    Args:
+        job: `world`, its number.
+        tell: called with lines of progress.
+
+    Returns:
+        A row for JSON.
+    """
+    row: dict[str, Any] = dict(job)
+    lines: list[str] = []
+
+    def say(line: str) -> None:
+        lines.append(line)
+        tell(line)
+
+    try:
+        w = world(job["world"])
+        row.update(told(w))
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = searched(w.model, [w.train], [w.validation], [w.test], say)
+        row["wall_s"] = time.perf_counter() - wall
+        row["cpu_s"] = time.process_time() - cpu
+        rounds = named(result)
+        row.update(
+            marks(w.hidden, [b.names for b in w.besides], rounds),
+            rounds=rounds,
+            verdict=result.verdict.value,
+            sentence=result.sentence,
+            notes=list(result.notes),
+            ranking=[
+                [s.effect, s.port, s.score if math.isfinite(s.score) else None] for s in result.ranking[:8]
+            ],
+            noise_floor=dict(result.noise_floor),
+            errors={
+                name: {
+                    stage: errors(model, [recording])
+                    for stage, model in (("baseline", result.baseline.model), ("final", result.model))
+                }
+                for name, recording in (("validation", w.validation), ("test", w.test))
+            },
+        )
+    except Exception as problem:  # the benchmark reports it and goes on
+        row["error"] = f"{type(problem).__name__}: {problem}"
+        row["traceback"] = traceback.format_exc()
+    row["lines"] = lines
+    return row

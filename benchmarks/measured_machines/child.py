@@ -1,0 +1,93 @@
+"""One direction of one machine in a process of its own; the last line that it prints is JSON.
+
+python -c "from measured_machines.child import main; main()" MACHINE DIRECTION cold METHOD...
+python -c "from measured_machines.child import main; main()" MACHINE DIRECTION warm
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rotflex_jax as rf
+from judged import errors, named, searched
+from measured_machines.machines import MACHINES, Direction
+from public_machines.rounds import estimates
+
+
+def main() -> None:
+    """Command line of the process."""
+    machine, direction, kind, *methods = sys.argv[1:]
+    rf.enable_fast_loops()
+    rf.enable_compilation_cache()
+    began = time.perf_counter()
+
+    def say(text: str) -> None:
+        print(
+            f"{machine}, {direction} {time.perf_counter() - began:6.1f} s  {text}",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    print(json.dumps(row(machine, direction, kind == "cold", methods, say)))
+
+
+def row(
+    machine: str, direction: str, all_of_it: bool, methods: Sequence[str], say: Callable[[str], None]
+) -> dict[str, Any]:
+    """What a search finds and how well it does; without `all_of_it` what it finds and its times alone."""
+    model = MACHINES[machine].model()
+    assert model is not None
+    way = next(w for w in MACHINES[machine].ways() if w.name == direction)
+    clock, processor = time.perf_counter(), time.process_time()
+    result = searched(model, way.train, way.validation, way.test, say)
+    found: dict[str, Any] = {
+        "clock_s": time.perf_counter() - clock,
+        "processor_s": time.process_time() - processor,
+        "rounds": named(result),
+    }
+    if not all_of_it:
+        return found
+    told = result.to_dict()
+    say("simulating the test recordings")
+    return found | {
+        "verdict": told["verdict"],
+        "sentence": told["sentence"],
+        "notes": told["notes"],
+        "estimates": estimates(result.final),
+        # What the search itself reports, all keys that it has, and the same anew by the public interface.
+        "reported": {
+            "baseline": reported(told["baseline"]),
+            "final": reported((told["rounds"] or [told["baseline"]])[-1]),
+        },
+        "simulated": {
+            "baseline": errors(result.baseline.model, way.test),
+            "final": errors(result.model, way.test),
+        },
+        "each_test": [errors(result.model, [r]) for r in way.test] if len(way.test) > 1 else None,
+        "seconds": {
+            part: sum(r.N * r.Ts for r in getattr(way, part)) for part in ("train", "validation", "test")
+        },
+        "others": compared(model, way, methods, say) if methods else None,
+    }
+
+
+def reported(stage: dict[str, Any]) -> dict[str, Any]:
+    """Errors of a stage of a search, by the names that its JSON has for them."""
+    return {k: v for k, v in stage.items() if k.startswith(("held_out_rmse", "test_rmse"))}
+
+
+def compared(
+    model: rf.Model, way: Direction, methods: Sequence[str], say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Other methods on the same data, best first; they learn from all that has a say in the search."""
+    began = time.perf_counter()
+    table = rf.compare(
+        [*way.train, *way.validation], methods, mechanism=model, test=list(way.test), progress=say
+    ).to_dict()
+    kept = ("method", "status", "reason", "held_out_rmse", "held_out_rmse_windows")
+    rows = [{k: r.get(k) for k in kept} for r in table["rows"]]
+    return {"rows": rows, "seconds": time.perf_counter() - began}

@@ -1,0 +1,133 @@
+"""Results of B9 as markdown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from measured_machines.machines import MACHINES
+
+Row = dict[str, Any]
+KINDS = ("whole", "windows", "whole_calibrated", "windows_calibrated")
+KEYS = dict(
+    zip(
+        KINDS,
+        ("test_rmse", "test_rmse_windows", "test_rmse_calibrated", "test_rmse_windows_calibrated"),
+        strict=True,
+    )
+)
+HEAD = """# B9: measured machines
+
+Written by `python benchmarks/B9_measured.py`. Learnt from some recordings, decided on the ends of these,
+judged on others that had no say. Root mean square errors of free runs over the whole test and over windows
+of 2 s, of all channels; calibrated: with the voltage offset that the first 2 s of each test recording ask
+for. Provisional rounds are in brackets, look-alikes after an equals sign.
+
+"""
+
+
+def judged(row: Row, stage: str) -> tuple[dict[str, Any], str]:
+    """Errors of a stage on the test by kind, and where they are from.
+
+    The search's own where it reports any on recordings that had no say; otherwise simulated by the benchmark
+    with the public interface.
+    """
+    own = row["reported"][stage]
+    if own.get(KEYS["whole"]):
+        return {kind: _channels(own.get(key)) for kind, key in KEYS.items()}, "the search"
+    return {kind: row["simulated"][stage][kind] for kind in KINDS}, "the benchmark"
+
+
+def held_out(row: Row, stage: str) -> dict[str, Any]:
+    """Errors that the search reports on the validation part, which had a say."""
+    own = row["reported"][stage]
+    return {
+        "whole": _channels(own.get("held_out_rmse")),
+        "windows": _channels(own.get("held_out_rmse_windows")),
+    }
+
+
+def _channels(errors: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Errors by channel, without the length of the windows."""
+    return None if errors is None else {k: v for k, v in errors.items() if k != "seconds"}
+
+
+def told(errors: dict[str, Any] | None, factor: float) -> str:
+    """Errors of all channels in the unit of the machine."""
+    if not errors:
+        return "-"
+    return " / ".join("-" if v is None else _short(factor * v) for v in errors.values())
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def said(row: Row) -> str:
+    """What was found."""
+    parts = []
+    for r in row["rounds"]:
+        text = f"{r['effect']}@{r['port']}"
+        text += " = " + ", ".join("@".join(p) for p in r["equivalent"]) if r["equivalent"] else ""
+        parts.append(text if r["status"] == "established" else f"({text})")
+    return ", ".join(parts) or "nothing"
+
+
+def best(row: Row) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:
+    """Best of the other methods: its name and its two errors on the test."""
+    rows = [r for r in (row["others"] or {"rows": []})["rows"] if r["status"] == "ok"]
+    if not rows:
+        return "-", None, None
+    return rows[0]["method"], _channels(rows[0]["held_out_rmse"]), _channels(rows[0]["held_out_rmse_windows"])
+
+
+def times(row: Row) -> list[str]:
+    """Seconds by the clock and of the processor, cold and warm."""
+    cells = []
+    for state in ("cold", "warm"):
+        found = row.get(state)
+        cells.append(f"{found['clock_s']:.0f} / {found['processor_s']:.0f}" if found else "-")
+    return cells
+
+
+def page(results: dict[str, Any]) -> str:
+    """All rows, then what was left out."""
+    rows = [results["rows"][k] for k in sorted(results["rows"], key=_place)]
+    good = [r for r in rows if "error" not in r]
+    lines = [
+        "| machine | direction | unit | stage | whole | windows | whole, calibrated | windows, calibrated | "
+        "validation, windows | judged by |",
+        "|---|---|---|---|---:|---:|---:|---:|---:|---|",
+    ]
+    for row in good:
+        machine = MACHINES[row["machine"]]
+        for stage in ("baseline", "final"):
+            errors, source = judged(row, stage)
+            head = [row["machine"], row["direction"], machine.unit] if stage == "baseline" else ["", "", ""]
+            cells = [told(errors[kind], machine.factor) for kind in KINDS]
+            cells.append(told(held_out(row, stage)["windows"], machine.factor))
+            lines.append("| " + " | ".join([*head, stage, *cells, source]) + " |")
+        name, whole, windows = best(row)
+        cells = [told(whole, machine.factor), told(windows, machine.factor), "", "", "", "`compare`"]
+        lines.append("| " + " | ".join(["", "", "", f"best other: {name}", *cells]) + " |")
+    lines += [
+        "",
+        "| machine | direction | verdict | named (status) | cold: clock / processor [s] | warm [s] | "
+        "the same again | commit |",
+        "|---|---|---|---|---:|---:|---|---|",
+    ]
+    for row in good:
+        again = {None: "-", True: "yes", False: "no"}[row.get("same_again")]
+        commit = row["commit"] + ("" if row["clean"] else ", changed")
+        cells = [row["machine"], row["direction"], row["verdict"], said(row), *times(row), again, commit]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines.append("")
+    lines += [f"- {r['machine']}, {r['direction']}: failed, {r['error']}" for r in rows if "error" in r]
+    lines += [f"- {name}: left out, {reason}" for name, reason in results.get("left_out", {}).items()]
+    return HEAD + "\n".join(lines).rstrip() + "\n"
+
+
+def _place(key: str) -> tuple[int, str]:
+    """Rows in the order of the machines."""
+    names = list(MACHINES)
+    machine = key.split(":")[0]
+    return (names.index(machine) if machine in names else len(names), key)
