@@ -6,6 +6,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.signal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -112,7 +113,7 @@ def _heating(ax: Axes, effect: Effect) -> None:
 def _actuation(ax: Axes, effect: Effect) -> None:
     """Voltage at the motor over the command."""
     assert isinstance(effect, Actuation)
-    reach = 10.0 if effect.name == "saturation" else 0.4
+    reach = {"saturation": 10.0, "amplifier_saturation": 20.0}.get(effect.name, 0.4)
     u = np.linspace(-reach, reach, 401)
     ax.plot(u, u, **OTHER, label="without it")
     ax.plot(u, np.asarray(effect.drive(jnp.asarray(u), 0.001)), **LINE, label="with it")
@@ -145,6 +146,37 @@ def _sensing(ax: Axes, effect: Effect) -> None:
     ax.plot(value, value, **OTHER, label="without it")
     ax.plot(value, np.asarray(effect.measure(value)) + 0.0 * value, **LINE, label="with it")
     _labels(ax, "true value [rad]", "reading [rad]")
+
+
+def _runout(ax: Axes, effect: Effect) -> None:
+    """What the reading adds, over the angle."""
+    assert isinstance(effect, Sensing)
+    value = np.linspace(-2 * math.pi, 2 * math.pi, 600)
+    ax.plot(value, 1e3 * (np.asarray(effect.measure(value)) - value), **LINE)
+    _labels(ax, "true value [rad]", "error of the reading [mrad]")
+
+
+def _cross_talk(ax: Axes, effect: Effect) -> None:
+    """Reading while the true value is zero, over the other channel."""
+    assert isinstance(effect, Sensing)
+    other = np.linspace(-3.0, 3.0, 100)
+    ax.plot(other, 1e3 * np.asarray(effect.measure(0.0 * other, other)), **LINE)
+    _labels(ax, "true value at the other sensor [rad]", "reading of a value of zero [mrad]")
+
+
+def _late(ax: Axes, effect: Effect) -> None:
+    """A true value that starts to swing, and its reading."""
+    assert isinstance(effect, fx.ChannelDelay)
+    stamp = effect.stamp()
+    t = np.linspace(0.0, 0.06, 1201)
+    swing = 2 * math.pi * 25
+    value, speed = 0.1 * (1 - np.cos(swing * t)), 0.1 * swing * np.sin(swing * t)
+    states = scipy.signal.lsim(
+        (np.array(stamp.own), np.array(stamp.from_speed)[:, None], np.eye(2), np.zeros((2, 1))), speed, t
+    )[1]
+    ax.plot(1e3 * t, value, **OTHER, label="true value")
+    ax.plot(1e3 * t, effect.measure(value, tuple(states.T), 0), **LINE, label="reading")
+    _labels(ax, "time [ms]", "angle [rad]")
 
 
 def _stamped(x: str, entry: str) -> Draw:
@@ -216,6 +248,9 @@ DRAWINGS: dict[type, Draw] = {
     fx.VoltageDrift: _drift,
     fx.Heating: _heating,
     fx.Backlash: _gear,
+    fx.EccentricEncoder: _runout,
+    fx.CrossTalk: _cross_talk,
+    fx.ChannelDelay: _late,
     fx.Motor: _motor,
     fx.CurrentDrive: _stamped("command [V]", "drive"),
     fx.SecondMode: _mode,

@@ -20,6 +20,7 @@ from rotflex_jax.effects.base import (
     Memory,
     Period,
     Scalar,
+    Sensing,
     Stamp,
     StatePart,
 )
@@ -120,6 +121,12 @@ def effects_of(mechanism: Mechanism, kind: type[EffectKind]) -> list[tuple[int, 
     return [(i, e) for i, e in enumerate(mechanism.effects) if isinstance(e, kind)]
 
 
+def stamped(mechanism: Mechanism) -> list[tuple[int, Linear | Sensing]]:
+    """Linear effects and sensors with states of their own, with their indices, in order of their states."""
+    kinds = (Linear, Sensing)
+    return [(i, e) for i, e in enumerate(mechanism.effects) if isinstance(e, kinds) and e.state_part]
+
+
 def own_states(mechanism: Mechanism) -> dict[int, tuple[int, ...]]:
     """Index of each effect with states of its own -> indices of these in the state."""
     rows, start = {}, 2 * len(mechanism.coordinates)
@@ -163,10 +170,7 @@ def equations(mechanism: Mechanism, gates: Float[Array, " E"]) -> EquationsOfMot
         gates: One factor per effect; one where it is on, zero where it is off.
     """
     layout = Layout.of(mechanism.structure)
-    stamps = [
-        PlacedStamp(e.stamp(), np.array(mechanism.port_vectors[e.at]), gates[i])
-        for i, e in effects_of(mechanism, Linear)
-    ]
+    stamps = [PlacedStamp(e.stamp(), np.array(mechanism.vector(e)), gates[i]) for i, e in stamped(mechanism)]
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), layout.n)
     return equations_from_stamps(stamps, P, layout.linear, gates.dtype)
 

@@ -26,6 +26,7 @@ from rotflex_jax.mechanism.assembly import (
     equations_from_stamps,
     from_equations,
     phi_functions,
+    stamped,
 )
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import matvec
@@ -89,12 +90,13 @@ def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tu
     """
     n, share = layout.n, gear.rotor()
     acting = []
-    for i, e in effects_of(known, Linear):
-        stamp, here = e.stamp(), e.at == gear.at
-        p = np.array([*known.port_vectors[e.at], 1.0 if here and e.motor else 0.0])
-        if here and not e.motor:
+    for i, e in stamped(known):
+        stamp, here = e.stamp(), isinstance(e, Linear) and e.at == gear.at
+        motor = here and e.motor
+        p = np.array([*known.vector(e), 1.0 if motor else 0.0])
+        if here and not motor:
             rotor = Stamp(inertia=share * stamp.inertia)
-            acting.append(PlacedStamp(rotor, np.array([*known.port_vectors[e.at], 1.0]), gates[i]))
+            acting.append(PlacedStamp(rotor, np.array([*known.vector(e), 1.0]), gates[i]))
             stamp = stamp._replace(inertia=(1 - share) * stamp.inertia)
         acting.append(PlacedStamp(stamp, p, gates[i]))
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), n)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -135,13 +135,28 @@ class Mechanism:
             return ("input",)
         return self.channels if effect.acts_on == "channel" else tuple(name for name, _ in self.ports)
 
+    def vector(self, effect: Effect) -> tuple[float, ...]:
+        """Vector of the port at which an effect acts, of a sensor of the port that it measures."""
+        port = dict(self.outputs)[effect.at][0] if effect.acts_on == "channel" else effect.at
+        return self.port_vectors[port]
+
+    def quantity(self, channel: str) -> Quantity:
+        """What a channel measures."""
+        return self.quantities[self.channels.index(channel)]
+
     def linear_effects(self, port: str) -> list[Linear]:
         """Linear effects at a port."""
         return [e for e in self.effects if isinstance(e, Linear) and e.at == port]
 
     def lacking(self, effect: Effect | type[Effect], port: str) -> list[str]:
-        """What an effect needs at a port that is not there: `motor`, `inertia`."""
-        has = {"motor": self.has_motor, "inertia": self.has_inertia}
+        """What an effect needs at a port or an output that is not there: `motor`, `inertia`, ..."""
+        has: dict[str, Callable[[str], bool]] = {
+            "motor": self.has_motor,
+            "inertia": self.has_inertia,
+            "second output": lambda channel: len(self.outputs) > 1,
+            "position": lambda channel: self.quantity(channel).is_position,
+            "position or speed": lambda channel: self.quantity(channel).derivative <= 1,
+        }
         return [name for name in effect.needs() if not has[name](port)]
 
     def accepts(self, effect: type[Effect], at: str) -> bool:
