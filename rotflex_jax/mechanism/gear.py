@@ -92,7 +92,7 @@ def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tu
     acting = []
     for i, e in stamped(known):
         stamp, here = e.stamp(), isinstance(e, Linear) and e.at == gear.at
-        motor = here and e.motor
+        motor = isinstance(e, Linear) and here and e.motor
         p = np.array([*known.vector(e), 1.0 if motor else 0.0])
         if here and not motor:
             rotor = Stamp(inertia=share * stamp.inertia)
