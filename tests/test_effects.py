@@ -75,6 +75,7 @@ PASSIVE = {
     "coulomb",
     "coulomb_asymmetric",
     "stribeck",
+    "load_friction",
     "quadratic_drag",
     "dahl",
     "lugre",
@@ -121,7 +122,8 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
     elif isinstance(effect, Force):
         said = [effect.force(position, speed, voltage)]
     elif isinstance(effect, DryFriction):
-        said = [effect.limit(position, jnp.abs(speed), way) for way in (1.0, -1.0)]
+        load = (voltage,) if effect.loaded else ()
+        said = [effect.limit(position, jnp.abs(speed), way, *load) for way in (1.0, -1.0)]
     elif isinstance(effect, Memory):
         said = [
             effect.force(z, position, speed, voltage),

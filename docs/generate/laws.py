@@ -63,6 +63,15 @@ def _friction(ax: Axes, effect: Effect) -> None:
     _labels(ax, "speed [rad/s]", "torque on the port [N m]")
 
 
+def _load_friction(ax: Axes, effect: Effect) -> None:
+    """Level against motion each way, over the torque through the gear."""
+    assert isinstance(effect, fx.LoadFriction)
+    load = np.linspace(-0.5, 0.5, 201)
+    for way, look, words in ((1.0, LINE, "forwards"), (-1.0, OTHER, "backwards")):
+        ax.plot(load, np.asarray(effect.limit(0.0, 0.0, way, load)), **look, label=f"turning {words}")
+    _labels(ax, "torque through the gear [N m]", "level of friction [N m]")
+
+
 def _force(ax: Axes, effect: Effect) -> None:
     """Over the position or the speed, whichever the law depends on."""
     assert isinstance(effect, Force)
@@ -248,6 +257,7 @@ DRAWINGS: dict[type, Draw] = {
     fx.VoltageDrift: _drift,
     fx.Heating: _heating,
     fx.Backlash: _gear,
+    fx.LoadFriction: _load_friction,
     fx.EccentricEncoder: _runout,
     fx.CrossTalk: _cross_talk,
     fx.ChannelDelay: _late,

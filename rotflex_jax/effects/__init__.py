@@ -31,7 +31,7 @@ from rotflex_jax.effects.base import (
     register,
 )
 from rotflex_jax.effects.damping import QuadraticDrag, Viscous, ViscousAsymmetric
-from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, Stribeck
+from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, LoadFriction, Stribeck
 from rotflex_jax.effects.gear import Backlash
 from rotflex_jax.effects.hysteresis import BoucWen, Dahl, LuGre
 from rotflex_jax.effects.inertia import Inertia, SecondMode
@@ -76,6 +76,7 @@ __all__ = [
     "Coulomb",
     "CoulombAsymmetric",
     "Stribeck",
+    "LoadFriction",
     # force
     "QuadraticDrag",
     "ViscousAsymmetric",

@@ -277,10 +277,19 @@ class DryFriction(Effect):
     not_linearised: ClassVar[str] = "has no slope at rest"
     # True where the level is the same at every speed and position: a step need not iterate on it.
     steady: ClassVar[bool] = False
+    # True where it depends on the torque that passes from the motor to the machine: `limit` receives it [N m]
+    # as a fourth argument, positive where the motor pushes forwards. It is the mean of both sides of the
+    # port: of what the motors give and of what the rest of the machine takes, by its linear part.
+    loaded: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar, *load: Scalar) -> Scalar:
         """Level [N m] >= 0 that opposes motion in `direction` (+1 or -1) at |speed| [rad/s]."""
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A motor and an inertia between it and the rest, where the transmitted torque is asked for."""
+        return ("motor", "inertia") if cls.loaded else ()
 
 
 class Memory(Effect):

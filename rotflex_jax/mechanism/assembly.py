@@ -236,6 +236,7 @@ class Constants(NamedTuple):
         mobility: The same for a unit impulse.
         push: Response of the linear states to a unit impulse that acts on positions.
         gear: Constants of a gear with play (`gear.GearConstants`), None without one.
+        load: Rows of the transmitted torques (`step.LoadRows`), None where no friction depends on them.
     """
 
     values: Real[Array, "P *D"]
@@ -253,6 +254,7 @@ class Constants(NamedTuple):
     mobility: Float[Array, "p p *D"]
     push: Float[Array, "m p *D"]
     gear: Any = None
+    load: Any = None
 
 
 def constants(

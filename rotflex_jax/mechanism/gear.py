@@ -10,8 +10,9 @@ states of a contact and the conditions that end them.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Real
@@ -58,9 +59,21 @@ class GearConstants(NamedTuple):
 
 
 def gear_constants(
-    mechanism: Mechanism, values: Real[Array, " P"], gates: Float[Array, " E"], h: Float[Array, ""]
+    mechanism: Mechanism,
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    h: Float[Array, ""],
+    load: Any = None,
 ) -> GearConstants | None:
-    """Constants of `geared_step`, or None where no gear has play."""
+    """Constants of `geared_step`, or None where no gear has play.
+
+    Args:
+        mechanism: Structure.
+        values: Parameter values.
+        gates: One factor per effect.
+        h: Length of the step [s].
+        load: Rows of the transmitted torques while the teeth touch; in flight they transmit none.
+    """
     known = mechanism.with_values(values)
     gears = effects_of(known, Gear)
     if not gears:
@@ -75,7 +88,7 @@ def gear_constants(
     (a, b), (p, q) = line[angle], line[speed]
     return GearConstants(
         gap=gates[i] * gear.stops(),
-        flight=from_equations(eq, layout, values, gates, h),
+        flight=from_equations(eq, layout, values, gates, h)._replace(load=jax.tree.map(jnp.zeros_like, load)),
         line=line,
         moments=ends @ jnp.asarray(MOMENTS_TO_POLYNOMIAL, ends.dtype),
         correction=-jnp.array([[q, -b], [-p, a]]) / (a * q - b * p),
