@@ -508,6 +508,14 @@ LADEN = {
         fx.VoltageDrift(rate=0.2),
         fx.ViscousAsymmetric("hub", 0.002),
     ],
+    "sensors and load": [
+        fx.AmplifierSaturation(limit=2.5),
+        fx.EccentricEncoder("theta", cosine=0.004, sine=-0.01),
+        fx.CrossTalk("alpha", share=0.02),
+        fx.ChannelDelay("theta", time=0.003),
+        fx.ChannelDelay("alpha", time=0.005),
+        fx.LoadFriction("hub", level=0.02, driving=0.2, driven=0.5),
+    ],
     "dry": [
         fx.CoulombAsymmetric("hub", 0.03, 0.02),
         fx.Stribeck("joint", 0.003, 0.002, 0.3),
