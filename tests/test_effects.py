@@ -130,7 +130,7 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
             effect.flow(z, position, speed, voltage),
         ]
     elif isinstance(effect, Gear):  # a rotor with no room to turn is no rotor
-        said = [effect.stops(), effect.stops() * effect.rotor()]
+        said = [effect.stops(), effect.stops() * effect.rotor(), *(effect.teeth() or ())]
     elif isinstance(effect, Actuation):
         voltages = voltage * jnp.array([1.0, -1.0, 0.3], voltage.dtype)
         return effect.drive(voltages, 0.002)

@@ -236,6 +236,17 @@ def _gear(ax: Axes, effect: Effect) -> None:
     _labels(ax, "rotor against port [mrad]", "torque passed on [N m]")
 
 
+def _elastic_gear(ax: Axes, effect: Effect) -> None:
+    """Torque over the angle of the rotor against the port, slowly and while the teeth approach each other."""
+    assert isinstance(effect, fx.ElasticBacklash)
+    r = np.linspace(-1.3, 1.3, 800) * float(effect.gap)
+    depth, side = np.abs(r) - float(effect.gap), np.sign(r)
+    for speed, look, words in ((0.0, LINE, "slowly"), (1.0, OTHER, "teeth approach at 1 rad/s")):
+        push = float(effect.stiffness) * depth + float(effect.damping) * speed
+        ax.plot(1e3 * r, np.where(depth > 0, push, 0.0) * side, **look, label=words)
+    _labels(ax, "rotor against port [mrad]", "torque passed on [N m]")
+
+
 def _splines(ax: Axes, effect: Effect) -> None:
     assert isinstance(effect, fx.LearnedTorque)
     speed = np.linspace(-5.5, 5.5, 800)
@@ -257,6 +268,7 @@ DRAWINGS: dict[type, Draw] = {
     fx.VoltageDrift: _drift,
     fx.Heating: _heating,
     fx.Backlash: _gear,
+    fx.ElasticBacklash: _elastic_gear,
     fx.LoadFriction: _load_friction,
     fx.EccentricEncoder: _runout,
     fx.CrossTalk: _cross_talk,

@@ -32,7 +32,7 @@ from rotflex_jax.effects.base import (
 )
 from rotflex_jax.effects.damping import QuadraticDrag, Viscous, ViscousAsymmetric
 from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, LoadFriction, Stribeck
-from rotflex_jax.effects.gear import Backlash
+from rotflex_jax.effects.gear import Backlash, ElasticBacklash
 from rotflex_jax.effects.hysteresis import BoucWen, Dahl, LuGre
 from rotflex_jax.effects.inertia import Inertia, SecondMode
 from rotflex_jax.effects.learned import LearnedTorque
@@ -88,6 +88,7 @@ __all__ = [
     "LearnedTorque",
     # gear
     "Backlash",
+    "ElasticBacklash",
     # with memory
     "Dahl",
     "LuGre",

@@ -339,6 +339,9 @@ class Gear(Effect):
     slope_at_zero: ClassVar[bool] = False
     single: ClassVar[bool] = True
     not_linearised: ClassVar[str] = "has no slope within the play; the gear is taken as tight"
+    # Steps into which a step is cut, so that contact and separation of elastic teeth are apart; more than one
+    # only for a gear with `teeth`.
+    steps: ClassVar[int] = 1
 
     @property
     def order(self) -> int:
@@ -352,6 +355,10 @@ class Gear(Effect):
     @abc.abstractmethod
     def rotor(self) -> Scalar:
         """The rotor's part of the inertia that is entered at the port, above 0 and below 1."""
+
+    def teeth(self) -> tuple[Scalar, Scalar] | None:
+        """Stiffness [N m/rad] and damping [N m s/rad] of teeth in contact; None where they are rigid."""
+        return None
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:

@@ -167,10 +167,11 @@ class LoadFriction(DryFriction):
 
         |tau| = level + driving |load| while the motor drives,  level + driven |load| while it is driven
 
-    and at rest any torque up to that level. `load` is the torque through the gear, taken as the mean of both
-    sides of the port: of what the motor gives and of what the rest of the machine takes. The motor drives
-    where the load has the sign of the motion. A gear with `driven` of 2 or more cannot be turned by its
-    load. Not beside an efficiency of the motor that is free, which does the same while the motor drives.
+    At rest any torque up to that level holds the port. `load` is the torque through the gear, taken as the
+    mean of both sides of the port: of what the motor gives and of what the rest of the machine takes. The
+    motor drives where the load has the sign of the motion. A gear with `driven` of 2 or more cannot be turned
+    by its load. Not beside an efficiency of the motor that is free, which does the same while the motor
+    drives.
 
     Args:
         at: Port of the motor.

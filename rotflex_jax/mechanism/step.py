@@ -15,8 +15,9 @@ from jaxtyping import Array, Float, Real
 
 from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of, equations, own_states
+from rotflex_jax.mechanism.elastic_teeth import elastic_step
 from rotflex_jax.mechanism.friction import coupled_contacts, limited, solve_masked
-from rotflex_jax.mechanism.gear import gear_constants, geared_step
+from rotflex_jax.mechanism.gear import gear_constants, gear_steps, geared_step
 from rotflex_jax.mechanism.intersample import Intersample, substep_voltages
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import (
@@ -251,10 +252,10 @@ class Exponential:
         Ts: Float[Array, ""],
     ) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
-        h = Ts / self.substeps
+        h = Ts / (self.substeps * gear_steps(structure))
         c = constants(structure, values, gates, h)
         c = c._replace(load=load_rows(structure.with_values(values), gates))
-        return c._replace(gear=gear_constants(structure, values, gates, h, c.load))
+        return c._replace(gear=gear_constants(structure, values, gates, c))
 
     def advance(
         self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*hS"], c: Constants
@@ -268,17 +269,20 @@ class Exponential:
             c: From `prepare`.
         """
         mechanism = structure.with_values(c.values)
-        if self.substeps == 1:
+        cut = gear_steps(structure)
+        if self.substeps * cut == 1:
             return _step(mechanism, x, v if self.between == "held" else v[0], c, self)
-        at = lambda k: v if self.between == "held" else v[k]  # noqa: E731
+        at = lambda k: v if self.between == "held" else v[k // cut]  # noqa: E731
         body = lambda k, state: _step(mechanism, state, at(k), c, self)  # noqa: E731
-        return jax.lax.fori_loop(0, self.substeps, body, x)
+        return jax.lax.fori_loop(0, self.substeps * cut, body, x)
 
 
 def _step(mechanism: Mechanism, x: Array, v: Array, c: Constants, solver: Exponential) -> Array:
     if c.gear is None:
         return _advance_smooth(mechanism, x, v, c, solver)
     advance = lambda x, c, extra: _advance_smooth(mechanism, x, v, c, solver, extra)  # noqa: E731
+    if c.gear.teeth is not None:
+        return elastic_step(mechanism, x, c, advance)
     return geared_step(mechanism, x, c, advance)
 
 
