@@ -25,10 +25,9 @@ from rotflex_jax.mechanism.gear import Advance, crossing_time, delayed
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import matvec
 
-# Points at which the torque of the teeth is looked at for its first sign change.
-LOOKS = 8
-# Secant steps to where it is zero.
-REFINEMENTS = 6
+# Intervals in which the torque of the teeth is looked at for its first sign change, the first of them halved
+# this often.
+LOOKS, HALVINGS = 8, 3
 
 
 class Cubic(NamedTuple):
@@ -71,15 +70,51 @@ def swing(stiff: Float[Array, "*S"], loss: Float[Array, "*S"], t: Float[Array, "
     quick, over = ~near & (square > 0), ~near & (square < 0)
     w = jnp.sqrt(jnp.where(quick, square, 1.0))
     v = jnp.sqrt(jnp.where(over, -square, 1.0))
-    fade = jnp.exp(-loss * t / 2)
-    # The slower of the two exponents, without the difference of large numbers.
-    slow = jnp.exp(-jnp.where(over, stiff / (loss / 2 + v), 0.0) * t)
+    # Where overdamped the slower of two exponents, without a difference of large numbers, else the only one.
+    fade = jnp.exp(-jnp.where(over, stiff / (loss / 2 + v), loss / 2) * t)
     fast = jnp.exp(-jnp.where(over, loss / 2 + v, 0.0) * t)
     z = jnp.where(near, square * t * t, 0.0)
-    cosine = jnp.where(quick, fade * jnp.cos(w * t), (slow + fast) / 2)
-    sine = jnp.where(quick, fade * jnp.sin(w * t) / w, (slow - fast) / (2 * v))
+    cosine = jnp.where(quick, fade * jnp.cos(w * t), (fade + fast) / 2)
+    sine = jnp.where(quick, fade * jnp.sin(w * t) / w, (fade - fast) / (2 * v))
     cosine = jnp.where(near, fade * (1 - z / 2 * (1 - z / 12)), cosine)
     return Swing(cosine, jnp.where(near, fade * t * (1 - z / 6 * (1 - z / 20)), sine))
+
+
+class Oscillator(NamedTuple):
+    """Depth of teeth in contact: what the flight asks for, linear in time, and a free motion about it.
+
+    Attributes:
+        stiff: Stiffness over mass, in units of the step.
+        loss: Damping over mass, in units of the step.
+        y: Free motion at the beginning.
+        dy: Its rate.
+        rests: The rest of the depth at the beginning.
+        grows: Its rate.
+    """
+
+    stiff: Float[Array, "*S"]
+    loss: Float[Array, "*S"]
+    y: Float[Array, "*S"]
+    dy: Float[Array, "*S"]
+    rests: Float[Array, "*S"]
+    grows: Float[Array, "*S"]
+
+    def moved(
+        self, s: Swing, y: Float[Array, "*S"], dy: Float[Array, "*S"]
+    ) -> tuple[Float[Array, "*S"], Float[Array, "*S"]]:
+        """Free motion and its rate after the time of a swing."""
+        return (
+            y * s.cosine + (dy + self.loss / 2 * y) * s.sine,
+            dy * s.cosine - (self.stiff * y + self.loss / 2 * dy) * s.sine,
+        )
+
+    def torque(
+        self, t: Float[Array, "*S"], y: Float[Array, "*S"], dy: Float[Array, "*S"]
+    ) -> tuple[Float[Array, "*S"], Float[Array, "*S"]]:
+        """Torque over mass, and its rate, at a time with this free motion."""
+        bend = -self.stiff * y - self.loss * dy
+        value = self.stiff * (self.rests + self.grows * t) + self.loss * self.grows - bend
+        return value, self.stiff * (self.grows + dy) + self.loss * bend
 
 
 class Contact(NamedTuple):
@@ -122,23 +157,14 @@ def contact(
     y0 = flight.at(start) - rests - grows * start
     dy0 = flight.slope(start) - grows
 
-    def motion(t: Array, y0: Array, dy0: Array) -> tuple[Array, Array]:
-        s = swing(stiff, loss, t)
-        y = y0 * s.cosine + (dy0 + loss / 2 * y0) * s.sine
-        dy = dy0 * s.cosine - (stiff * y0 + loss / 2 * dy0) * s.sine
-        return y, dy
-
-    def torque(t: Array) -> Array:
-        y, dy = motion(t, y0, dy0)
-        return stiff * (rests + grows * (start + t) + y) + loss * (grows + dy)
-
     span = 1 - start
-    length = jax.lax.stop_gradient(_until_zero(torque, span, stiff - loss * loss / 4))
+    oscillator = Oscillator(stiff, loss, y0, dy0, rests + grows * start, grows)
+    length = jax.lax.stop_gradient(_until_zero(oscillator, span))
     ends = length < jax.lax.stop_gradient(span)
     # At its end the torque is zero: the moments do not depend on where that is, to first order.
     length = jnp.where(ends, length, span)
     t = start + length
-    y, dy = motion(length, y0, dy0)
+    y, dy = oscillator.moved(swing(stiff, loss, length), y0, dy0)
     depth, rate = rests + grows * t + y, grows + dy
     behind, slower = depth - flight.at(t), rate - flight.slope(t)
     change = flight.slope(t) - flight.slope(start)
@@ -149,37 +175,54 @@ def contact(
     return Contact(start, moments[0], moments, touching & ~ends)
 
 
-def _until_zero(torque, span: Array, square: Array) -> Array:  # noqa: ANN001 - a function of the time
+def _until_zero(o: Oscillator, span: Array) -> Array:
     """Time until the torque first falls to zero, or `span`.
 
-    An oscillator whose torque is above zero for a whole period stays so, as it decays.
+    An oscillator whose torque is above zero for a whole period stays so, as it decays. Exponentials are
+    evaluated twice only: from one look to the next the motion is a product, between them a cubic.
     """
+    square = o.stiff - o.loss * o.loss / 4
     period = 2 * np.pi / jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    reach = jnp.where((square > 0) & (period < span), period, span)
-    before = after = jnp.zeros_like(span)
-    high, low = torque(before), torque(before)
+    each = jnp.where((square > 0) & (period < span), period, span) / LOOKS
+    # Closer at the beginning, where a strongly damped torque changes fast.
+    step = each / 2**HALVINGS
+    move = swing(o.stiff, o.loss, step)
+    here = o.torque(jnp.zeros_like(span), o.y, o.dy)
+    t, y, dy = jnp.zeros_like(span), o.y, o.dy
+    before, width, first, last = t, step, here, here
     found = jnp.zeros(jnp.shape(span), bool)
-    for k in range(1, LOOKS + 1):
-        # Closer at the beginning, where a strongly damped torque changes fast.
-        t = reach * (k / LOOKS) ** 2
-        f = torque(t)
-        crosses = ~found & (f < 0)
-        before, high = jnp.where(found | crosses, before, t), jnp.where(found | crosses, high, f)
-        after, low = jnp.where(crosses, t, after), jnp.where(crosses, f, low)
-        found = found | crosses
-    kept = jnp.zeros_like(span)
-    for _ in range(REFINEMENTS):
-        drop = jnp.where(found, high - low, 1.0)
-        t = before + (after - before) * jnp.where(found, high, 0.0) / drop
-        f = torque(t)
-        above = f >= 0
-        # Where one end is kept twice, half its value moves the secant towards it (Illinois rule).
-        low = jnp.where(above, jnp.where(kept > 0, low / 2, low), f)
-        high = jnp.where(above, f, jnp.where(kept < 0, high / 2, high))
-        before, after = jnp.where(above, t, before), jnp.where(above, after, t)
-        kept = jnp.where(above, 1.0, -1.0)
-    drop = jnp.where(found & (high > low), high - low, 1.0)
-    return jnp.where(found, before + (after - before) * jnp.where(found, high, 0.0) / drop, span)
+    for k in range(HALVINGS + LOOKS):
+        t, (y, dy) = t + step, o.moved(move, y, dy)
+        there = o.torque(t, y, dy)
+        crosses = ~found & (there[0] < 0)
+        before, width = jnp.where(crosses, t - step, before), jnp.where(crosses, step, width)
+        first = (jnp.where(crosses, here[0], first[0]), jnp.where(crosses, here[1], first[1]))
+        last = (jnp.where(crosses, there[0], last[0]), jnp.where(crosses, there[1], last[1]))
+        found, here = found | crosses, there
+        if 0 < k <= HALVINGS:
+            move = Swing(
+                move.cosine * move.cosine - square * move.sine * move.sine, 2 * move.cosine * move.sine
+            )
+            step = 2 * step
+    # The cubic with the values and slopes at both ends, in units of the interval.
+    (f0, d0), (f1, d1) = first, last
+    d0, d1, rise = d0 * width, d1 * width, f1 - f0
+    cubic = Cubic(f0, d0, 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise)
+    drop = jnp.where(found, -rise, 1.0)
+    share = jnp.where(found, f0, 0.0) / drop
+    for _ in range(3):
+        share = _downwards(share, cubic.at(share), cubic.slope(share), found)
+    length = before + width * share
+    value, slope = o.torque(length, *o.moved(swing(o.stiff, o.loss, length), o.y, o.dy))
+    length = before + width * _downwards(share, value, slope * width, found)
+    return jnp.where(found, length, span)
+
+
+def _downwards(share: Array, value: Array, slope: Array, found: Array) -> Array:
+    """One Newton step to where a falling function is zero, within 0 and 1."""
+    falls = found & (slope < 0)
+    share = share - jnp.where(falls, value, 0.0) / jnp.where(falls, slope, 1.0)
+    return jnp.where(share < 0, 0.0, jnp.where(share > 1, 1.0, share))
 
 
 def elastic_step(
@@ -210,7 +253,7 @@ def elastic_step(
     push = lambda found: _pushed(matvec(a.moments, side[None] * found.moments), x)  # noqa: E731
     end = in_flight + push(first)
     found = first
-    if layout.torque_ports:
+    if layout.contacts:
         # A port that friction holds does not give way: the teeth meet a larger inertia.
         linear = push(first)
         response = advance(x, a.flight, linear[: len(a.line)]) - in_flight - linear
