@@ -17,7 +17,8 @@ class Backlash(Gear):
 
     `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the transmitted
     torque. The rotor has a `share` of the inertia that is entered at the port; the motor with its back-EMF
-    acts on it, all other effects at the port on the rest. The impact of the teeth is perfectly inelastic.
+    acts on it, all other effects at the port on the rest. What the motor's own shaft meets stands at the port
+    `rotor`, which a mechanism with this gear has besides its own. The impact of the teeth is inelastic.
     Not for a spring that is loose about its rest position, which is `joint_play`, nor for play that is
     never crossed, which shifts the angle only. Beside `heating` the lost torque acts on the port even
     while the rotor is in flight.
@@ -79,7 +80,8 @@ class ElasticBacklash(Gear):
 
     `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the torque on the
     port. The rotor has a `share` of the inertia that is entered at the port; the motor with its back-EMF
-    acts on it, all other effects at the port on the rest. Without a gap it is a gear that is elastic only.
+    acts on it with all that stands at the port `rotor`, all other effects at the port on the rest. Without a
+    gap it is a gear that is elastic only.
     Not where the teeth swing far above the sampling frequency: that is `backlash`, its limit, without the
     two parameters that no recording shows then. A search tries it on request and in the place of
     `backlash`, since a machine has one gear.

@@ -78,6 +78,7 @@ class Layout:
         rotor: Index of the rotor's angle, if a gear has play.
         torque_ports: Ports at which nonlinear torques act, those with dry friction first.
         port_matrix: Their vectors.
+        rotor_side: One for those on the motor's side of a gear with play, zero for the others.
         contacts: How many of them have dry friction.
         output_rows: Each output as a combination of positions and speeds.
     """
@@ -88,6 +89,7 @@ class Layout:
     rotor: int
     torque_ports: tuple[str, ...]
     port_matrix: tuple[tuple[float, ...], ...]
+    rotor_side: tuple[float, ...]
     contacts: int
     output_rows: tuple[tuple[float, ...], ...]
 
@@ -111,6 +113,7 @@ class Layout:
             rotor=rotor,
             torque_ports=names,
             port_matrix=tuple(structure.port_vectors[p] for p in names),
+            rotor_side=tuple(1.0 if structure.on_rotor(p) else 0.0 for p in names),
             contacts=len(dry),
             output_rows=tuple(quantity.row(structure.port_vectors[port]) for quantity, port in measured),
         )
@@ -282,6 +285,13 @@ def from_equations(
     push = jnp.zeros_like(eq.ports).at[:n].set(eq.ports[n : 2 * n])
     if layout.linear > layout.rotor:
         push = push.at[layout.rotor].set(eq.ports[layout.rotor + 1])
+
+    def moved(states: Array, first: int, rotor: int) -> Array:
+        """Motion of the ports with the coordinates, and of those on the rotor's side with the rotor."""
+        own = P @ states[first : first + n]
+        side = np.array(layout.rotor_side)
+        return own + jnp.asarray(side, E.dtype)[:, None] * states[rotor][None] if side.any() else own
+
     return Constants(
         values=values,
         gates=gates,
@@ -294,8 +304,8 @@ def from_equations(
         half_E=half_E,
         half_input=half[:, 0],
         half_hold=half[:, 1:],
-        stop=P @ one[n : 2 * n, 1:],
-        mobility=P @ push[:n],
+        stop=moved(one[:, 1:], n, layout.rotor + 1),
+        mobility=moved(push, 0, layout.rotor),
         push=push,
     )
 

@@ -110,13 +110,14 @@ def gear_constants(
 def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tuple[EquationsOfMotion, Array]:
     """Equations of motion with the rotor in flight, and the column of the teeth's torque on the port.
 
-    The rotor's angle relative to the port is an additional coordinate, and the motor acts at port plus rotor.
+    The rotor's angle relative to the port is an additional coordinate, and the motor acts at port plus rotor,
+    as all that is put at `rotor` does.
     """
     n, share = layout.n, gear.rotor()
     acting = []
     for i, e in stamped(known):
         stamp, here = e.stamp(), isinstance(e, Linear) and e.at == gear.at
-        motor = isinstance(e, Linear) and here and e.motor
+        motor = isinstance(e, Linear) and (known.on_rotor(e.at) or (here and e.motor))
         p = np.array([*known.vector(e), 1.0 if motor else 0.0])
         if here and not motor:
             rotor = Stamp(inertia=share * stamp.inertia)
@@ -124,7 +125,7 @@ def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tu
             stamp = stamp._replace(inertia=(1 - share) * stamp.inertia)
         acting.append(PlacedStamp(stamp, p, gates[i]))
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), n)
-    P = np.vstack([np.column_stack([P, np.zeros(len(P))]), np.eye(n + 1)[n]])
+    P = np.vstack([np.column_stack([P, np.array(layout.rotor_side)]), np.eye(n + 1)[n]])
     eq = equations_from_stamps(acting, P, layout.linear, gates.dtype)
     # From (q, r, dq, dr, linear states) to the order of the layout.
     order = np.array([*range(n), *range(n + 1, 2 * n + 1), *range(2 * n + 2, layout.linear), n, 2 * n + 1])

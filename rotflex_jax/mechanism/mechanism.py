@@ -20,6 +20,9 @@ from rotflex_jax.parameters import Specification, specifications
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import equation, unit_text
 
+ROTOR = "rotor"
+"""Port on the motor's side of a gear with play, which a mechanism with such a gear has besides its own."""
+
 
 class _Slot:
     """Placeholder of a parameter value in a structure."""
@@ -85,8 +88,16 @@ class Mechanism:
 
     @property
     def port_vectors(self) -> dict[str, tuple[float, ...]]:
-        """Port name -> vector over the coordinates."""
-        return dict(self.ports)
+        """Port name -> vector over the coordinates; with a gear also its `rotor`, while the teeth touch."""
+        vectors = dict(self.ports)
+        for e in self.effects:
+            if e.state_part == "rotor" and e.at in vectors:
+                vectors.setdefault(ROTOR, vectors[e.at])
+        return vectors
+
+    def on_rotor(self, port: str) -> bool:
+        """Whether a port is on the motor's side of a gear with play."""
+        return port == ROTOR and ROTOR not in dict(self.ports) and ROTOR in self.port_vectors
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -133,7 +144,7 @@ class Mechanism:
         """Where an effect can act here: the ports, the voltage (`input`), or the outputs."""
         if effect.acts_on == "input":
             return ("input",)
-        return self.channels if effect.acts_on == "channel" else tuple(name for name, _ in self.ports)
+        return self.channels if effect.acts_on == "channel" else tuple(self.port_vectors)
 
     def vector(self, effect: Effect) -> tuple[float, ...]:
         """Vector of the port at which an effect acts, of a sensor of the port that it measures."""

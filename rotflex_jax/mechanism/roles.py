@@ -19,11 +19,11 @@ def port_roles(mechanism: Mechanism, port: str) -> set[str]:
 
     A motor makes it a `hub`, a spring a `joint`, and neither an `arm`; one that moves in metres is an
     `axis` as well. A machine that has a hub, a joint and an arm by name says with them where it is
-    searched: its other ports have no role.
+    searched: its other ports have no role. Neither has the motor's side of a gear with play.
     """
     if port in PORTS:
         return {port}
-    if all(name in mechanism.port_vectors for name in PORTS):
+    if mechanism.on_rotor(port) or all(name in mechanism.port_vectors for name in PORTS):
         return set()
     stiff = any(float(e.stamp().stiffness) != 0 for e in mechanism.linear_effects(port))
     roles = {"hub"} if mechanism.has_motor(port) else set()

@@ -32,7 +32,11 @@ from rotflex_jax.mechanism.small_matrices import (
 def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "p *S"], Float[Array, "p *S"]]:
     """Positions and speeds of the torque ports at linear states."""
     P, n = layout.port_matrix, layout.n
-    return sparse_matvec(P, x[:n]), sparse_matvec(P, x[n : 2 * n])
+    position, speed = sparse_matvec(P, x[:n]), sparse_matvec(P, x[n : 2 * n])
+    if any(layout.rotor_side):
+        side = expand_axes(jnp.asarray(layout.rotor_side, x.dtype), position)
+        position, speed = position + side * x[layout.rotor][None], speed + side * x[layout.rotor + 1][None]
+    return position, speed
 
 
 def motor_torque(

@@ -66,7 +66,7 @@ def effects(given: Any) -> tuple[Effect, ...]:
 
 def check(mechanism: "Mechanism") -> None:
     """Raise `InputError` where ports, outputs and effects do not fit together."""
-    ports = mechanism.port_vectors
+    ports = dict(mechanism.ports)
     for name, vector in ports.items():
         if len(vector) != len(mechanism.coordinates):
             raise InputError(
