@@ -286,10 +286,9 @@ def from_equations(
     if layout.linear > layout.rotor:
         push = push.at[layout.rotor].set(eq.ports[layout.rotor + 1])
 
-    def moved(states: Array, first: int, rotor: int) -> Array:
+    def moved(coordinates: Array, states: Array, rotor: int) -> Array:
         """Motion of the ports with the coordinates, and of those on the rotor's side with the rotor."""
-        own = P @ states[first : first + n]
-        side = np.array(layout.rotor_side)
+        own, side = P @ coordinates, np.array(layout.rotor_side)
         return own + jnp.asarray(side, E.dtype)[:, None] * states[rotor][None] if side.any() else own
 
     return Constants(
@@ -304,8 +303,8 @@ def from_equations(
         half_E=half_E,
         half_input=half[:, 0],
         half_hold=half[:, 1:],
-        stop=moved(one[:, 1:], n, layout.rotor + 1),
-        mobility=moved(push, 0, layout.rotor),
+        stop=moved(one[n : 2 * n, 1:], one[:, 1:], layout.rotor + 1),
+        mobility=moved(push[:n], push, layout.rotor),
         push=push,
     )
 

@@ -117,7 +117,7 @@ class Oscillator(NamedTuple):
         return value, self.stiff * (self.grows + dy) + self.loss * bend
 
 
-class Contact(NamedTuple):
+class ToothContact(NamedTuple):
     """Teeth in contact for a part of a step.
 
     Attributes:
@@ -140,7 +140,7 @@ def contact(
     stiff: Float[Array, "*S"],
     loss: Float[Array, "*S"],
     mass: Float[Array, "*S"],
-) -> Contact:
+) -> ToothContact:
     """Contact from a fraction `start` of the step until the torque is zero or the step ends.
 
     Args:
@@ -172,7 +172,7 @@ def contact(
     area = way - (flight.integral(t) - flight.integral(start))
     moments = -jnp.stack([slower, t * slower - behind, t * t * slower - 2 * t * behind + 2 * area])
     moments = jnp.where(touching[None], mass[None] * moments, 0.0)
-    return Contact(start, moments[0], moments, touching & ~ends)
+    return ToothContact(start, moments[0], moments, touching & ~ends)
 
 
 def _until_zero(o: Oscillator, span: Array) -> Array:

@@ -214,7 +214,7 @@ def _separation(
     return stays, Separation(separates, moments)
 
 
-def delayed(t: Array, response: Array, layout: Layout) -> Array:
+def delayed(t: Float[Array, "*S"], response: Float[Array, "n *S"], layout: Layout) -> Float[Array, "n *S"]:
     """Response of friction and other torques to an impact at the fraction `t` of a step, from that at 0."""
     positions = {*range(layout.n), layout.rotor}
     return response * jnp.stack([(1 - t) ** 2 if i in positions else 1 - t for i in range(len(response))])
@@ -273,7 +273,9 @@ def _impact(
     return Impact(t, rests, jnp.stack([impulse * t**m + held * after_impact[m] for m in range(3)]))
 
 
-def crossing_time(distance: Array, b: Array, d: Array) -> Array:
+def crossing_time(
+    distance: Float[Array, "*S"], b: Float[Array, "*S"], d: Float[Array, "*S"]
+) -> Float[Array, "*S"]:
     """The root of `b t + d t^2 = distance` at which the motion crosses outwards."""
     way = jnp.where(distance + 0.0 == 0, jnp.sign(b + d), jnp.sign(distance))
     square = b * b + 4 * d * distance

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 
-from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory
+from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of, equations, own_states
 from rotflex_jax.mechanism.elastic_teeth import elastic_step
 from rotflex_jax.mechanism.friction import coupled_contacts, limited, solve_masked
@@ -138,8 +138,8 @@ def friction_level(
     speed: Float[Array, "*S"],
     direction: float,
     load: Float[Array, "*S"] | None,
-) -> Float[Array, "*S"]:
-    """Level [N m] of a dry friction against motion in a direction.
+) -> Scalar:
+    """Level [N m] of a dry friction against motion in a direction; one number where it is the same anywhere.
 
     Args:
         e: The effect.
@@ -150,7 +150,7 @@ def friction_level(
     """
     signals = (position, speed) if load is None or not e.loaded else (position, speed, load)
     limit = lambda e, q, s, *load: e.limit(q, s, direction, *load)  # noqa: E731
-    return jnp.asarray(evaluate_effect(e, limit, *signals))
+    return evaluate_effect(e, limit, *signals)
 
 
 def _drive(mechanism: Mechanism, e: Memory, x: Array, v: Array, gates: Array) -> Array:
