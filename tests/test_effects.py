@@ -18,6 +18,7 @@ import rotflex_jax.effects as effects
 from rotflex_jax.effects import (
     CATALOG,
     Actuation,
+    AmplifierSaturation,
     BoucWen,
     Cogging,
     Coulomb,
@@ -74,6 +75,7 @@ PASSIVE = {
     "coulomb",
     "coulomb_asymmetric",
     "stribeck",
+    "load_friction",
     "quadratic_drag",
     "dahl",
     "lugre",
@@ -116,27 +118,39 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
     """All that an effect says at one point, as one vector, whatever its kind."""
     effect = effect.replace(**dict(zip(effect.values, numbers, strict=True)))
     if isinstance(effect, Linear):
-        s = effect.stamp()
-        lists = (*s.own, s.from_speed, s.from_voltage, s.torque)
-        said = [s.inertia, s.damping, s.stiffness, s.drive, *(c for row in lists for c in row)]
+        said = entries(effect)
     elif isinstance(effect, Force):
         said = [effect.force(position, speed, voltage)]
     elif isinstance(effect, DryFriction):
-        said = [effect.limit(position, jnp.abs(speed), way) for way in (1.0, -1.0)]
+        load = (voltage,) if effect.loaded else ()
+        said = [effect.limit(position, jnp.abs(speed), way, *load) for way in (1.0, -1.0)]
     elif isinstance(effect, Memory):
         said = [
             effect.force(z, position, speed, voltage),
             effect.flow(z, position, speed, voltage),
         ]
     elif isinstance(effect, Gear):  # a rotor with no room to turn is no rotor
-        said = [effect.stops(), effect.stops() * effect.rotor()]
+        said = [effect.stops(), effect.stops() * effect.rotor(), *(effect.teeth() or ())]
     elif isinstance(effect, Actuation):
         voltages = voltage * jnp.array([1.0, -1.0, 0.3], voltage.dtype)
         return effect.drive(voltages, 0.002)
     else:
         assert isinstance(effect, Sensing)
-        said = [effect.measure(position)]
+        said = [effect.measure(position, *beside(effect, speed, z))]
+        said += entries(effect) if effect.order else []
     return jnp.stack([jnp.asarray(s, position.dtype) for s in said])
+
+
+def entries(effect: Linear | Sensing) -> list:
+    """All entries of a stamp."""
+    s = effect.stamp()
+    lists = (*s.own, s.from_speed, s.from_voltage, s.torque)
+    return [s.inertia, s.damping, s.stiffness, s.drive, *(c for row in lists for c in row)]
+
+
+def beside(effect: Sensing, other, z) -> tuple:
+    """What a sensor is given besides the true value; a speed where it has states of its own."""
+    return {"nothing": (), "other": (other,), "states": ((z, 2 * z), 1)}[effect.beside]
 
 
 def nothing(effect: Effect, position, voltage):
@@ -251,7 +265,8 @@ def test_jit_vmap_and_arrays_agree_with_one_point(cls):
     if isinstance(effect, Force):
         np.testing.assert_allclose(effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, 0], rtol=1e-14)
     if isinstance(effect, Sensing):
-        np.testing.assert_allclose(effect.measure(grid), one_by_one[:, 0], rtol=1e-14)
+        said = effect.measure(grid, *beside(effect, 2 * grid, grid / 4))
+        np.testing.assert_allclose(said, one_by_one[:, 0], rtol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -377,6 +392,9 @@ def test_what_may_be_negative():
         "sensor_gain.error",
         "sensor_cubic.cubic",
         "rectifier.loss",
+        "eccentric_encoder.cosine",
+        "eccentric_encoder.sine",
+        "cross_talk.share",
     }
 
 
@@ -458,7 +476,9 @@ def test_candidates_cover_the_first_family():
     assert {("lag", "input"), ("delay", "input"), ("heating", "hub"), ("cogging", "hub")} <= pairs
     assert {("joint_play", "joint"), ("bouc_wen", "joint"), ("second_mode", "arm")} <= pairs
     assert {(name, p) for name in ("dahl", "lugre") for p in ("hub", "joint")} <= pairs
-    assert {("sensor_cubic", "alpha"), ("rectifier", "alpha")} <= pairs
+    assert {("sensor_cubic", "alpha"), ("rectifier", "alpha"), ("cross_talk", "alpha")} <= pairs
+    assert {("eccentric_encoder", "theta"), ("channel_delay", "theta"), ("channel_delay", "alpha")} <= pairs
+    assert {("voltage_drift", "input"), ("amplifier_saturation", "input")} <= pairs
     assert ("heating", "arm") not in pairs and ("heating", "joint") not in pairs  # no motor there
     assert ("sensor_bias", "alpha") in pairs and ("sensor_bias", "theta") not in pairs
     assert not {"inertia", "spring", "motor"} & {n for n, _ in pairs}
@@ -532,6 +552,11 @@ def test_actuation_laws_and_their_order():
     limited = Saturation(limit=5.0).drive(v, 0.01)
     np.testing.assert_allclose(limited, [-5, -0.2, -0.05, 0, 0.05, 0.3, 5], atol=0)
     np.testing.assert_allclose(VoltageOffset(offset=0.3).drive(v, 0.01), v + 0.3, atol=0)
+    soft = np.asarray(AmplifierSaturation(limit=5.0).drive(v, 0.01))
+    np.testing.assert_allclose(soft, 5 * (1 - 2 / (np.exp(2 * v / 5) + 1)), rtol=1e-13, atol=1e-15)
+    small = np.asarray(AmplifierSaturation(limit=5.0).drive(v / 100, 0.01))
+    np.testing.assert_allclose(small, v / 100 * (1 - (v / 500) ** 2 / 3), rtol=1e-7)
+    assert AmplifierSaturation.stage == Saturation.stage
     assert Saturation.stage < VoltageOffset.stage < DeadZone.stage < Delay.stage < Lag.stage
     assert DeadZone().at == "input"
 

@@ -508,6 +508,14 @@ LADEN = {
         fx.VoltageDrift(rate=0.2),
         fx.ViscousAsymmetric("hub", 0.002),
     ],
+    "sensors and load": [
+        fx.AmplifierSaturation(limit=2.5),
+        fx.EccentricEncoder("theta", cosine=0.004, sine=-0.01),
+        fx.CrossTalk("alpha", share=0.02),
+        fx.ChannelDelay("theta", time=0.003),
+        fx.ChannelDelay("alpha", time=0.005),
+        fx.LoadFriction("hub", level=0.02, driving=0.2, driven=0.5),
+    ],
     "dry": [
         fx.CoulombAsymmetric("hub", 0.03, 0.02),
         fx.Stribeck("joint", 0.003, 0.002, 0.3),
@@ -584,7 +592,7 @@ def test_derivatives_of_a_trajectory_equal_central_differences(case):
 def test_every_effect_has_its_derivatives_checked():
     used = {e.name for effects in LADEN.values() for e in effects} | {"inertia", "motor", "current_drive"}
     # Play has no slope at a gap of zero; its own tests hold where it has one.
-    assert used | {"backlash"} == set(fx.CATALOG)
+    assert used | {"backlash", "elastic_backlash"} == set(fx.CATALOG)
 
 
 @pytest.mark.parametrize("case", LADEN)

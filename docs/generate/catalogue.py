@@ -26,6 +26,7 @@ OWN_CAPTIONS = {
     "learned_torque": "The splines along the speed; a weight for each makes the map.",
     "motor": "Less torque the faster it turns: the back-EMF takes voltage away.",
     "coulomb_asymmetric": "With half the level backwards.",
+    "load_friction": "Turning forwards, a positive load is the motor's own; backwards it is the machine's.",
 }
 
 

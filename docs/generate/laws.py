@@ -6,6 +6,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.signal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -62,6 +63,15 @@ def _friction(ax: Axes, effect: Effect) -> None:
     _labels(ax, "speed [rad/s]", "torque on the port [N m]")
 
 
+def _load_friction(ax: Axes, effect: Effect) -> None:
+    """Level against motion each way, over the torque through the gear."""
+    assert isinstance(effect, fx.LoadFriction)
+    load = np.linspace(-0.5, 0.5, 201)
+    for way, look, words in ((1.0, LINE, "forwards"), (-1.0, OTHER, "backwards")):
+        ax.plot(load, np.asarray(effect.limit(0.0, 0.0, way, load)), **look, label=f"turning {words}")
+    _labels(ax, "torque through the gear [N m]", "level of friction [N m]")
+
+
 def _force(ax: Axes, effect: Effect) -> None:
     """Over the position or the speed, whichever the law depends on."""
     assert isinstance(effect, Force)
@@ -112,7 +122,7 @@ def _heating(ax: Axes, effect: Effect) -> None:
 def _actuation(ax: Axes, effect: Effect) -> None:
     """Voltage at the motor over the command."""
     assert isinstance(effect, Actuation)
-    reach = 10.0 if effect.name == "saturation" else 0.4
+    reach = {"saturation": 10.0, "amplifier_saturation": 20.0}.get(effect.name, 0.4)
     u = np.linspace(-reach, reach, 401)
     ax.plot(u, u, **OTHER, label="without it")
     ax.plot(u, np.asarray(effect.drive(jnp.asarray(u), 0.001)), **LINE, label="with it")
@@ -145,6 +155,37 @@ def _sensing(ax: Axes, effect: Effect) -> None:
     ax.plot(value, value, **OTHER, label="without it")
     ax.plot(value, np.asarray(effect.measure(value)) + 0.0 * value, **LINE, label="with it")
     _labels(ax, "true value [rad]", "reading [rad]")
+
+
+def _runout(ax: Axes, effect: Effect) -> None:
+    """What the reading adds, over the angle."""
+    assert isinstance(effect, Sensing)
+    value = np.linspace(-2 * math.pi, 2 * math.pi, 600)
+    ax.plot(value, 1e3 * (np.asarray(effect.measure(value)) - value), **LINE)
+    _labels(ax, "true value [rad]", "error of the reading [mrad]")
+
+
+def _cross_talk(ax: Axes, effect: Effect) -> None:
+    """Reading while the true value is zero, over the other channel."""
+    assert isinstance(effect, Sensing)
+    other = np.linspace(-3.0, 3.0, 100)
+    ax.plot(other, 1e3 * np.asarray(effect.measure(0.0 * other, other)), **LINE)
+    _labels(ax, "true value at the other sensor [rad]", "reading of a value of zero [mrad]")
+
+
+def _late(ax: Axes, effect: Effect) -> None:
+    """A true value that starts to swing, and its reading."""
+    assert isinstance(effect, fx.ChannelDelay)
+    stamp = effect.stamp()
+    t = np.linspace(0.0, 0.06, 1201)
+    swing = 2 * math.pi * 25
+    value, speed = 0.1 * (1 - np.cos(swing * t)), 0.1 * swing * np.sin(swing * t)
+    states = scipy.signal.lsim(
+        (np.array(stamp.own), np.array(stamp.from_speed)[:, None], np.eye(2), np.zeros((2, 1))), speed, t
+    )[1]
+    ax.plot(1e3 * t, value, **OTHER, label="true value")
+    ax.plot(1e3 * t, effect.measure(value, tuple(states.T), 0), **LINE, label="reading")
+    _labels(ax, "time [ms]", "angle [rad]")
 
 
 def _stamped(x: str, entry: str) -> Draw:
@@ -195,6 +236,17 @@ def _gear(ax: Axes, effect: Effect) -> None:
     _labels(ax, "rotor against port [mrad]", "torque passed on [N m]")
 
 
+def _elastic_gear(ax: Axes, effect: Effect) -> None:
+    """Torque over the angle of the rotor against the port, slowly and while the teeth approach each other."""
+    assert isinstance(effect, fx.ElasticBacklash)
+    r = np.linspace(-1.3, 1.3, 800) * float(effect.gap)
+    depth, side = np.abs(r) - float(effect.gap), np.sign(r)
+    for speed, look, words in ((0.0, LINE, "slowly"), (1.0, OTHER, "teeth approach at 1 rad/s")):
+        push = float(effect.stiffness) * depth + float(effect.damping) * speed
+        ax.plot(1e3 * r, np.where(depth > 0, push, 0.0) * side, **look, label=words)
+    _labels(ax, "rotor against port [mrad]", "torque passed on [N m]")
+
+
 def _splines(ax: Axes, effect: Effect) -> None:
     assert isinstance(effect, fx.LearnedTorque)
     speed = np.linspace(-5.5, 5.5, 800)
@@ -216,6 +268,11 @@ DRAWINGS: dict[type, Draw] = {
     fx.VoltageDrift: _drift,
     fx.Heating: _heating,
     fx.Backlash: _gear,
+    fx.ElasticBacklash: _elastic_gear,
+    fx.LoadFriction: _load_friction,
+    fx.EccentricEncoder: _runout,
+    fx.CrossTalk: _cross_talk,
+    fx.ChannelDelay: _late,
     fx.Motor: _motor,
     fx.CurrentDrive: _stamped("command [V]", "drive"),
     fx.SecondMode: _mode,

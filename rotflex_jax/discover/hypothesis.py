@@ -174,6 +174,10 @@ def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: floa
     z[list(c.parameters)] = Transform.of(specs).unconstrain(values)
     locations = (*h.locations, start.location)
     x0 = h.initial_state_for(s, locations)
+    if CATALOG[start.location.effect].per_recording:
+        own = np.tile(z[list(c.parameters)], (len(x0), 1))
+        local, local_z = (*h.local, *c.parameters), np.hstack([h.local_z, own])
+        return dataclasses.replace(h, locations=locations, local=local, local_z=local_z, z=z, x0=x0)
     return dataclasses.replace(h, locations=locations, free=(*h.free, *c.parameters), z=z, x0=x0)
 
 

@@ -4,7 +4,15 @@ To add one, derive a frozen dataclass from a kind (`base.py`), decorate it with 
 import it here.
 """
 
-from rotflex_jax.effects.actuation import DeadZone, Delay, Lag, Saturation, VoltageDrift, VoltageOffset
+from rotflex_jax.effects.actuation import (
+    AmplifierSaturation,
+    DeadZone,
+    Delay,
+    Lag,
+    Saturation,
+    VoltageDrift,
+    VoltageOffset,
+)
 from rotflex_jax.effects.angle import Cogging, Gravity
 from rotflex_jax.effects.base import (
     CATALOG,
@@ -23,13 +31,21 @@ from rotflex_jax.effects.base import (
     register,
 )
 from rotflex_jax.effects.damping import QuadraticDrag, Viscous, ViscousAsymmetric
-from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, Stribeck
-from rotflex_jax.effects.gear import Backlash
+from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, LoadFriction, Stribeck
+from rotflex_jax.effects.gear import Backlash, ElasticBacklash
 from rotflex_jax.effects.hysteresis import BoucWen, Dahl, LuGre
 from rotflex_jax.effects.inertia import Inertia, SecondMode
 from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.effects.motor import CurrentDrive, Heating, Motor
-from rotflex_jax.effects.sensors import Rectifier, SensorBias, SensorCubic, SensorGain
+from rotflex_jax.effects.sensors import (
+    ChannelDelay,
+    CrossTalk,
+    EccentricEncoder,
+    Rectifier,
+    SensorBias,
+    SensorCubic,
+    SensorGain,
+)
 from rotflex_jax.effects.springs import CubicSpring, JointPlay, QuadraticSpring, Spring
 
 __all__ = [
@@ -60,6 +76,7 @@ __all__ = [
     "Coulomb",
     "CoulombAsymmetric",
     "Stribeck",
+    "LoadFriction",
     # force
     "QuadraticDrag",
     "ViscousAsymmetric",
@@ -71,6 +88,7 @@ __all__ = [
     "LearnedTorque",
     # gear
     "Backlash",
+    "ElasticBacklash",
     # with memory
     "Dahl",
     "LuGre",
@@ -79,6 +97,7 @@ __all__ = [
     # actuation
     "DeadZone",
     "Saturation",
+    "AmplifierSaturation",
     "VoltageOffset",
     "VoltageDrift",
     "Delay",
@@ -88,4 +107,7 @@ __all__ = [
     "SensorGain",
     "SensorCubic",
     "Rectifier",
+    "EccentricEncoder",
+    "CrossTalk",
+    "ChannelDelay",
 ]

@@ -1,4 +1,4 @@
-"""Effects on the voltage before the motor: dead zone, saturation, offset, drift, delay, first-order lag."""
+"""Effects on the voltage before the motor: dead zone, hard and soft saturation, offset, drift, delay, lag."""
 
 import dataclasses
 from typing import ClassVar
@@ -98,6 +98,45 @@ class Saturation(Actuation):
 
 @register
 @dataclasses.dataclass(frozen=True)
+class AmplifierSaturation(Actuation):
+    """An amplifier that gives less and less of a large voltage, without a corner at its limit.
+
+        v -> limit tanh(v / limit)
+
+    Inactive only at an infinite limit, so it has no amplitude; a limit far above the largest recorded
+    voltage has no effect. Not for a supply that cuts off at its voltage (`saturation`).
+
+    Args:
+        at: Always `input`.
+        limit: Voltage that it approaches [V].
+
+    Source: H. K. Khalil, Nonlinear Systems, 3rd ed., 2002, section 1.2.7.
+    """
+
+    name: ClassVar[str] = "amplifier_saturation"
+    title: ClassVar[str] = "amplifier that saturates gradually"
+    equation: ClassVar[str] = "v -> limit * tanh(v / limit)"
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    stage: ClassVar[int] = 0
+
+    limit: float = parameter(10.0, unit="V", lower=1e-3, meaning="voltage that it approaches")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] at the motor."""
+        return self.limit * jnp.tanh(voltage / self.limit)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction at each of three limits."""
+        return [[{"limit": share * scale.voltage}] for share in (2.4, 1.2, 0.6)]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the amplifier saturates gradually and gives less than {self.limit:.3g} V either way"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
 class VoltageOffset(Actuation):
     """A constant offset of the amplifier.
 
@@ -118,6 +157,7 @@ class VoltageOffset(Actuation):
     equation: ClassVar[str] = "v -> v + offset"
     amplitudes: ClassVar[tuple[str, ...]] = ("offset",)
     searched: ClassVar[tuple[str, ...]] = ("input",)
+    per_recording: ClassVar[bool] = True
     stage: ClassVar[int] = 1
 
     offset: float = parameter(0.0, unit="V", typical=0.05, meaning="voltage added")
@@ -160,6 +200,8 @@ class VoltageDrift(Actuation):
     title: ClassVar[str] = "offset of the voltage that drifts"
     equation: ClassVar[str] = "v -> v + rate * t"
     amplitudes: ClassVar[tuple[str, ...]] = ("rate",)
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    per_recording: ClassVar[bool] = True
     stage: ClassVar[int] = 1
 
     rate: float = parameter(0.0, unit="V/s", typical=1e-3, meaning="change of the offset with time")

@@ -30,6 +30,7 @@ Probe = Mapping[str, float]
 """Parameter name -> value at which a score test tries an effect."""
 Drive = Literal["voltage", "motor"]
 Domain = Literal["port", "input", "channel"]
+Beside = Literal["nothing", "other", "states"]
 StatePart = Literal["linear", "rotor", "memory"]
 EffectType = TypeVar("EffectType", bound="Effect")
 
@@ -97,6 +98,7 @@ class Effect(abc.ABC):
     # Ports a search tries it at by default; none for what a model has from the start.
     searched: ClassVar[tuple[str, ...]] = ()
     turning: ClassVar[bool] = False  # a function of an angle: no meaning where a port moves along a line
+    per_recording: ClassVar[bool] = False  # its parameters belong to a recording, not to the machine
 
     # -- declared by each kind
     kind_label: ClassVar[str]
@@ -198,7 +200,7 @@ class Effect(abc.ABC):
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """Effects that must be at its port: `motor`, `inertia`."""
+        """What must be where it acts: `motor`, `inertia`; of a sensor `second output`, `position`."""
         return ()
 
     def sentence(self) -> str:
@@ -275,10 +277,19 @@ class DryFriction(Effect):
     not_linearised: ClassVar[str] = "has no slope at rest"
     # True where the level is the same at every speed and position: a step need not iterate on it.
     steady: ClassVar[bool] = False
+    # True where it depends on the torque that passes from the motor to the machine: `limit` receives it [N m]
+    # as a fourth argument, positive where the motor pushes forwards. It is the mean of both sides of the
+    # port: of what the motors give and of what the rest of the machine takes, by its linear part.
+    loaded: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar, *load: Scalar) -> Scalar:
         """Level [N m] >= 0 that opposes motion in `direction` (+1 or -1) at |speed| [rad/s]."""
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A motor and an inertia between it and the rest, where the transmitted torque is asked for."""
+        return ("motor", "inertia") if cls.loaded else ()
 
 
 class Memory(Effect):
@@ -328,6 +339,9 @@ class Gear(Effect):
     slope_at_zero: ClassVar[bool] = False
     single: ClassVar[bool] = True
     not_linearised: ClassVar[str] = "has no slope within the play; the gear is taken as tight"
+    # Steps into which a step is cut, so that contact and separation of elastic teeth are apart; more than one
+    # only for a gear with `teeth`.
+    steps: ClassVar[int] = 1
 
     @property
     def order(self) -> int:
@@ -341,6 +355,10 @@ class Gear(Effect):
     @abc.abstractmethod
     def rotor(self) -> Scalar:
         """The rotor's part of the inertia that is entered at the port, above 0 and below 1."""
+
+    def teeth(self) -> tuple[Scalar, Scalar] | None:
+        """Stiffness [N m/rad] and damping [N m s/rad] of teeth in contact; None where they are rigid."""
+        return None
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
@@ -369,7 +387,11 @@ class Actuation(Effect):
 
 
 class Sensing(Effect):
-    """Output to output: what the sensor of one channel makes of the true value."""
+    """Output to output: what the sensor of one channel makes of the true value.
+
+    A sensor with dynamics has an `order` and a `stamp`, as a linear effect at the port of its channel; the
+    stamp gives the port no torque. `measure` receives its states.
+    """
 
     kind_label: ClassVar[str] = "sensing"
     kind_meaning: ClassVar[str] = "What a sensor makes of the true value."
@@ -377,10 +399,22 @@ class Sensing(Effect):
     exact_step: ClassVar[bool] = True
     # True for an error that shows only against another sensor.
     relative: ClassVar[bool] = False
+    # What `measure` receives after the true value: nothing, the true value of another channel (the first of
+    # the others), or the tuple of its own states and the order of the derivative that the channel shows.
+    beside: ClassVar[Beside] = "nothing"
 
     @abc.abstractmethod
-    def measure(self, value: Scalar) -> Scalar:
+    def measure(self, value: Scalar, *beside: Any) -> Scalar:
         """Reading [unit of the channel] for a true value."""
+
+    def stamp(self) -> Stamp:
+        """Equations of its own states; not for a sensor without any."""
+        return Stamp()
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A second output where its true value is asked for."""
+        return ("second output",) if cls.beside == "other" else ()
 
 
 KINDS: tuple[type[Effect], ...] = (DryFriction, Force, Memory, Gear, Linear, Actuation, Sensing)

@@ -1,4 +1,4 @@
-"""Dry friction: Coulomb, different in each direction, Stribeck."""
+"""Dry friction: Coulomb, different in each direction, Stribeck, growing with the load of a gear."""
 
 import dataclasses
 from typing import ClassVar
@@ -157,4 +157,66 @@ class Stribeck(DryFriction):
         return (
             f"friction at the {self.at} falls from {self.level + self.excess:.3g} N m at "
             f"standstill to {self.level:.3g} N m within about {2 * self.speed:.2g} rad/s"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class LoadFriction(DryFriction):
+    """Friction of a gear that grows with the torque it transmits, more where the load drives the motor.
+
+        |tau| = level + driving |load| while the motor drives,  level + driven |load| while it is driven
+
+    At rest any torque up to that level holds the port. `load` is the torque through the gear, taken as the
+    mean of both sides of the port: of what the motor gives and of what the rest of the machine takes. The
+    motor drives where the load has the sign of the motion. A gear with `driven` of 2 or more cannot be turned
+    by its load. Not beside an efficiency of the motor that is free, which does the same while the motor
+    drives.
+
+    Args:
+        at: Port of the motor.
+        level: Friction torque without load [N m].
+        driving: Share of the load while the motor drives.
+        driven: Share of the load while the load drives the motor.
+
+    Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
+    simulation of servo actuators, 2024, models M3 and M5 (load-dependent and directional friction).
+    """
+
+    name: ClassVar[str] = "load_friction"
+    title: ClassVar[str] = "friction of a gear that grows with its load"
+    equation: ClassVar[str] = (
+        "tau = -(level + share * |load|) * sign(speed), share = driving if load * speed > 0, driven "
+        "otherwise, load torque through the gear"
+    )
+    ports: ClassVar[tuple[str, ...]] = ("hub",)
+    amplitudes: ClassVar[tuple[str, ...]] = ("level", "driving", "driven")
+    contains: ClassVar[tuple[str, ...]] = ("coulomb",)
+    searched: ClassVar[tuple[str, ...]] = ("hub",)
+    loaded: ClassVar[bool] = True
+
+    level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque without load")
+    driving: float = parameter(
+        0.1, unit="", lower=0.0, meaning="share of the load that is lost while the motor drives"
+    )
+    driven: float = parameter(
+        0.2, unit="", lower=0.0, meaning="share of the load that is lost while the load drives the motor"
+    )
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar, load: Scalar) -> Scalar:
+        """Level [N m] that opposes motion in `direction` under the load [N m]."""
+        push = jnp.asarray(load) * direction
+        return self.level + jnp.where(push > 0, self.driving * push, -self.driven * push)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Three directions, one for each number."""
+        none = {"level": 0.0, "driving": 0.0, "driven": 0.0}
+        return [[none | {"level": 0.1 * scale.torque}, none | {"driving": 0.2}, none | {"driven": 0.2}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"friction at the {self.at} grows with the torque through the gear: from {self.level:.3g} N m by "
+            f"{self.driving:.1%} of it while the motor drives and by {self.driven:.1%} while it is driven"
         )

@@ -1,4 +1,4 @@
-"""Sensor errors: gain, bias, nonlinearity, rectification."""
+"""Sensor errors: gain, bias, nonlinearity, rectification, an encoder out of centre, cross-talk, delay."""
 
 import dataclasses
 import math
@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from rotflex_jax.effects.base import Probe, Scalar, Scale, Sensing, register
+from rotflex_jax.effects.base import Beside, Probe, Scalar, Scale, Sensing, Stamp, StatePart, register
 from rotflex_jax.parameters import parameter
 
 
@@ -76,6 +76,7 @@ class SensorBias(Sensing):
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("bias",)
     searched: ClassVar[tuple[str, ...]] = ("alpha",)
+    per_recording: ClassVar[bool] = True
 
     bias: float = parameter(0.0, unit="rad", typical=0.01, meaning="reading at zero")
 
@@ -183,3 +184,172 @@ class Rectifier(Sensing):
         if self.loss >= 0:
             return f"the sensor of {self.at} loses {self.loss:.2%} of what is below zero"
         return f"the sensor of {self.at} reads {-self.loss:.2%} more below zero than above"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class EccentricEncoder(Sensing):
+    """An encoder whose disc does not turn about its own centre: an error that repeats once per turn.
+
+        y = value + cosine cos(value) + sine sin(value)
+
+    Two amplitudes instead of one and a phase, because the zero of the angle is where the recording began.
+    An eccentricity `e` of a disc of radius `r` gives an amplitude of `e / r`. Not where the shaft of the
+    encoder turns much less than once: a bias, a gain and a curvature (`sensor_cubic`) are the same there.
+
+    Args:
+        at: Channel of an angle, as the shaft of the encoder turns.
+        cosine: Amplitude of the cosine [rad].
+        sine: Amplitude of the sine [rad].
+
+    Source: J. R. R. Mayer, High-resolution of rotary encoder analog quadrature signals, IEEE Trans.
+    Instrumentation and Measurement 43, 1994; any encoder's data sheet, runout of the disc.
+    """
+
+    name: ClassVar[str] = "eccentric_encoder"
+    title: ClassVar[str] = "encoder out of centre"
+    equation: ClassVar[str] = "y = value + cosine * cos(value) + sine * sin(value)"
+    ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
+    amplitudes: ClassVar[tuple[str, ...]] = ("cosine", "sine")
+    searched: ClassVar[tuple[str, ...]] = ("theta",)
+    turning: ClassVar[bool] = True
+
+    # An amplitude of one turns the reading back: no disc is that far from its centre.
+    cosine: float = parameter(
+        0.0, unit="rad", typical=0.01, lower=-0.9, upper=0.9, meaning="amplitude of the cosine"
+    )
+    sine: float = parameter(
+        0.0, unit="rad", typical=0.01, lower=-0.9, upper=0.9, meaning="amplitude of the sine"
+    )
+
+    def measure(self, value: Scalar) -> Scalar:
+        """Reading [rad]."""
+        return value + self.cosine * jnp.cos(value) + self.sine * jnp.sin(value)
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A sensor of a position."""
+        return ("position",)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two directions, cosine and sine."""
+        return [[{"cosine": 0.01, "sine": 0.0}, {"cosine": 0.0, "sine": 0.01}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        size = math.hypot(self.cosine, self.sine)
+        return (
+            f"the sensor of {self.at} is out of centre: its error of up to {size:.3g} rad "
+            f"({math.degrees(size):.2g} degrees) repeats once per turn"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class CrossTalk(Sensing):
+    """A share of another channel in a reading: crossed wires, or axes of two sensors that are not apart.
+
+        y = value + share other
+
+    `other` is the true value of the other sensor, of several the first. Not for a servo angle with a share
+    of the deflection in it: the two are one angle at another place of the shaft.
+
+    Args:
+        at: Channel that the other one disturbs.
+        share: Of the other channel in its reading [unit of the channel per unit of the other].
+
+    Source: P. Horowitz and W. Hill, The Art of Electronics, 3rd ed., 2015, section 8.16.
+    """
+
+    name: ClassVar[str] = "cross_talk"
+    title: ClassVar[str] = "share of another sensor in a reading (cross-talk)"
+    equation: ClassVar[str] = "y = value + share * other"
+    ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
+    amplitudes: ClassVar[tuple[str, ...]] = ("share",)
+    searched: ClassVar[tuple[str, ...]] = ("alpha",)
+    relative: ClassVar[bool] = True
+    beside: ClassVar[Beside] = "other"
+
+    share: float = parameter(0.0, unit="", typical=0.01, meaning="share of the other channel")
+
+    def measure(self, value: Scalar, other: Scalar) -> Scalar:
+        """Reading [unit of the channel]."""
+        return value + self.share * other
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"share": 0.01}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the sensor of {self.at} also reads {self.share:+.3g} times what the other sensor should"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class ChannelDelay(Sensing):
+    """A sensor whose reading comes late, alone among the sensors.
+
+        y(t) = value(t - time)
+
+    The way covered in the meantime follows from the speed by a filter of order two, the Pade approximation
+    of the delay, which is stepped exactly with the machine: its relative error is `(W time)^5 / 720` at the
+    angular frequency `W`, 0.0001 at 16 Hz for 6 ms. A jump of the voltage is a corner of the speed, which the
+    filter rounds: for delays of a few samples only. Where all sensors are late by the same time, it is the
+    input that is (`delay`). At the start the machine counts as having been at rest.
+
+    Args:
+        at: Channel of a position or a speed.
+        time: Delay [s].
+
+    Source: G. H. Golub and C. F. Van Loan, Matrix Computations, 4th ed., 2013, section 9.3.1, for the
+    approximation of order (2, 2).
+    """
+
+    name: ClassVar[str] = "channel_delay"
+    title: ClassVar[str] = "delay of one sensor"
+    equation: ClassVar[str] = "y(t) = value(t - time)"
+    ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
+    searched: ClassVar[tuple[str, ...]] = ("theta", "alpha")
+    relative: ClassVar[bool] = True
+    beside: ClassVar[Beside] = "states"
+    state_part: ClassVar[StatePart | None] = "linear"
+
+    # Below the bound no sample shows the delay, and the filter is too fast for the step's matrix exponential.
+    time: float = parameter(0.002, unit="s", lower=5e-5, meaning="delay")
+
+    @property
+    def order(self) -> int:
+        """Two states: how far the reading is behind, and the rate of that times the delay."""
+        return 2
+
+    def stamp(self) -> Stamp:
+        """Filter from the speed: time / (1 + s time/2 + s^2 time^2/12), states of equal size."""
+        fast = 1.0 / self.time
+        return Stamp(
+            own=((0.0, fast), (-12.0 * fast, -6.0 * fast)),
+            from_speed=(0.0, 12.0),
+            from_voltage=(0.0, 0.0),
+            torque=(0.0, 0.0),
+        )
+
+    def measure(self, value: Scalar, states: tuple[Scalar, Scalar], derivative: int) -> Scalar:
+        """Reading [unit of the channel], of the position (derivative 0) or of the speed (1)."""
+        behind, rate = states
+        return value - (behind if derivative == 0 else rate / self.time)
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A sensor of a position or a speed."""
+        return ("position or speed",)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two delays, each an alternative."""
+        return [[{"time": 0.001}], [{"time": 0.004}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the sensor of {self.at} reads what was true {1e3 * self.time:.3g} ms ago"

@@ -1,5 +1,6 @@
-"""Ready-made mechanisms: joints of the paper and the maker, a single inertia, public machines."""
+"""Ready-made mechanisms: joints of the paper and the maker, a link, a single inertia, public machines."""
 
+from rotflex_jax.joints.flexible_link import flexible_link
 from rotflex_jax.joints.public_machines import emps, rotary_arm, silverbox, two_dof_link
 from rotflex_jax.joints.rotary_flexible import (
     arm_inertia,
@@ -17,6 +18,7 @@ __all__ = [
     "quanser_2002",
     "quanser_2010",
     "flexible_joint",
+    "flexible_link",
     "single_inertia",
     "emps",
     "silverbox",

@@ -12,7 +12,7 @@ from typing import Any
 
 from rotflex_jax.errors import InputError
 
-JOINTS = ("paper", "quanser_2002", "quanser_2010", "single_inertia")
+JOINTS = ("paper", "quanser_2002", "quanser_2010", "flexible_link", "single_inertia")
 
 
 def choose(name: str, choices: Iterable[str], what: str) -> str:

@@ -204,8 +204,12 @@ def arm_inertia(arm: int = 2) -> float:
     return main if centre is None else main + 0.030 * ((6 * INCH) ** 2 / 12 + centre**2)
 
 
-def hub_inertia(tachometer: bool = True) -> float:
-    """Moment of inertia [kg m^2] of the maker's servo and the joint's body, seen at the load shaft.
+def hub_inertia(tachometer: bool = True, body: float = 0.0005) -> float:
+    """Moment of inertia [kg m^2] of the maker's servo and the body on it, seen at the load shaft.
+
+    Args:
+        tachometer: Whether the motor has one.
+        body: What sits on the load shaft, the body of the joint by default [kg m^2].
 
     Source: Quanser, config_servo_exp.m, 2002, and config_srv02.m, 2010, in high gear.
 
@@ -216,8 +220,26 @@ def hub_inertia(tachometer: bool = True) -> float:
     gears = disc(0.005, 0.5) + 2 * disc(0.030, 1.5) + disc(0.083, 2.5)
     # Rotor and tachometer, oz in s^2 converted.
     motor = (5.523e-5 + (1e-5 if tachometer else 0.0)) * 0.2780139 * INCH
-    body = 0.0005
     return gears + _GEAR_RATIO**2 * 0.90 * motor + body
+
+
+def srv02_motor(inductance: float | None = None) -> Motor:
+    """Motor and gear of the maker's servo.
+
+    Args:
+        inductance: [H] or None.
+
+    Source: Quanser, config_srv02.m, 2010, in high gear.
+    """
+    return Motor(
+        at="hub",
+        torque_constant=_TORQUE_CONSTANT,
+        back_emf=_BACK_EMF,
+        resistance=2.6,
+        gear_ratio=_GEAR_RATIO,
+        efficiency=_EFFICIENCY,
+        inductance=inductance,
+    )
 
 
 def _srv02(arm: int, stiffness: float, *, hub_damping: float, inductance: float | None) -> Mechanism:
@@ -225,14 +247,6 @@ def _srv02(arm: int, stiffness: float, *, hub_damping: float, inductance: float 
         hub_inertia=hub_inertia(),
         arm_inertia=arm_inertia(arm),
         stiffness=stiffness,
-        motor=Motor(
-            at="hub",
-            torque_constant=_TORQUE_CONSTANT,
-            back_emf=_BACK_EMF,
-            resistance=2.6,
-            gear_ratio=_GEAR_RATIO,
-            efficiency=_EFFICIENCY,
-            inductance=inductance,
-        ),
+        motor=srv02_motor(inductance),
         hub_damping=hub_damping,
     )

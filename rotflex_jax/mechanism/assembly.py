@@ -20,6 +20,7 @@ from rotflex_jax.effects.base import (
     Memory,
     Period,
     Scalar,
+    Sensing,
     Stamp,
     StatePart,
 )
@@ -77,6 +78,7 @@ class Layout:
         rotor: Index of the rotor's angle, if a gear has play.
         torque_ports: Ports at which nonlinear torques act, those with dry friction first.
         port_matrix: Their vectors.
+        rotor_side: One for those on the motor's side of a gear with play, zero for the others.
         contacts: How many of them have dry friction.
         output_rows: Each output as a combination of positions and speeds.
     """
@@ -87,6 +89,7 @@ class Layout:
     rotor: int
     torque_ports: tuple[str, ...]
     port_matrix: tuple[tuple[float, ...], ...]
+    rotor_side: tuple[float, ...]
     contacts: int
     output_rows: tuple[tuple[float, ...], ...]
 
@@ -110,6 +113,7 @@ class Layout:
             rotor=rotor,
             torque_ports=names,
             port_matrix=tuple(structure.port_vectors[p] for p in names),
+            rotor_side=tuple(1.0 if structure.on_rotor(p) else 0.0 for p in names),
             contacts=len(dry),
             output_rows=tuple(quantity.row(structure.port_vectors[port]) for quantity, port in measured),
         )
@@ -118,6 +122,12 @@ class Layout:
 def effects_of(mechanism: Mechanism, kind: type[EffectKind]) -> list[tuple[int, EffectKind]]:
     """Effects of one kind with their indices in `mechanism.effects`."""
     return [(i, e) for i, e in enumerate(mechanism.effects) if isinstance(e, kind)]
+
+
+def stamped(mechanism: Mechanism) -> list[tuple[int, Linear | Sensing]]:
+    """Linear effects and sensors with states of their own, with their indices, in order of their states."""
+    kinds = (Linear, Sensing)
+    return [(i, e) for i, e in enumerate(mechanism.effects) if isinstance(e, kinds) and e.state_part]
 
 
 def own_states(mechanism: Mechanism) -> dict[int, tuple[int, ...]]:
@@ -163,10 +173,7 @@ def equations(mechanism: Mechanism, gates: Float[Array, " E"]) -> EquationsOfMot
         gates: One factor per effect; one where it is on, zero where it is off.
     """
     layout = Layout.of(mechanism.structure)
-    stamps = [
-        PlacedStamp(e.stamp(), np.array(mechanism.port_vectors[e.at]), gates[i])
-        for i, e in effects_of(mechanism, Linear)
-    ]
+    stamps = [PlacedStamp(e.stamp(), np.array(mechanism.vector(e)), gates[i]) for i, e in stamped(mechanism)]
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), layout.n)
     return equations_from_stamps(stamps, P, layout.linear, gates.dtype)
 
@@ -232,6 +239,7 @@ class Constants(NamedTuple):
         mobility: The same for a unit impulse.
         push: Response of the linear states to a unit impulse that acts on positions.
         gear: Constants of a gear with play (`gear.GearConstants`), None without one.
+        load: Rows of the transmitted torques (`step.LoadRows`), None where no friction depends on them.
     """
 
     values: Real[Array, "P *D"]
@@ -249,6 +257,7 @@ class Constants(NamedTuple):
     mobility: Float[Array, "p p *D"]
     push: Float[Array, "m p *D"]
     gear: Any = None
+    load: Any = None
 
 
 def constants(
@@ -276,6 +285,12 @@ def from_equations(
     push = jnp.zeros_like(eq.ports).at[:n].set(eq.ports[n : 2 * n])
     if layout.linear > layout.rotor:
         push = push.at[layout.rotor].set(eq.ports[layout.rotor + 1])
+
+    def moved(coordinates: Array, states: Array, rotor: int) -> Array:
+        """Motion of the ports with the coordinates, and of those on the rotor's side with the rotor."""
+        own, side = P @ coordinates, np.array(layout.rotor_side)
+        return own + jnp.asarray(side, E.dtype)[:, None] * states[rotor][None] if side.any() else own
+
     return Constants(
         values=values,
         gates=gates,
@@ -288,8 +303,8 @@ def from_equations(
         half_E=half_E,
         half_input=half[:, 0],
         half_hold=half[:, 1:],
-        stop=P @ one[n : 2 * n, 1:],
-        mobility=P @ push[:n],
+        stop=moved(one[n : 2 * n, 1:], one[:, 1:], layout.rotor + 1),
+        mobility=moved(push[:n], push, layout.rotor),
         push=push,
     )
 

@@ -12,6 +12,7 @@ states of a contact and the conditions that end them.
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Real
@@ -26,6 +27,7 @@ from rotflex_jax.mechanism.assembly import (
     equations_from_stamps,
     from_equations,
     phi_functions,
+    stamped,
 )
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import matvec
@@ -46,6 +48,7 @@ class GearConstants(NamedTuple):
         moments: The same for a torque with the first, second or third moment in_flight.
         correction: Constant and growing torque that cancel an error of the rotor's angle and speed.
         mass: Effective inertia of an impact of the teeth [kg m^2].
+        teeth: Stiffness and damping of elastic teeth, None where they are rigid.
     """
 
     gap: Float[Array, ""]
@@ -54,51 +57,75 @@ class GearConstants(NamedTuple):
     moments: Float[Array, "m 3"]
     correction: Float[Array, "2 2"]
     mass: Float[Array, ""]
+    teeth: tuple[Float[Array, ""], Float[Array, ""]] | None
+
+
+def gear_steps(structure: Mechanism) -> int:
+    """Steps into which the gear cuts a step."""
+    return max((gear.steps for _, gear in effects_of(structure, Gear)), default=1)
 
 
 def gear_constants(
-    mechanism: Mechanism, values: Real[Array, " P"], gates: Float[Array, " E"], h: Float[Array, ""]
+    mechanism: Mechanism, values: Real[Array, " P"], gates: Float[Array, " E"], tight: Constants
 ) -> GearConstants | None:
-    """Constants of `geared_step`, or None where no gear has play."""
+    """Constants of `geared_step` or of `elastic_step`, or None where no gear has play.
+
+    Args:
+        mechanism: Structure.
+        values: Parameter values.
+        gates: One factor per effect.
+        tight: Constants of the step without play.
+    """
     known = mechanism.with_values(values)
     gears = effects_of(known, Gear)
     if not gears:
         return None
     ((i, gear),) = gears
-    layout = Layout.of(mechanism.structure)
-    eq, teeth = _equations(known, gear, gates, layout)
-    _, one, two, three = phi_functions(eq.A, teeth[:, None], h, 3)
+    layout, h = Layout.of(mechanism.structure), tight.h
+    eq, push = _equations(known, gear, gates, layout)
+    _, one, two, three = phi_functions(eq.A, push[:, None], h, 3)
     ends = jnp.concatenate([one, two, 2 * three], axis=1)
     angle, speed = layout.rotor, layout.rotor + 1
     line = ends[:, :2]
     (a, b), (p, q) = line[angle], line[speed]
+    # In flight the gear transmits no torque.
+    load = jax.tree.map(jnp.zeros_like, tight.load)
+    flight = from_equations(eq, layout, values, gates, h)._replace(load=load)
+    teeth = gear.teeth()
+    if teeth is not None:
+        # The rotor of a gear that is switched off stays at rest, and its teeth never touch.
+        flight = jax.tree.map(lambda apart, one: jnp.where(gates[i] > 0, apart, one), flight, tight)
+        teeth = (jnp.asarray(teeth[0], h.dtype), jnp.asarray(teeth[1], h.dtype))
     return GearConstants(
         gap=gates[i] * gear.stops(),
-        flight=from_equations(eq, layout, values, gates, h),
+        flight=flight,
         line=line,
         moments=ends @ jnp.asarray(MOMENTS_TO_POLYNOMIAL, ends.dtype),
         correction=-jnp.array([[q, -b], [-p, a]]) / (a * q - b * p),
-        mass=-1 / teeth[speed],
+        mass=-1 / push[speed],
+        teeth=teeth,
     )
 
 
 def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tuple[EquationsOfMotion, Array]:
     """Equations of motion with the rotor in flight, and the column of the teeth's torque on the port.
 
-    The rotor's angle relative to the port is an additional coordinate, and the motor acts at port plus rotor.
+    The rotor's angle relative to the port is an additional coordinate, and the motor acts at port plus rotor,
+    as all that is put at `rotor` does.
     """
     n, share = layout.n, gear.rotor()
     acting = []
-    for i, e in effects_of(known, Linear):
-        stamp, here = e.stamp(), e.at == gear.at
-        p = np.array([*known.port_vectors[e.at], 1.0 if here and e.motor else 0.0])
-        if here and not e.motor:
+    for i, e in stamped(known):
+        stamp, here = e.stamp(), isinstance(e, Linear) and e.at == gear.at
+        motor = isinstance(e, Linear) and (known.on_rotor(e.at) or (here and e.motor))
+        p = np.array([*known.vector(e), 1.0 if motor else 0.0])
+        if here and not motor:
             rotor = Stamp(inertia=share * stamp.inertia)
-            acting.append(PlacedStamp(rotor, np.array([*known.port_vectors[e.at], 1.0]), gates[i]))
+            acting.append(PlacedStamp(rotor, np.array([*known.vector(e), 1.0]), gates[i]))
             stamp = stamp._replace(inertia=(1 - share) * stamp.inertia)
         acting.append(PlacedStamp(stamp, p, gates[i]))
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), n)
-    P = np.vstack([np.column_stack([P, np.zeros(len(P))]), np.eye(n + 1)[n]])
+    P = np.vstack([np.column_stack([P, np.array(layout.rotor_side)]), np.eye(n + 1)[n]])
     eq = equations_from_stamps(acting, P, layout.linear, gates.dtype)
     # From (q, r, dq, dr, linear states) to the order of the layout.
     order = np.array([*range(n), *range(n + 1, 2 * n + 1), *range(2 * n + 2, layout.linear), n, 2 * n + 1])
@@ -107,13 +134,13 @@ def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tu
     return ordered, -ports[:, -1]
 
 
+Advance = Callable[[Float[Array, "n *S"], Constants, Float[Array, "m *S"] | None], Float[Array, "n *S"]]
+
+
 def geared_step(
-    mechanism: Mechanism,
-    x: Float[Array, "n *S"],
-    c: Constants,
-    advance: Callable[[Float[Array, "n *S"], Constants, Float[Array, "m *S"] | None], Float[Array, "n *S"]],
+    mechanism: Mechanism, x: Float[Array, "n *S"], c: Constants, advance: Advance
 ) -> Float[Array, "n *S"]:
-    """State at the end of a step.
+    """State at the end of a step with rigid teeth.
 
     Args:
         mechanism: With (traced) parameter values.
@@ -141,7 +168,7 @@ def geared_step(
     push = matvec(a.moments, moments)
     push = jnp.concatenate([push, jnp.zeros_like(x[len(push) :])])
     response = advance(x, a.flight, push[: len(a.line)]) - in_flight - push
-    end = in_flight + push + jnp.where(impacts[None], _delayed(impact.t, response, layout), response)
+    end = in_flight + push + jnp.where(impacts[None], delayed(impact.t, response, layout), response)
     rests = impacts & impact.rests
     # Friction and other torques have responded to the torque of the teeth.
     error = jnp.stack([end[k] - stop, end[k + 1]])
@@ -187,7 +214,7 @@ def _separation(
     return stays, Separation(separates, moments)
 
 
-def _delayed(t: Array, response: Array, layout: Layout) -> Array:
+def delayed(t: Float[Array, "*S"], response: Float[Array, "n *S"], layout: Layout) -> Float[Array, "n *S"]:
     """Response of friction and other torques to an impact at the fraction `t` of a step, from that at 0."""
     positions = {*range(layout.n), layout.rotor}
     return response * jnp.stack([(1 - t) ** 2 if i in positions else 1 - t for i in range(len(response))])
@@ -230,7 +257,7 @@ def _impact(
     # The cubic through both ends, in units of the step: r + b t + d t^2 + e t^3.
     travel, b, last = angle - r, c.h * s, c.h * speed
     d, e = 3 * travel - 2 * b - last, b + last - 2 * travel
-    t = jnp.where(impacts, _crossing_time(stop - r, b, travel - b), 0.0)
+    t = jnp.where(impacts, crossing_time(stop - r, b, travel - b), 0.0)
     for _ in range(2):
         slope = b + t * (2 * d + 3 * t * e)
         safe = impacts & (slope * stop > 0)
@@ -246,7 +273,9 @@ def _impact(
     return Impact(t, rests, jnp.stack([impulse * t**m + held * after_impact[m] for m in range(3)]))
 
 
-def _crossing_time(distance: Array, b: Array, d: Array) -> Array:
+def crossing_time(
+    distance: Float[Array, "*S"], b: Float[Array, "*S"], d: Float[Array, "*S"]
+) -> Float[Array, "*S"]:
     """The root of `b t + d t^2 = distance` at which the motion crosses outwards."""
     way = jnp.where(distance + 0.0 == 0, jnp.sign(b + d), jnp.sign(distance))
     square = b * b + 4 * d * distance

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -19,6 +19,9 @@ from rotflex_jax.mechanism.validation import check
 from rotflex_jax.parameters import Specification, specifications
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import equation, unit_text
+
+ROTOR = "rotor"
+"""Port on the motor's side of a gear with play, which a mechanism with such a gear has besides its own."""
 
 
 class _Slot:
@@ -85,8 +88,16 @@ class Mechanism:
 
     @property
     def port_vectors(self) -> dict[str, tuple[float, ...]]:
-        """Port name -> vector over the coordinates."""
-        return dict(self.ports)
+        """Port name -> vector over the coordinates; with a gear also its `rotor`, while the teeth touch."""
+        vectors = dict(self.ports)
+        for e in self.effects:
+            if e.state_part == "rotor" and e.at in vectors:
+                vectors.setdefault(ROTOR, vectors[e.at])
+        return vectors
+
+    def on_rotor(self, port: str) -> bool:
+        """Whether a port is on the motor's side of a gear with play."""
+        return port == ROTOR and ROTOR not in dict(self.ports) and ROTOR in self.port_vectors
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -133,15 +144,30 @@ class Mechanism:
         """Where an effect can act here: the ports, the voltage (`input`), or the outputs."""
         if effect.acts_on == "input":
             return ("input",)
-        return self.channels if effect.acts_on == "channel" else tuple(name for name, _ in self.ports)
+        return self.channels if effect.acts_on == "channel" else tuple(self.port_vectors)
+
+    def vector(self, effect: Effect) -> tuple[float, ...]:
+        """Vector of the port at which an effect acts, of a sensor of the port that it measures."""
+        port = dict(self.outputs)[effect.at][0] if effect.acts_on == "channel" else effect.at
+        return self.port_vectors[port]
+
+    def quantity(self, channel: str) -> Quantity:
+        """What a channel measures."""
+        return self.quantities[self.channels.index(channel)]
 
     def linear_effects(self, port: str) -> list[Linear]:
         """Linear effects at a port."""
         return [e for e in self.effects if isinstance(e, Linear) and e.at == port]
 
     def lacking(self, effect: Effect | type[Effect], port: str) -> list[str]:
-        """What an effect needs at a port that is not there: `motor`, `inertia`."""
-        has = {"motor": self.has_motor, "inertia": self.has_inertia}
+        """What an effect needs at a port or an output that is not there: `motor`, `inertia`, ..."""
+        has: dict[str, Callable[[str], bool]] = {
+            "motor": self.has_motor,
+            "inertia": self.has_inertia,
+            "second output": lambda channel: len(self.outputs) > 1,
+            "position": lambda channel: self.quantity(channel).is_position,
+            "position or speed": lambda channel: self.quantity(channel).derivative <= 1,
+        }
         return [name for name in effect.needs() if not has[name](port)]
 
     def accepts(self, effect: type[Effect], at: str) -> bool:

@@ -18,10 +18,13 @@ def port_roles(mechanism: Mechanism, port: str) -> set[str]:
     """Roles of a port: its own name if the joint has one of that name, otherwise by the effects at it.
 
     A motor makes it a `hub`, a spring a `joint`, and neither an `arm`; one that moves in metres is an
-    `axis` as well.
+    `axis` as well. A machine that has a hub, a joint and an arm by name says with them where it is
+    searched: its other ports have no role. Neither has the motor's side of a gear with play.
     """
     if port in PORTS:
         return {port}
+    if mechanism.on_rotor(port) or all(name in mechanism.port_vectors for name in PORTS):
+        return set()
     stiff = any(float(e.stamp().stiffness) != 0 for e in mechanism.linear_effects(port))
     roles = {"hub"} if mechanism.has_motor(port) else set()
     roles |= {"joint"} if stiff else set()
@@ -74,9 +77,10 @@ def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
     wanted = set(cls.searched)
     # A place that the effect itself names comes in its order, others in the machine's.
     named = [place for place in cls.searched if place in roles]
-    return named + [
-        place for place, role in roles.items() if place not in named and (role | {place}) & wanted
-    ]
+    others = [place for place, role in roles.items() if place not in named and (role | {place}) & wanted]
+    # A sensor of a speed, say, has no error that depends on an angle.
+    fits = lambda place: cls.acts_on != "channel" or not mechanism.lacking(cls, place)  # noqa: E731
+    return [place for place in named + others if fits(place)]
 
 
 def calibrations(mechanism: Mechanism) -> list[tuple[str, str]]:

@@ -1,7 +1,7 @@
 """Free run and prediction on arrays: pure, compiled once per structure, differentiable."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer, Real
 
 from rotflex_jax.effects.base import Sensing
-from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_voltage, rest_state
+from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_voltage, own_states, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import BLOCKED_FROM_SAMPLES, linear_outputs, states
 from rotflex_jax.mechanism.small_matrices import evaluate_effect, matvec, sparse_matvec
@@ -27,12 +27,24 @@ def true_outputs(structure: Mechanism, x: Float[Array, "n *S"]) -> Float[Array, 
 
 
 def sensor_readings(
-    mechanism: Mechanism, gates: Float[Array, "E *D"], y: Float[Array, "C *S"]
+    mechanism: Mechanism,
+    gates: Float[Array, "E *D"],
+    true: Float[Array, "C *S"],
+    x: Float[Array, "n *S"] | None,
 ) -> Float[Array, "C *S"]:
-    """Sensor readings of true outputs."""
+    """Sensor readings of true outputs; of the states `x`, which only sensors with dynamics need."""
+    y, rows = true, own_states(mechanism)
     for i, effect in effects_of(mechanism, Sensing):
         c = mechanism.channels.index(effect.at)
-        read = y[c] + gates[i] * (evaluate_effect(effect, lambda e, true: e.measure(true), y[c]) - y[c])
+        measure: Callable[..., Any] = lambda e, *seen: e.measure(*seen)  # noqa: E731
+        beside: tuple[Array, ...] = ()
+        if effect.beside == "other":
+            beside = (true[0 if c else 1],)
+        elif effect.beside == "states" and x is not None:
+            order = mechanism.quantities[c].derivative
+            measure = lambda e, value, *z, order=order: e.measure(value, z, order)  # noqa: E731
+            beside = tuple(x[row] for row in rows[i])
+        read = y[c] + gates[i] * (evaluate_effect(effect, measure, y[c], *beside) - y[c])
         y = jnp.concatenate([y[:c], read[None], y[c + 1 :]])
     return y
 
@@ -41,7 +53,7 @@ def read_outputs(
     mechanism: Mechanism, gates: Float[Array, "E *D"], x: Float[Array, "n *S"]
 ) -> Float[Array, "C *S"]:
     """Sensor readings of states."""
-    return sensor_readings(mechanism, gates, true_outputs(mechanism.structure, x))
+    return sensor_readings(mechanism, gates, true_outputs(mechanism.structure, x), x)
 
 
 def readings_with_slope_sign(
@@ -55,7 +67,7 @@ def readings_with_slope_sign(
     true = true_outputs(mechanism.structure, x)
     if not effects_of(mechanism, Sensing):
         return true, jnp.ones_like(true)
-    read, slope = jax.jvp(lambda y: sensor_readings(mechanism, gates, y), (true,), (jnp.ones_like(true),))
+    read, slope = jax.jvp(lambda y: sensor_readings(mechanism, gates, y, x), (true,), (jnp.ones_like(true),))
     return read, jnp.sign(slope)
 
 
@@ -213,9 +225,11 @@ def _free_outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001,
     mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
     step = FreeStep(structure, solver)
     if step.linear and len(u) >= BLOCKED_FROM_SAMPLES:
+        if any(e.order for _, e in effects_of(structure, Sensing)):
+            return read_outputs(mechanism, gates, states(step, x0, v, c).T).T
         rows = jnp.asarray(Layout.of(structure).output_rows, x0.dtype)
         rows = jnp.pad(rows, ((0, 0), (0, len(x0) - rows.shape[1])))
-        return sensor_readings(mechanism, gates, linear_outputs(step, x0, v, c, rows).T).T
+        return sensor_readings(mechanism, gates, linear_outputs(step, x0, v, c, rows).T, None).T
     body = lambda x, w: (step(x, w, c), read_outputs(mechanism, gates, x))  # noqa: E731
     return jax.lax.scan(body, x0, v)[1]
 

@@ -16,7 +16,15 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import EquationsOfMotion, Layout, effects_of, equations
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import matvec, scaled_vector
-from rotflex_jax.mechanism.step import memory_rates, port_motion, torques
+from rotflex_jax.mechanism.step import (
+    LoadRows,
+    friction_level,
+    load_rows,
+    memory_rates,
+    port_motion,
+    torques,
+    transmitted_torques,
+)
 
 
 class SmoothConstants(NamedTuple):
@@ -27,12 +35,14 @@ class SmoothConstants(NamedTuple):
         gates: One factor per effect.
         h: Length of a step [s].
         equations: Of the linear part.
+        load: Rows of the transmitted torques; None where no friction depends on them.
     """
 
     values: Real[Array, " P"]
     gates: Float[Array, " E"]
     h: Float[Array, ""]
     equations: EquationsOfMotion
+    load: LoadRows | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +75,9 @@ class SmoothRK4:
             raise InputError(
                 "SmoothRK4 cannot integrate a gear with play, but one was given; use Exponential."
             )
-        eq = equations(structure.with_values(values), gates)
-        return SmoothConstants(values, gates, Ts / self.substeps, eq)
+        mechanism = structure.with_values(values)
+        eq = equations(mechanism, gates)
+        return SmoothConstants(values, gates, Ts / self.substeps, eq, load_rows(mechanism, gates))
 
     def advance(
         self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*S"], c: SmoothConstants
@@ -91,10 +102,12 @@ class SmoothRK4:
             return dL
         total = torques(mechanism, L, z, v, c.gates)
         position, speed = port_motion(layout, L)
+        load = transmitted_torques(c.load, L, v)
         for i, e in effects_of(mechanism, DryFriction):
             k = layout.torque_ports.index(e.at)
             size = jnp.abs(speed[k])
-            up, down = (e.limit(position[k], size, direction) for direction in (1.0, -1.0))
+            through = None if load is None else load[k]
+            up, down = (friction_level(e, position[k], size, way, through) for way in (1.0, -1.0))
             smooth = jnp.tanh(speed[k] / self.width)
             total = total.at[k].add(-c.gates[i] * jnp.where(smooth > 0, up, down) * smooth)
         dL = dL + matvec(eq.ports, total)

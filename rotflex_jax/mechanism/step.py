@@ -7,15 +7,17 @@ no smoothing width.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 
-from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory
-from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of
+from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar
+from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of, equations, own_states
+from rotflex_jax.mechanism.elastic_teeth import elastic_step
 from rotflex_jax.mechanism.friction import coupled_contacts, limited, solve_masked
-from rotflex_jax.mechanism.gear import gear_constants, geared_step
+from rotflex_jax.mechanism.gear import gear_constants, gear_steps, geared_step
 from rotflex_jax.mechanism.intersample import Intersample, substep_voltages
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import (
@@ -30,7 +32,11 @@ from rotflex_jax.mechanism.small_matrices import (
 def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "p *S"], Float[Array, "p *S"]]:
     """Positions and speeds of the torque ports at linear states."""
     P, n = layout.port_matrix, layout.n
-    return sparse_matvec(P, x[:n]), sparse_matvec(P, x[n : 2 * n])
+    position, speed = sparse_matvec(P, x[:n]), sparse_matvec(P, x[n : 2 * n])
+    if any(layout.rotor_side):
+        side = expand_axes(jnp.asarray(layout.rotor_side, x.dtype), position)
+        position, speed = position + side * x[layout.rotor][None], speed + side * x[layout.rotor + 1][None]
+    return position, speed
 
 
 def motor_torque(
@@ -62,6 +68,89 @@ def motor_torque(
             )
             total = total + gates[i] * (per_speed * speed + per_volt * v)
     return total
+
+
+class LoadRows(NamedTuple):
+    """The torque that the motors transmit through each friction port, linear in state and voltage.
+
+    Attributes:
+        state: Coefficients of the linear states.
+        voltage: Coefficients of the voltage.
+    """
+
+    state: Float[Array, "k m *D"]
+    voltage: Float[Array, "k *D"]
+
+
+def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | None:
+    """Rows of the transmitted torques, or None where no friction depends on them.
+
+        load = (motor - rest) / 2,   rest = inertia p.ddq - motor
+
+    The inertia that is entered at the port lies between both sides, and accelerates by the linear part.
+
+    Args:
+        mechanism: With (traced) parameter values.
+        gates: One factor per effect.
+    """
+    layout = Layout.of(mechanism.structure)
+    ports = {e.at for _, e in effects_of(mechanism, DryFriction) if e.loaded}
+    if not ports:
+        return None
+    eq = equations(mechanism, gates)
+    m, n = layout.linear, layout.n
+    # Columns: each state alone, then the voltage alone.
+    x, v = jnp.eye(m, m + 1, dtype=gates.dtype), jnp.eye(1, m + 1, m, dtype=gates.dtype)[0]
+    slope = jnp.concatenate([eq.A, eq.B[:, None]], axis=1)
+    rows = []
+    for port in layout.torque_ports[: layout.contacts]:
+        if port not in ports:
+            rows.append(jnp.zeros(m + 1, gates.dtype))
+            continue
+        acceleration = sparse_matvec((mechanism.port_vectors[port],), slope[n : 2 * n])[0]
+        here = [(i, e.stamp(), e) for i, e in effects_of(mechanism, Linear) if e.at == port]
+        inertia = sum(gates[i] * stamp.inertia for i, stamp, _ in here)
+        # What the current gives now is what accelerates; what it gives over a step is its steady value.
+        own = own_states(mechanism)
+        now = jnp.zeros(m + 1, gates.dtype)
+        for i, stamp, e in here:
+            if e.motor:
+                speed = sparse_matvec((mechanism.port_vectors[port],), x[n : 2 * n])[0]
+                now = now + gates[i] * (stamp.drive * v - stamp.damping * speed)
+                for row, torque in zip(own.get(i, ()), stamp.torque, strict=True):
+                    now = now + gates[i] * torque * x[row]
+        motor = motor_torque(mechanism, port, x, v, gates)
+        rows.append((motor - (inertia * acceleration - now)) / 2)
+    found = jnp.stack(rows)
+    return LoadRows(found[:, :m], found[:, m])
+
+
+def transmitted_torques(
+    rows: LoadRows | None, x: Float[Array, "m *S"], v: Float[Array, "*S"]
+) -> Float[Array, "k *S"] | None:
+    """Torques [N m] through the friction ports at linear states; None where none is asked for."""
+    return None if rows is None else matvec(rows.state, x) + scaled_vector(rows.voltage, v)
+
+
+def friction_level(
+    e: DryFriction,
+    position: Float[Array, "*S"],
+    speed: Float[Array, "*S"],
+    direction: float,
+    load: Float[Array, "*S"] | None,
+) -> Scalar:
+    """Level [N m] of a dry friction against motion in a direction; one number where it is the same anywhere.
+
+    Args:
+        e: The effect.
+        position: Of its port.
+        speed: Size of its speed.
+        direction: +1 or -1.
+        load: Torque through the port [N m].
+    """
+    signals = (position, speed) if load is None or not e.loaded else (position, speed, load)
+    limit = lambda e, q, s, *load: e.limit(q, s, direction, *load)  # noqa: E731
+    return evaluate_effect(e, limit, *signals)
 
 
 def _drive(mechanism: Mechanism, e: Memory, x: Array, v: Array, gates: Array) -> Array:
@@ -167,9 +256,10 @@ class Exponential:
         Ts: Float[Array, ""],
     ) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
-        h = Ts / self.substeps
+        h = Ts / (self.substeps * gear_steps(structure))
         c = constants(structure, values, gates, h)
-        return c._replace(gear=gear_constants(structure, values, gates, h))
+        c = c._replace(load=load_rows(structure.with_values(values), gates))
+        return c._replace(gear=gear_constants(structure, values, gates, c))
 
     def advance(
         self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*hS"], c: Constants
@@ -183,17 +273,20 @@ class Exponential:
             c: From `prepare`.
         """
         mechanism = structure.with_values(c.values)
-        if self.substeps == 1:
+        cut = gear_steps(structure)
+        if self.substeps * cut == 1:
             return _step(mechanism, x, v if self.between == "held" else v[0], c, self)
-        at = lambda k: v if self.between == "held" else v[k]  # noqa: E731
+        at = lambda k: v if self.between == "held" else v[k // cut]  # noqa: E731
         body = lambda k, state: _step(mechanism, state, at(k), c, self)  # noqa: E731
-        return jax.lax.fori_loop(0, self.substeps, body, x)
+        return jax.lax.fori_loop(0, self.substeps * cut, body, x)
 
 
 def _step(mechanism: Mechanism, x: Array, v: Array, c: Constants, solver: Exponential) -> Array:
     if c.gear is None:
         return _advance_smooth(mechanism, x, v, c, solver)
     advance = lambda x, c, extra: _advance_smooth(mechanism, x, v, c, solver, extra)  # noqa: E731
+    if c.gear.teeth is not None:
+        return elastic_step(mechanism, x, c, advance)
     return geared_step(mechanism, x, c, advance)
 
 
@@ -214,10 +307,10 @@ def _advance_smooth(
         return start
     smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
     if not smooth:
-        return _with_dry_friction(mechanism, L, start, c, solver.passes)
+        return _with_dry_friction(mechanism, L, start, v, c, solver.passes)
     f0 = torques(mechanism, L, z, v, c.gates)
     guess = start + matvec(c.hold, f0)
-    brake = _predicted_friction(mechanism, L, guess, c) if layout.contacts else None
+    brake = _predicted_friction(mechanism, L, guess, v, c) if layout.contacts else None
     end = guess if brake is None else guess + matvec(c.hold, brake)
     z1 = advance_memories(mechanism, z, (L + end) / 2, v, c.gates, c.h)
     if solver.order == 2:
@@ -225,7 +318,7 @@ def _advance_smooth(
     else:
         own = end if extra is None else end - extra
         final = guess + _fourth_order(mechanism, L, z, z1, v, f0, brake, own, c)
-    final = _with_dry_friction(mechanism, L, final, c, solver.passes)
+    final = _with_dry_friction(mechanism, L, final, v, c, solver.passes)
     return jnp.concatenate([final, z1]) if z.shape[0] else final
 
 
@@ -246,26 +339,29 @@ def _fourth_order(mechanism, L, z, z1, v, f0, brake, end, c):  # noqa: ANN001, A
     return matvec(c.ramp, slope) + matvec(c.rise, bend)
 
 
-def _friction_levels(mechanism: Mechanism, x: Array, end: Array, gates: Array) -> tuple[Array, Array]:
+def _friction_levels(
+    mechanism: Mechanism, x: Array, end: Array, v: Array, c: Constants
+) -> tuple[Array, Array]:
     """Friction levels against positive and negative motion of each friction port."""
     layout = Layout.of(mechanism.structure)
     position, before = port_motion(layout, x)
     speed = jnp.abs(before + port_motion(layout, end)[1]) / 2
+    load = transmitted_torques(c.load, (x + end) / 2, v)
     up = [jnp.zeros(x.shape[1:], x.dtype)] * layout.contacts
     down = list(up)
     for i, e in effects_of(mechanism, DryFriction):
         k = layout.torque_ports.index(e.at)
         for levels, direction in ((up, 1.0), (down, -1.0)):
-            level = evaluate_effect(e, lambda e, q, s, d=direction: e.limit(q, s, d), position[k], speed[k])
-            levels[k] = levels[k] + gates[i] * level
+            level = friction_level(e, position[k], speed[k], direction, None if load is None else load[k])
+            levels[k] = levels[k] + c.gates[i] * level
     return jnp.stack(up), jnp.stack(down)
 
 
-def _predicted_friction(mechanism: Mechanism, x: Array, end: Array, c: Constants) -> Array:
+def _predicted_friction(mechanism: Mechanism, x: Array, end: Array, v: Array, c: Constants) -> Array:
     """Friction torques for the stages: exact where a port slides, contacts uncoupled."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
-    up, down = _friction_levels(mechanism, x, end, c.gates)
+    up, down = _friction_levels(mechanism, x, end, v, c)
     own = jnp.stack([1 / c.stop[i, i] for i in range(k)])
     needed = -port_motion(layout, end)[1][:k]
     needed = needed * expand_axes(own, needed)
@@ -273,7 +369,9 @@ def _predicted_friction(mechanism: Mechanism, x: Array, end: Array, c: Constants
     return jnp.concatenate([limited(needed, up, down), none])
 
 
-def _with_dry_friction(mechanism: Mechanism, x: Array, end: Array, c: Constants, passes: int | None) -> Array:
+def _with_dry_friction(
+    mechanism: Mechanism, x: Array, end: Array, v: Array, c: Constants, passes: int | None
+) -> Array:
     """The state at the end of the step with dry friction, positions matched to the stop inside it."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
@@ -281,11 +379,11 @@ def _with_dry_friction(mechanism: Mechanism, x: Array, end: Array, c: Constants,
         return end
     q0, v0 = (m[:k] for m in port_motion(layout, x))
     free, stop = port_motion(layout, end)[1][:k], c.stop[:k, :k]
-    levels = _friction_levels(mechanism, x, end, c.gates)
+    levels = _friction_levels(mechanism, x, end, v, c)
     if not all(e.steady for _, e in effects_of(mechanism, DryFriction)):
         # The level belongs to the speed that friction leaves, not to the one without it.
         rough = coupled_contacts(v0, free, stop, *levels, passes=1)
-        levels = _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], rough.torque), c.gates)
+        levels = _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], rough.torque), v, c)
     found = coupled_contacts(v0, free, stop, *levels, passes=passes)
     end = end + matvec(c.hold[:, :k], found.torque)
     q1, v1 = (m[:k] for m in port_motion(layout, end))

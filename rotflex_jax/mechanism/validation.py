@@ -66,7 +66,7 @@ def effects(given: Any) -> tuple[Effect, ...]:
 
 def check(mechanism: "Mechanism") -> None:
     """Raise `InputError` where ports, outputs and effects do not fit together."""
-    ports = mechanism.port_vectors
+    ports = dict(mechanism.ports)
     for name, vector in ports.items():
         if len(vector) != len(mechanism.coordinates):
             raise InputError(
@@ -101,6 +101,11 @@ def _check_surroundings(mechanism: "Mechanism", effect: Effect) -> None:
     name = type(effect).__name__
     if missing := mechanism.lacking(effect, effect.at):
         needed, added = (" and ".join(map(_with_article, names)) for names in (effect.needs(), missing))
+        if effect.acts_on == "channel":
+            raise InputError(
+                f"{name} was put at the output {effect.at!r}, but it needs {needed} there; leave it out, or "
+                "put it where there is one."
+            )
         raise InputError(
             f"{name} was put at {effect.at!r}, but it needs a port with {needed}; put it at such a port, or "
             f"add {added} there first."

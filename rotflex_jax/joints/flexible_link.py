@@ -1,0 +1,105 @@
+"""A rotary flexible link: a servo turns a hub, a beam clamped to it bends, a strain gauge shows how much.
+
+A clamped beam acts on the hub like separate inertias on springs, one for each mode: of the moment of inertia
+of a uniform beam `12 / (beta L)^4` belongs to a mode, 97.07 % to the first and 2.47 % to the second. The
+deflection of each is an angle `eta` of that inertia against the hub. The curvature of the beam at the clamp
+is `4 / L` times the sum of these angles, whatever the mode.
+"""
+
+import math
+
+from rotflex_jax.effects import Inertia, Motor, SensorGain, Spring, Viscous
+from rotflex_jax.joints.rotary_flexible import hub_inertia, srv02_motor
+from rotflex_jax.mechanism import Mechanism
+
+# Roots of cosh(b) cos(b) = -1: b is the wave number of a clamped beam times its length.
+WAVE_NUMBERS = (1.8751040687, 4.6940911330)
+# Part of the beam's moment of inertia about the clamp that belongs to each mode.
+SHARES = tuple(12 / b**4 for b in WAVE_NUMBERS)
+# A gauge that is calibrated by the tip under a load there shows tip / L: 3/4 of what its strain shows
+# of the modes, since a beam under a load at its tip has the strain 3 tip / L^2 at the clamp.
+GAUGE_GAIN = 4 / 3
+
+PORTS = {
+    "hub": (1.0, 0.0, 0.0),
+    "joint": (0.0, 1.0, 0.0),
+    "arm": (1.0, 1.0, 0.0),
+    "second": (0.0, 0.0, 1.0),
+    "second_arm": (1.0, 0.0, 1.0),
+    "gauge": (0.0, 1.0, 1.0),
+}
+
+
+def flexible_link(
+    *,
+    mass: float = 0.065,
+    length: float = 0.419,
+    frequency: float = 3.0,
+    damping_ratio: float = 0.01,
+    hub: float | None = None,
+    hub_damping: float = 0.004,
+    gauge_gain: float = GAUGE_GAIN,
+    motor: Motor | None = None,
+) -> Mechanism:
+    """A beam on a servo with its first two modes; `alpha` is what a strain gauge at the clamp shows.
+
+        J theta'' + J_1 (theta'' + eta_1'') + J_2 (theta'' + eta_2'') = motor - hub_damping theta'
+        J_i (theta'' + eta_i'') = -k_i eta_i - d_i eta_i',   alpha = gain (eta_1 + eta_2)
+
+    Searches try effects at `hub`, `joint` (the first mode) and `arm`. Trusted are the inertias of both
+    modes and of the motor everything but its torque constant. Free are hub inertia, stiffnesses, dampers,
+    the torque constant and the gain of the gauge (`alpha.sensor_gain.error`, gain less one). Not for a tip
+    that carries a load: it changes the shares of the modes.
+
+    Args:
+        mass: Of the beam [kg].
+        length: From the axis of the hub to the tip [m].
+        frequency: Of the first mode while the hub is held [Hz]; the second is 6.27 times as high.
+        damping_ratio: Of both modes.
+        hub: Inertia of the servo as the hub feels it [kg m^2]; None for the SRV02's.
+        hub_damping: Viscous damping beside the motor's own [N m s/rad].
+        gauge_gain: Reading of the gauge over the sum of the modes' angles; 4/3 where the gauge was calibrated
+            with the tip as `deflection / length`.
+        motor: Motor with its gear; None for the SRV02's.
+
+    Returns:
+        Mechanism with the outputs `theta` and `alpha`.
+
+    Source: L. Meirovitch, Fundamentals of Vibrations, 2001, section 8.3 (clamped beam); Quanser, Rotary
+        Flexible Link, user manual, 2011 (mass, length, calibration of the gauge). The frequency is a usual
+        one for that link.
+
+    >>> link = flexible_link()
+    >>> link.channels, "alpha.sensor_gain.error" in link.free_names
+    (('theta', 'alpha'), True)
+    """
+    whole = mass * length**2 / 3
+    inertias = [share * whole for share in SHARES]
+    angular = [2 * math.pi * frequency * (b / WAVE_NUMBERS[0]) ** 2 for b in WAVE_NUMBERS]
+    motor = motor or srv02_motor()
+    # Modes above the second follow the hub.
+    own = (hub_inertia(body=0.0) if hub is None else hub) + whole - sum(inertias)
+    modes = []
+    for at, carried, J, W in zip(("joint", "second"), ("arm", "second_arm"), inertias, angular, strict=True):
+        modes += [
+            Inertia(at=carried, inertia=J),
+            Spring(at=at, stiffness=J * W**2),
+            Viscous(at=at, coefficient=2 * damping_ratio * J * W),
+        ]
+    return Mechanism(
+        coordinates=("theta", "eta_1", "eta_2"),
+        ports=PORTS,
+        effects=(
+            Inertia(at="hub", inertia=own),
+            motor,
+            Viscous(at="hub", coefficient=hub_damping),
+            *modes,
+            SensorGain(at="alpha", error=gauge_gain - 1.0),
+        ),
+        outputs={"theta": "hub", "alpha": "gauge"},
+        trusted=(
+            "arm.inertia.inertia",
+            "second_arm.inertia.inertia",
+            *(f"hub.motor.{name}" for name in motor.values if name != "torque_constant"),
+        ),
+    )
