@@ -71,6 +71,7 @@ PASSIVE = {
     "viscous",
     "motor",
     "current_drive",
+    "position_servo",
     "coulomb",
     "coulomb_asymmetric",
     "stribeck",
@@ -119,6 +120,8 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
         s = effect.stamp()
         lists = (*s.own, s.from_speed, s.from_voltage, s.torque)
         said = [s.inertia, s.damping, s.stiffness, s.drive, *(c for row in lists for c in row)]
+        if isinstance(effect, Force):  # what a limit takes away
+            said.append(effect.force(position, speed, voltage))
     elif isinstance(effect, Force):
         said = [effect.force(position, speed, voltage)]
     elif isinstance(effect, DryFriction):
@@ -249,7 +252,7 @@ def test_jit_vmap_and_arrays_agree_with_one_point(cls):
     mapped = jax.jit(jax.vmap(lambda g: law(effect, numbers, g, 2 * g, 3 * g, g / 4)))(grid)
     np.testing.assert_allclose(mapped, one_by_one, rtol=1e-14, atol=1e-16)
     if isinstance(effect, Force):
-        np.testing.assert_allclose(effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, 0], rtol=1e-14)
+        np.testing.assert_allclose(effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, -1], rtol=1e-14)
     if isinstance(effect, Sensing):
         np.testing.assert_allclose(effect.measure(grid), one_by_one[:, 0], rtol=1e-14)
 

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 
-from rotflex_jax.discover.batched_predictor import BatchedPredictor
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import MIN_DECREASE_NATS, moved, step_limit, whitened_sums
@@ -39,7 +38,7 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
     if exact or not isinstance(predictor.solver, Exponential):
         return h
     solver = dataclasses.replace(predictor.solver, substeps=SUBSTEP_FACTOR * predictor.solver.substeps)
-    fine = dataclasses.replace(problem, predictor=BatchedPredictor(s, solver, predictor.data))
+    fine = LikelihoodProblem.of(s, solver, problem.dataset, problem.ports)
     _, J = problem.slopes([h])
     W = h.whitener(J[0, : h.moved], seen)
 

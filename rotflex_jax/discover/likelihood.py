@@ -38,7 +38,7 @@ class LikelihoodProblem:
         cls, supermodel: SuperModel, solver: Solver, dataset: Dataset, ports: tuple[str, ...]
     ) -> "LikelihoodProblem":
         """The problem of a super-model on a dataset."""
-        return cls(BatchedPredictor(supermodel, solver, dataset.data), dataset, ports)
+        return cls(BatchedPredictor(supermodel, solver, dataset.data, dataset.constants), dataset, ports)
 
     @property
     def supermodel(self) -> SuperModel:
@@ -85,11 +85,16 @@ class LikelihoodProblem:
     def gains(
         self, h: Hypothesis, intensities: Sequence[dict[str, float]]
     ) -> list[Float[np.ndarray, "R n C"]]:
-        """Gains of the baseline's linear part, one array per intensity."""
-        s, periods = self.supermodel, np.asarray(self.dataset.data.Ts).tolist()
+        """Gains of the baseline's linear part in each recording, one array per intensity."""
+        s, found = self.supermodel, {}
         mechanism = s.clean(h.values(s).mean(axis=0), ())
-        by_period = {Ts: kalman_gains(mechanism, intensities, self.noise, Ts) for Ts in set(periods)}
-        K = np.stack([by_period[Ts] for Ts in periods], axis=1)
+        rows = list(zip(np.asarray(self.dataset.data.Ts).tolist(), self.dataset.constants, strict=True))
+        keys = [(Ts, known.tobytes()) for Ts, known in rows]
+        for key, (Ts, known) in zip(keys, rows, strict=True):
+            if key not in found:
+                here = mechanism.with_values(np.where(np.isnan(known), mechanism.values, known))
+                found[key] = kalman_gains(here, intensities, self.noise, Ts)
+        K = np.stack([found[key] for key in keys], axis=1)
         full = np.zeros((*K.shape[:2], Layout.of(s.mechanism.structure).size, K.shape[3]))
         full[:, :, s.baseline_states] = K
         return list(full)

@@ -30,6 +30,7 @@ from rotflex_jax.effects.inertia import Inertia, SecondMode
 from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.effects.motor import CurrentDrive, Heating, Motor
 from rotflex_jax.effects.sensors import Rectifier, SensorBias, SensorCubic, SensorGain
+from rotflex_jax.effects.servo import PositionServo
 from rotflex_jax.effects.springs import CubicSpring, JointPlay, QuadraticSpring, Spring
 
 __all__ = [
@@ -55,6 +56,7 @@ __all__ = [
     "Viscous",
     "Motor",
     "CurrentDrive",
+    "PositionServo",
     "SecondMode",
     # dry friction
     "Coulomb",

@@ -96,6 +96,8 @@ class Effect(abc.ABC):
     contains: ClassVar[tuple[str, ...]] = ()
     # Ports a search tries it at by default; none for what a model has from the start.
     searched: ClassVar[tuple[str, ...]] = ()
+    # Its volts are the unit of the input, also where that is no voltage but a current or a goal.
+    volts_of_input: ClassVar[bool] = False
     turning: ClassVar[bool] = False  # a function of an angle: no meaning where a port moves along a line
 
     # -- declared by each kind
@@ -355,6 +357,7 @@ class Actuation(Effect):
     kind_label: ClassVar[str] = "actuation"
     kind_meaning: ClassVar[str] = "What lies between the recorded command and the motor."
     acts_on: ClassVar[Domain] = "input"
+    volts_of_input: ClassVar[bool] = True
     exact_step: ClassVar[bool] = True
     not_linearised: ClassVar[str] = "acts on the voltage before the motor, which is the input here"
     ports: ClassVar[tuple[str, ...]] = ("input",)

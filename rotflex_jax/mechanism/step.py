@@ -46,13 +46,17 @@ def motor_torque(
     values at the ends of a step say nothing about its mean.
     """
     layout = Layout.of(mechanism.structure)
-    speed = sparse_matvec((mechanism.port_vectors[at],), x[layout.n : 2 * layout.n])[0]
+    port = (mechanism.port_vectors[at],)
+    position = sparse_matvec(port, x[: layout.n])[0]
+    speed = sparse_matvec(port, x[layout.n : 2 * layout.n])[0]
     total = jnp.zeros_like(speed)
     for i, e in effects_of(mechanism, Linear):
         if not (e.motor and e.at == at):
             continue
         stamp = e.stamp()
-        total = total + gates[i] * (stamp.drive * v - stamp.damping * speed)
+        total = total + gates[i] * (stamp.drive * v - stamp.damping * speed - stamp.stiffness * position)
+        if isinstance(e, Force):  # a motor under a controller, whose limit takes a part of it away
+            total = total + gates[i] * e.force(position, speed, v)
         if e.order:
             own = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in row]) for row in stamp.own])
             columns = (stamp.from_speed, stamp.from_voltage)
