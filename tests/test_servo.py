@@ -10,6 +10,8 @@ from scipy.integrate import solve_ivp
 
 import rotflex_jax as rf
 from rotflex_jax import effects as fx
+from rotflex_jax.cli.app import main
+from rotflex_jax.cli.arguments import Columns
 from rotflex_jax.discover.batched_predictor import ParameterSet
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import build, scales
@@ -304,3 +306,23 @@ def test_a_measured_servo_at_a_gain_that_no_fit_has_seen(measured: Callable[[str
     # Of the order of the data sheet: 0.52 N m at 1.5 A and 5 V.
     assert 0.2 < found["hub.position_servo.torque_constant"].value < 0.7
     assert 1.5 < found["hub.position_servo.resistance"].value < 8.0
+
+
+def test_the_command_line_reads_a_goal_in_radians(tmp_path, capsys, servo_recordings):
+    r = servo_recordings[2]
+    log = np.column_stack([r.t, r.u, r.y[:, 0]])
+    np.savetxt(tmp_path / "log.csv", log, delimiter=",", header="t,goal,theta", comments="")
+    columns = Columns("goal", None, False, None, None, None, mechanism=xl330_pendulum())
+    read = columns.load(tmp_path / "log.csv")
+    assert (read.input_name, read.input_unit, read.units) == ("goal", "rad", ("rad",))
+    with pytest.raises(SystemExit) as left:
+        joint, friction = "xl330_pendulum:gain=400", "coulomb@hub:level=0.035"
+        main(
+            [
+                *("simulate", str(tmp_path / "log.csv"), "--input", "goal"),
+                *("--joint", joint, "--add", friction),
+            ]
+        )
+    assert left.value.code in (0, None)
+    said = capsys.readouterr().out
+    assert "theta" in said and " V" not in said
