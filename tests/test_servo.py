@@ -21,7 +21,7 @@ from rotflex_jax.fit.dataset import prepare
 from rotflex_jax.joints import by_name, position_servo, xl330_pendulum
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.roles import port_roles
-from rotflex_jax.mechanism.step import motor_torque
+from rotflex_jax.mechanism.step import memory_drive
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import double_precision
 
@@ -113,7 +113,8 @@ def test_the_torque_of_a_motor_under_a_loop_is_that_of_its_current():
     for q, v, goal in ((0.1, 2.0, 0.3), (-0.4, -1.0, 1.5), (0.5, 0.0, -1.5)):
         with double_precision():
             state, u = jnp.array([q, v]), jnp.asarray(goal)
-            found = float(motor_torque(mechanism, "hub", state, u, jnp.asarray(gates)))
+            heating = mechanism.effects[-1]
+            found = float(memory_drive(mechanism, heating, state, u, jnp.asarray(gates)))
         volts = 7.4 * duty(400.0, goal - q + 0.5e-3 * v)
         assert found == pytest.approx(0.35 / 3.4 * (volts - 0.35 * v), rel=1e-9)
 

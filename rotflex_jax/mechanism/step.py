@@ -55,8 +55,6 @@ def motor_torque(
             continue
         stamp = e.stamp()
         total = total + gates[i] * (stamp.drive * v - stamp.damping * speed - stamp.stiffness * position)
-        if isinstance(e, Force):  # a motor under a controller, whose limit takes a part of it away
-            total = total + gates[i] * e.force(position, speed, v)
         if e.order:
             own = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in row]) for row in stamp.own])
             columns = (stamp.from_speed, stamp.from_voltage)
@@ -68,9 +66,23 @@ def motor_torque(
     return total
 
 
-def _drive(mechanism: Mechanism, e: Memory, x: Array, v: Array, gates: Array) -> Array:
-    """Last argument of `flow` and `force` of a memory."""
-    return v if e.driven_by == "voltage" else motor_torque(mechanism, e.at, x, v, gates)
+def memory_drive(
+    mechanism: Mechanism,
+    e: Memory,
+    x: Float[Array, "m *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "*S"]:
+    """Last argument of `flow` and `force` of a memory: the voltage, or the torque of the motors [N m]."""
+    if e.driven_by == "voltage":
+        return v
+    torque, layout = motor_torque(mechanism, e.at, x, v, gates), Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    k = layout.torque_ports.index(e.at)
+    for i, motor in effects_of(mechanism, Force):
+        if isinstance(motor, Linear) and motor.motor and motor.at == e.at:  # what its limit takes away
+            torque = torque + gates[i] * motor.force(position[k], speed[k], v)
+    return torque
 
 
 def torques(
@@ -98,7 +110,7 @@ def torques(
         total[k] = total[k] + gates[i] * evaluate_effect(e, force, position[k], speed[k], v)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = _drive(mechanism, e, x, v, gates)
+        drive = memory_drive(mechanism, e, x, v, gates)
         total[k] = total[k] + gates[i] * evaluate_effect(e, force, z[m], position[k], speed[k], drive)
     return jnp.stack(total)
 
@@ -116,7 +128,7 @@ def memory_rates(
     rates, flow = [], lambda e, *signals: e.flow(*signals)
     for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = _drive(mechanism, e, x, v, gates)
+        drive = memory_drive(mechanism, e, x, v, gates)
         rates.append(jnp.asarray(evaluate_effect(e, flow, z[m], position[k], speed[k], drive)))
     return jnp.stack(rates)
 
