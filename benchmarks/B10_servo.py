@@ -45,7 +45,7 @@ from servo.arm import arm
 from servo.evolved import evolved
 from servo.friction_models import MODELS
 from servo.grey_box import FRICTION, direction, fitted, searched, servo
-from servo.page import page
+from servo.page import page, summary
 from servo.recordings import Split, splits
 
 RESULTS = HERE / "results"
@@ -94,7 +94,7 @@ def main() -> None:
         print(f"{time.perf_counter() - began:6.1f} s  {text}", flush=True)
 
     def keep() -> None:
-        found["machine"] = machine()
+        found["machine"], found["summary"] = machine(), summary(found["splits"])
         given.out.parent.mkdir(exist_ok=True)
         given.out.write_text(json.dumps(found, indent=1) + "\n")
         given.out.with_suffix(".md").write_text(page(found))
@@ -115,6 +115,7 @@ def main() -> None:
     if "so101" in given.parts and ("so101" not in found or given.fresh):
         found["so101"] = arm(say)
         keep()
+    keep()
     print(page(found))
 
 

@@ -13,6 +13,19 @@ def mean(row: dict[str, Any], part: str, kind: str) -> float:
     return statistics.mean(e[kind] for e in row[part].values())
 
 
+def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """What each model has over all that was left out: errors [deg], medians of free runs and times [s]."""
+    out = {}
+    for name in next(iter(splits.values()), {}):
+        if all(name in case for case in splits.values()):
+            rows = [case[name] for case in splits.values()]
+            out[name] = {
+                kind: statistics.mean(mean(r, "test", kind) for r in rows) for kind in ("mean", "rms")
+            }
+            out[name] |= {key: statistics.median(r[key] for r in rows) for key in ("rollouts", "seconds")}
+    return out
+
+
 def page(found: dict[str, Any]) -> str:
     """The page."""
     splits = found["splits"]
