@@ -61,8 +61,8 @@ def page(found: dict[str, Any]) -> str:
         )
     lines += [
         "",
-        "Medians over what was left out, on a machine with other work. A free run of the grey box carries the "
-        "derivatives along.",
+        "Medians over what was left out, on a machine with other work. A free run of the grey box carries "
+        "the derivatives along.",
         "",
     ]
     lines += ["## What the search found", ""]
