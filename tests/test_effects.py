@@ -72,6 +72,7 @@ PASSIVE = {
     "viscous",
     "motor",
     "current_drive",
+    "position_servo",
     "coulomb",
     "coulomb_asymmetric",
     "stribeck",
@@ -119,6 +120,8 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
     effect = effect.replace(**dict(zip(effect.values, numbers, strict=True)))
     if isinstance(effect, Linear):
         said = entries(effect)
+        if isinstance(effect, Force):  # what a limit takes away
+            said.append(effect.force(position, speed, voltage))
     elif isinstance(effect, Force):
         said = [effect.force(position, speed, voltage)]
     elif isinstance(effect, DryFriction):
@@ -263,7 +266,7 @@ def test_jit_vmap_and_arrays_agree_with_one_point(cls):
     mapped = jax.jit(jax.vmap(lambda g: law(effect, numbers, g, 2 * g, 3 * g, g / 4)))(grid)
     np.testing.assert_allclose(mapped, one_by_one, rtol=1e-14, atol=1e-16)
     if isinstance(effect, Force):
-        np.testing.assert_allclose(effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, 0], rtol=1e-14)
+        np.testing.assert_allclose(effect.force(grid, 2 * grid, 3 * grid), one_by_one[:, -1], rtol=1e-14)
     if isinstance(effect, Sensing):
         said = effect.measure(grid, *beside(effect, 2 * grid, grid / 4))
         np.testing.assert_allclose(said, one_by_one[:, 0], rtol=1e-14)

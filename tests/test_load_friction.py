@@ -9,9 +9,10 @@ from scipy.integrate import solve_ivp
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.errors import InputError
-from rotflex_jax.joints import paper, single_inertia
+from rotflex_jax.joints import paper, single_inertia, xl330_pendulum
 from rotflex_jax.mechanism import Exponential, SmoothRK4, free_run, simulate, simulate_states
 from rotflex_jax.mechanism.roles import search_places
+from rotflex_jax.mechanism.step import load_rows, transmitted_torques
 from rotflex_jax.runtime.xla import double_precision
 
 Ts, J, EMF, RESISTANCE = 0.002, 0.0021, 0.00767 * 70, 2.6
@@ -94,6 +95,56 @@ def test_against_scipy_in_a_joint():
         np.testing.assert_allclose(found, expected, atol=1e-3)
     smooth = simulate(machine, u, Ts, solver=SmoothRK4(width=2e-3, substeps=400))[::hold]
     np.testing.assert_allclose(smooth, expected, atol=2e-5)
+
+
+def servo_by_scipy(goal: np.ndarray, period: float, width: float = 2e-3) -> tuple[np.ndarray, float, float]:
+    """A pendulum on a servo at every sample, the law written out, and how far limit and weight take part."""
+    kt, R, supply, weight, inertia = 0.35, 3.4, 7.4, 0.49 * 9.80665 * 0.1, 0.49 * 0.1**2 + 0.002
+    slope = 400 * 4096 / (2 * np.pi) / (256 * 885)
+
+    def f(_, x, u):
+        duty = slope * (u - x[0] + 0.5e-3 * x[1])
+        motor = kt / R * (supply * np.clip(duty, -1, 1) - kt * x[1])
+        pull = -weight * np.sin(x[0])
+        load, way = (motor - pull) / 2, np.tanh(x[1] / width)
+        share = DRIVING if load * way > 0 else DRIVEN
+        return [x[1], (motor + pull - (FC + share * abs(load)) * way) / inertia]
+
+    x, out = np.zeros(2), []
+    for u in goal:
+        out.append(x)
+        x = solve_ivp(f, (0, period), x, "LSODA", args=(u,), rtol=1e-8, atol=1e-10).y[:, -1]
+    angle = np.array(out)[:, 0]
+    return angle, np.abs(slope * (goal - angle)).max(), np.abs(weight * np.sin(angle)).max()
+
+
+def test_weight_and_the_limit_of_a_servo_are_part_of_the_load():
+    period, goal = 0.005, np.repeat([0.4, 2.2, -1.2, 1.0, -2.4, 0.1], 60)
+    expected, duty, weight = servo_by_scipy(goal, period)
+    assert duty > 2 and weight > 0.4  # far beyond the limit, and a weight as large as the motor's torque
+    machine = xl330_pendulum() + FRICTION
+    for solver, error in ((Exponential(substeps=8), 5e-4), (Exponential(), 4e-3)):
+        found = simulate(machine, goal, period, solver=solver)[:, 0]
+        np.testing.assert_allclose(found, expected, atol=error)
+    smooth = simulate(machine, goal, period, solver=SmoothRK4(width=2e-3, substeps=400))[:, 0]
+    np.testing.assert_allclose(smooth, expected, atol=1e-4)
+
+
+def test_the_load_is_that_of_both_sides_at_any_state():
+    """Goal, limit, weight and what a hot motor loses, in the closed form; every part matters."""
+    machine = xl330_pendulum() + fx.Heating("hub") + FRICTION
+    heat = machine.effect("heating", "hub")
+    gates = np.ones(len(machine.effects))
+    with double_precision():
+        rows = load_rows(machine, jnp.asarray(gates))
+        for q, w, goal, z in ((0.1, 2.0, 0.3, 0.2), (-0.4, -1.0, 1.5, 0.5), (0.9, 0.0, -2.5, 0.0)):
+            duty = 400 * 4096 / (2 * np.pi) / (256 * 885) * (goal - q + 0.5e-3 * w)
+            motor = 0.35 / 3.4 * (7.4 * np.clip(duty, -1, 1) - 0.35 * w)
+            motor += float(heat.force(z, q, w, motor))
+            pull = -0.49 * 9.80665 * 0.1 * np.sin(q)
+            given = map(jnp.asarray, ([q, w], [z], goal, gates))
+            found = transmitted_torques(machine, rows, *given)
+            np.testing.assert_allclose(found, [(motor - pull) / 2], rtol=1e-9)
 
 
 def test_the_current_and_the_gear_take_part():

@@ -199,6 +199,7 @@ def test_a_servo_log_is_resampled_and_ends_with_the_torque(tmp_path: Path) -> No
     assert t[149] - 0.005 < run.t[-1] <= t[149] + 1e-9
     np.testing.assert_allclose(run.u, 2 * run.t, atol=1e-12)
     np.testing.assert_allclose(run.y[:, 0], run.t - 1, atol=1e-12)
+    assert dict(run.constants) == {"hub.position_servo.gain": 300.0}
     for word in ("ramp", "gain 300", "resampled to 5 ms", "torque is off"):
         assert word in run.source
 

@@ -66,7 +66,7 @@ def overview(on_site: bool = False) -> str:
     for kind in KINDS:
         lines += [f"## {kind.kind_label.capitalize()}", "", kind.kind_meaning, ""]
         lines += ["| effect | what it is | law | searched at |", "|---|---|---|---|"]
-        for cls in (c for c in shown() if issubclass(c, kind)):
+        for cls in (c for c in shown() if c.kind() == kind.kind_label):
             where = ", ".join(f"`{place}`" for place in cls.searched) or "no"
             file = f"../{cls.__module__.replace('.', '/')}.py"
             link = f"effects/{cls.name}.rst" if on_site else file

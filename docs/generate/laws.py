@@ -212,6 +212,17 @@ def _motor(ax: Axes, effect: Effect) -> None:
     _labels(ax, "speed of the port [rad/s]", "torque on the port [N m]")
 
 
+def _servo(ax: Axes, effect: Effect) -> None:
+    """Torque at rest over the distance to the goal."""
+    assert isinstance(effect, fx.PositionServo)
+    error = np.linspace(-1.5, 1.5, 601)
+    for gain, look in ((effect.gain, LINE), (effect.gain / 4, OTHER)):
+        servo = effect.replace(gain=gain)
+        torque = servo.stamp().stiffness * error + np.asarray(servo.force(-error, 0.0, 0.0))
+        ax.plot(error, torque, **look, label=f"gain {gain:g}")
+    _labels(ax, "goal less position, at rest [rad]", "torque on the port [N m]")
+
+
 def _mode(ax: Axes, effect: Effect) -> None:
     """How heavy the part is to the port, over frequency."""
     assert isinstance(effect, fx.SecondMode)
@@ -275,6 +286,7 @@ DRAWINGS: dict[type, Draw] = {
     fx.ChannelDelay: _late,
     fx.Motor: _motor,
     fx.CurrentDrive: _stamped("command [V]", "drive"),
+    fx.PositionServo: _servo,
     fx.SecondMode: _mode,
     fx.Inertia: _stamped("acceleration [rad/s²]", "inertia"),
     fx.Spring: _stamped("position [rad]", "stiffness"),

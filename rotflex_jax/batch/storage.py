@@ -47,6 +47,7 @@ def digest_of_recording(source: Path | Recording, common: str) -> str:
     if isinstance(source, Recording):
         labels = (source.Ts, source.channels, source.units, source.input_name, source.input_unit)
         labels = (*labels, source.n_init, source.start, source.accept, sorted(source.resolution.items()))
+        labels = (*labels, sorted(source.constants.items()))
         arrays = (np.ascontiguousarray(a).tobytes() for a in (source.u, source.y))
         return _digest(common.encode(), repr(labels).encode(), *arrays)
     return _digest(common.encode(), source.read_bytes())

@@ -34,7 +34,10 @@ JointName = Annotated[
     ),
 ]
 InputColumn = Annotated[
-    str | None, typer.Option("--input", metavar="COLUMN", help="Column of the motor voltage in volts.")
+    str | None,
+    typer.Option(
+        "--input", metavar="COLUMN", help="Column of the motor voltage in volts, or of the goal of a servo."
+    ),
 ]
 OutputColumns = Annotated[
     list[str] | None,
@@ -228,9 +231,12 @@ class Columns:
         from rotflex_jax.mechanism.linear import output_units
 
         units = {} if self.mechanism is None else output_units(self.mechanism)
+        channels = _channels(self.outputs or (), tuple(units))
+        if self.mechanism is not None and self.mechanism.units.input != "V":
+            units |= {self.input or "voltage": self.mechanism.units.input}
         return {
             "input": self.input,
-            "outputs": _channels(self.outputs or (), tuple(units)),
+            "outputs": channels,
             "units": units,
             "degrees": self.degrees,
             "Ts": self.Ts,

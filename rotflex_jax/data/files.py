@@ -206,7 +206,7 @@ def load(
         Ts: sampling period [s], where no column has the time.
         time: column of the time [s].
         accept: faults to accept by name, such as `saturated`; see `Recording`.
-        units: channel to unit, where it is not rad.
+        units: channel to unit, where it is not rad; the column of the input to its unit, where that is not V.
         max_bytes: largest size of the file, and of what it unpacks to [bytes].
 
     Returns:
@@ -220,6 +220,8 @@ def load(
     >>> frame = pd.DataFrame({"t": k / 50, "volts": np.sin(k), "theta": 0.01 * np.cos(k)})
     >>> load(frame, input="volts", outputs="theta")
     Recording(100 samples, 2 s at 50 Hz, voltage [V] to theta [rad], DataFrame)
+    >>> load(frame, input="volts", outputs="theta", units={"volts": "rad"})
+    Recording(100 samples, 2 s at 50 Hz, volts [rad] to theta [rad], DataFrame)
     """
     accepted = acceptable(accept)
     if is_foreign(source):
@@ -248,8 +250,11 @@ def load(
     start, period = _timing(table, time, Ts, len(u), "units" in accepted)
     together = np.column_stack(list(y.values()))
     try:
+        other = (units or {}).get(u_name)
         recording = Recording(
             u=u,
+            input_name="voltage" if other is None else u_name,
+            input_unit=other or "V",
             y=np.deg2rad(together) if degrees else together,
             Ts=period,
             channels=tuple(y),

@@ -272,6 +272,9 @@ def _gauge_step(alpha: Float[np.ndarray, " N"], stage: int) -> float | None:
     return next(fits, None)
 
 
+SERVO = "hub.position_servo"
+"""Where the ready-made servos have their firmware."""
+
 BAM_PERIOD = 0.005
 """Sampling period that the logs of the XL-330 are resampled to; they were taken every 5.1 to 7.1 ms [s]."""
 
@@ -282,14 +285,12 @@ def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
     Goal and angle were logged together, at uneven times, and are resampled to 5 ms by linear
     interpolation. Where the torque is switched off the arm falls freely; the recording ends there.
 
-    The toolkit has no model of the servo's own position loop yet, so this is for importing and for models
-    of one's own.
-
     Args:
         path: of the JSON file.
 
     Returns:
-        The recording, input goal [rad], channel theta [rad]; trajectory and gain are in its `source`.
+        The recording, input goal [rad], channel theta [rad]; its `constants` are the gain and the supply that
+        the servo was set to, as `rotflex_jax.joints.xl330_pendulum` names them.
 
     Raises:
         InputError: the file is missing, damaged, or no log of such a run.
@@ -308,6 +309,8 @@ def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
         rows = [[entry[name] for name in columns] for entry in entries[:stop]]
         t, goal, theta = np.array(rows, dtype=float).T
         what = f"{file.name}, {run['trajectory']}, gain {run['kp']}"
+        known = {"gain": run["kp"]} | ({"supply": run["vin"]} if "vin" in run else {})
+        settings = {f"{SERVO}.{name}": float(value) for name, value in known.items()}
     except (ValueError, KeyError, TypeError) as error:
         raise unreadable(file, "a log of the XL-330", error) from error
     Ts = BAM_PERIOD
@@ -320,6 +323,7 @@ def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
         source=f"{what}, resampled to 5 ms{'' if stop == len(on) else ', up to where the torque is off'}",
         start=float(t[0]),
         resolution={"theta": COUNT},
+        constants=settings,
     )
 
 

@@ -109,16 +109,6 @@ def _stacked(parameter_sets: list[ParameterSet]) -> ParameterSet:
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *full)
 
 
-def restrict(parameter_set: ParameterSet, model: ReducedModel) -> ParameterSet:
-    """A parameter set without what a reduced model leaves out."""
-    return ParameterSet(
-        parameter_set.values[:, model.parameters],
-        parameter_set.x0,
-        parameter_set.gates[np.array(model.effects)],
-        parameter_set.K[:, np.array(model.states)],
-    )
-
-
 @dataclasses.dataclass(frozen=True)
 class BatchedPredictor:
     """Runs hypotheses: one super-model, one solver, one set of recordings.
@@ -127,13 +117,30 @@ class BatchedPredictor:
         supermodel: What is compiled, each reduced model of it once.
         solver: Integration rule.
         data: The recordings.
+        constants: Values of the baseline's parameters that the recordings know, nan for the others; None
+            where they know none.
         compiled: Programs that have run once, and so may run on several threads.
     """
 
     supermodel: SuperModel
     solver: Solver
     data: StackedRecordings
+    constants: Float[np.ndarray, "R B"] | None = None
     compiled: set[Any] = dataclasses.field(default_factory=set)
+
+    def restrict(self, parameter_set: ParameterSet, model: ReducedModel) -> ParameterSet:
+        """A parameter set with what the recordings know, without what a reduced model leaves out."""
+        values = parameter_set.values
+        if self.constants is not None:
+            values = values.copy()
+            known = ~np.isnan(self.constants)
+            values[:, : known.shape[1]][known] = self.constants[known]
+        return ParameterSet(
+            values[:, model.parameters],
+            parameter_set.x0,
+            parameter_set.gates[np.array(model.effects)],
+            parameter_set.K[:, np.array(model.states)],
+        )
 
     def innovations(
         self, parameter_sets: list[ParameterSet], window: Int[np.ndarray, "R N"]
@@ -143,7 +150,7 @@ class BatchedPredictor:
         def run(job: tuple[ReducedModel, list[int]]) -> np.ndarray:
             model, indices = job
             with double_precision():
-                batch = _stacked([restrict(parameter_sets[i], model) for i in indices])
+                batch = _stacked([self.restrict(parameter_sets[i], model) for i in indices])
                 data, index = self.on_device(), jnp.asarray(window)
                 e = _innovations(model.mechanism.structure, self.solver, batch, data, index)
                 return np.asarray(e)[: len(indices)]
@@ -170,7 +177,7 @@ class BatchedPredictor:
             d = directions[i]
             along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
             with double_precision():
-                structure, inputs = model.mechanism.structure, restrict(parameter_sets[i], model)
+                structure, inputs = model.mechanism.structure, self.restrict(parameter_sets[i], model)
                 data, index = self.on_device(), jnp.asarray(window)
                 e, J = _slopes(structure, self.solver, inputs, along, data, index)
                 return np.asarray(e), np.asarray(J)

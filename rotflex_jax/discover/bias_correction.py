@@ -40,7 +40,8 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
     if exact or not isinstance(predictor.solver, Exponential):
         return h
     solver = dataclasses.replace(predictor.solver, substeps=SUBSTEP_FACTOR * predictor.solver.substeps)
-    fine = dataclasses.replace(problem, predictor=BatchedPredictor(s, solver, predictor.data))
+    finer = BatchedPredictor(s, solver, predictor.data, predictor.constants)
+    fine = dataclasses.replace(problem, predictor=finer)
     coordinates = FitCoordinates.of(h, problem.windows)
     _, J = problem.slopes([h])
     W = h.whitener(J[0, : h.moved], seen)

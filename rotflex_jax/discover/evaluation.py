@@ -106,7 +106,11 @@ def errors_as_trained(
 ) -> RunErrors:
     """Errors over recordings with the trained model as it is; arguments as before."""
     trained = dataclasses.replace(
-        h, local_z=h.local_z.mean(axis=0, keepdims=True), x0=h.x0[:1], densities=np.array(-np.inf)
+        h,
+        local_z=h.local_z.mean(axis=0, keepdims=True),
+        x0=h.x0[:1],
+        K=h.K[:1],
+        densities=np.array(-np.inf),
     )
     model = validation.model_of(trained, locations, 0)
     return errors_of_runs(validation, [model] * len(validation.problem.dataset.recordings))

@@ -210,6 +210,11 @@ def with_all_calibrations(s: SuperModel, h: Hypothesis) -> Hypothesis:
     )
 
 
+def parameter_count(s: SuperModel, h: Hypothesis, location: EffectLocation) -> int:
+    """How many numbers an effect takes, those of each recording counted one by one."""
+    return sum(len(h.x0) if i in h.local else 1 for i in s.parameter_indices(location))
+
+
 def is_physical(s: SuperModel, h: Hypothesis, location: EffectLocation) -> bool:
     """Whether the parameters of an effect lie in their physical range."""
     values, specs = h.mean_values(s), s.mechanism.parameter_specifications

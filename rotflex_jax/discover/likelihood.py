@@ -57,7 +57,7 @@ class LikelihoodProblem:
         number: int = 1,
     ) -> "LikelihoodProblem":
         """The one-step prediction of a dataset by a super-model; `number` as in `Windows.whole`."""
-        predictor = BatchedPredictor(supermodel, solver, dataset.data)
+        predictor = BatchedPredictor(supermodel, solver, dataset.data, dataset.constants)
         return cls(predictor, dataset, ports, Windows.whole(dataset, number))
 
     def of_free_runs(self, windows: Windows) -> "LikelihoodProblem":
@@ -128,14 +128,19 @@ class LikelihoodProblem:
     def gains(
         self, h: Hypothesis, intensities: Sequence[dict[str, float]]
     ) -> list[Float[np.ndarray, "R n C"]]:
-        """Gains of the baseline's linear part, one array per intensity."""
-        s, periods = self.supermodel, np.asarray(self.dataset.data.Ts).tolist()
+        """Gains of the baseline's linear part in each recording, one array per intensity."""
+        s, periods, found = self.supermodel, np.asarray(self.dataset.data.Ts).tolist(), {}
         if self.free_run:
             shape = (len(periods), Layout.of(s.mechanism.structure).size, len(self.noise))
             return [np.zeros(shape) for _ in intensities]
         mechanism = s.clean(h.values(s).mean(axis=0), ())
-        by_period = {Ts: kalman_gains(mechanism, intensities, self.noise, Ts) for Ts in set(periods)}
-        K = np.stack([by_period[Ts] for Ts in periods], axis=1)
+        rows = list(zip(periods, self.dataset.constants, strict=True))
+        keys = [(Ts, known.tobytes()) for Ts, known in rows]
+        for key, (Ts, known) in zip(keys, rows, strict=True):
+            if key not in found:
+                here = mechanism.with_values(np.where(np.isnan(known), mechanism.values, known))
+                found[key] = kalman_gains(here, intensities, self.noise, Ts)
+        K = np.stack([found[key] for key in keys], axis=1)
         full = np.zeros((*K.shape[:2], Layout.of(s.mechanism.structure).size, K.shape[3]))
         full[:, :, s.baseline_states] = K
         return list(full)

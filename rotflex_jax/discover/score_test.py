@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, restrict
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
 from rotflex_jax.discover.coordinates import FitCoordinates, Projection
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
@@ -107,7 +107,7 @@ def candidate_sensitivities(
     s = predictor.supermodel
     active = s.active(current.gates)
     with double_precision():
-        structure, inputs = active.mechanism.structure, restrict(current, active)
+        structure, inputs = active.mechanism.structure, predictor.restrict(current, active)
         A = _run_slopes(structure, predictor.solver, inputs, predictor.on_device(), jnp.asarray(window))
 
     def run(job: tuple[ReducedModel, InactiveCandidates]) -> np.ndarray:
@@ -115,7 +115,7 @@ def candidate_sensitivities(
         along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
         with double_precision():
             present = jnp.array([model.states.index(i) for i in active.states])
-            structure, inputs = model.mechanism.structure, restrict(parameter_set, model)
+            structure, inputs = model.mechanism.structure, predictor.restrict(parameter_set, model)
             solver, data = predictor.solver, predictor.on_device()
             given = (present, A, along, data, jnp.asarray(window))
             return np.asarray(_inactive_slopes(structure, solver, inputs, *given))

@@ -19,7 +19,13 @@ from rotflex_jax.discover.evaluation import (
     process_noise_gain,
 )
 from rotflex_jax.discover.horizon import Horizon, Horizons, as_prediction, fit_free_runs
-from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, generalisations, is_physical
+from rotflex_jax.discover.hypothesis import (
+    CandidateStart,
+    Hypothesis,
+    generalisations,
+    is_physical,
+    parameter_count,
+)
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.proposal import with_proposal
@@ -339,7 +345,9 @@ def _refit(
     runs = refit_candidates(horizons.free_run.problem, current.free_run.hypothesis, informed)
     validated = [
         dataclasses.replace(
-            horizons.validated(h, f, current), location=c.location, parameter_count=len(c.values)
+            horizons.validated(h, f, current),
+            location=c.location,
+            parameter_count=parameter_count(s, h, c.location),
         )
         for h, f, c in zip(grown, runs, starts, strict=True)
         if is_physical(s, h, c.location) and is_physical(s, f, c.location)

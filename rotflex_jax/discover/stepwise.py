@@ -12,6 +12,7 @@ from rotflex_jax.discover.hypothesis import (
     Hypothesis,
     embed_initial_state,
     is_physical,
+    parameter_count,
     replacing,
     with_candidate,
     with_effect,
@@ -155,7 +156,7 @@ def eliminate(
     while tested := [p for p in h.locations if p not in added[-1:]]:
         rivals = refit(problem, [without(s, h, p) for p in tested], alternations=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
-        count = {p: len(s.parameter_indices(p)) * (len(h.x0) if p in s.calibrations else 1) for p in worth}
+        count = {p: parameter_count(s, h, p) for p in worth}
         needed = {p: TRAIN_NATS + 0.5 * count[p] * np.log(problem.measured_values) for p in worth}
         surplus = {p: worth[p] - needed[p] for p in worth}
         for p, r in zip(tested, rivals, strict=True):

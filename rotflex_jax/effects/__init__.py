@@ -46,6 +46,7 @@ from rotflex_jax.effects.sensors import (
     SensorCubic,
     SensorGain,
 )
+from rotflex_jax.effects.servo import PositionServo
 from rotflex_jax.effects.springs import CubicSpring, JointPlay, QuadraticSpring, Spring
 
 __all__ = [
@@ -71,6 +72,7 @@ __all__ = [
     "Viscous",
     "Motor",
     "CurrentDrive",
+    "PositionServo",
     "SecondMode",
     # dry friction
     "Coulomb",

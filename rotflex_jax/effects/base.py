@@ -97,6 +97,8 @@ class Effect(abc.ABC):
     contains: ClassVar[tuple[str, ...]] = ()
     # Ports a search tries it at by default; none for what a model has from the start.
     searched: ClassVar[tuple[str, ...]] = ()
+    # Its volts are the unit of the input, also where that is no voltage but a current or a goal.
+    volts_of_input: ClassVar[bool] = False
     turning: ClassVar[bool] = False  # a function of an angle: no meaning where a port moves along a line
     per_recording: ClassVar[bool] = False  # its parameters belong to a recording, not to the machine
 
@@ -279,7 +281,7 @@ class DryFriction(Effect):
     steady: ClassVar[bool] = False
     # True where it depends on the torque that passes from the motor to the machine: `limit` receives it [N m]
     # as a fourth argument, positive where the motor pushes forwards. It is the mean of both sides of the
-    # port: of what the motors give and of what the rest of the machine takes, by its linear part.
+    # port: of what the motors give and of what the rest of the machine takes, dry friction apart.
     loaded: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -373,6 +375,7 @@ class Actuation(Effect):
     kind_label: ClassVar[str] = "actuation"
     kind_meaning: ClassVar[str] = "What lies between the recorded command and the motor."
     acts_on: ClassVar[Domain] = "input"
+    volts_of_input: ClassVar[bool] = True
     exact_step: ClassVar[bool] = True
     not_linearised: ClassVar[str] = "acts on the voltage before the motor, which is the input here"
     ports: ClassVar[tuple[str, ...]] = ("input",)

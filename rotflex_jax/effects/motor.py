@@ -99,6 +99,7 @@ class CurrentDrive(Linear):
     name: ClassVar[str] = "current_drive"
     title: ClassVar[str] = "motor on a current amplifier"
     equation: ClassVar[str] = "tau = gain * v"
+    volts_of_input: ClassVar[bool] = True
     amplitudes: ClassVar[tuple[str, ...]] = ("gain",)
     motor: ClassVar[bool] = True
 

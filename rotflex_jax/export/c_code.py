@@ -137,7 +137,8 @@ def _lines(model: Model, Ts: float, prefix: str, code: SampleProgram) -> Iterato
     x = ", ".join(map(_number, start))
     yield f"    static const {prefix}_state rest = {{.x = {{{x}}}, .started = 0}};"
     yield "    *s = rest;\n}\n"
-    yield "/* y: what the sensors read now. u: command that is held from now over one sample [V]. */"
+    unit = mechanism.units.input
+    yield f"/* y: what the sensors read now. u: command that is held from now over one sample [{unit}]. */"
     yield f"static void {prefix}_step({prefix}_state *s, double u, double y[{len(mechanism.channels)}])\n{{"
     yield from _reading(code)
     yield from _driving(code, firsts, pasts)
@@ -157,7 +158,7 @@ def _heading(mechanism: Mechanism, model: Model, Ts: float) -> Iterator[str]:
         yield f" * {effect.title} at {effect.at}{off}: {_comment(effect)}"
         declared = specifications(effect)
         for n, v in effect.values.items():
-            unit = mechanism.units.unit(declared[n].unit)
+            unit = mechanism.units.unit(declared[n].unit, effect.volts_of_input)
             yield f" *     {n} = {v:.10g} {unit}".rstrip()
     yield " */"
 

@@ -193,14 +193,14 @@ def _with_equations(mechanism: Mechanism) -> Iterator[Effect]:
     path = ("input", "port", "channel")
     stage = lambda e: (path.index(e.acts_on), getattr(e, "stage", 0))  # noqa: E731
     for effect in sorted(mechanism.effects, key=stage):
-        if not effect.is_linear or effect.order:
+        if not effect.is_linear or effect.order or not effect.exact_step:
             yield effect
 
 
 def _parameters(mechanism: Mechanism, effect: Effect) -> Iterator[tuple[str, float, str, str]]:
     """Name, value, unit and meaning of the parameters of an effect."""
     for (name, value), spec in zip(effect.values.items(), specifications(effect).values(), strict=True):
-        yield name, float(value), mechanism.units.unit(spec.unit), spec.meaning
+        yield name, float(value), mechanism.units.unit(spec.unit, effect.volts_of_input), spec.meaning
 
 
 def _plain(value: float) -> str:

@@ -41,6 +41,7 @@ class Dataset:
         noise: Standard deviation of the sensor noise of each channel.
         torque_scale: Torque that the motor gives at the root mean square voltage [N m].
         first_states: First positions and speeds, where a fit starts.
+        constants: Values of the parameters that the recordings know; nan where the model's own counts.
     """
 
     recordings: tuple[Recording, ...]
@@ -48,6 +49,7 @@ class Dataset:
     noise: Float[np.ndarray, " C"]
     torque_scale: float
     first_states: Float[np.ndarray, "R n"]
+    constants: Float[np.ndarray, "R P"]
 
 
 def prepare(
@@ -77,7 +79,46 @@ def prepare(
         noise=like.noise if like else sensor_noise((*recordings, *noise_of), model),
         torque_scale=like.torque_scale if like else torque_scale(model.mechanism, data),
         first_states=first_states(model, recordings),
+        constants=known_values(model, recordings),
     )
+
+
+def known_values(model: Model, recordings: Sequence[Recording]) -> Float[np.ndarray, "R P"]:
+    """Values of the parameters that the recordings know, nan where the model's own counts.
+
+    Raises:
+        InputError: A parameter that is free in the model.
+    """
+    names = model.mechanism.parameter_names
+    known = np.full((len(recordings), len(names)), np.nan)
+    for row, recording in zip(known, recordings, strict=True):
+        model.at(recording)  # names are checked there
+        for name, value in recording.constants.items():
+            if name in model.mechanism.free_names:
+                raise InputError(
+                    f"Parameter {name!r} is free in the model, but the recording knows that it is {value:g}; "
+                    f"hold it, mechanism.trust({name!r})."
+                )
+            if name in names:
+                row[names.index(name)] = value
+    return known
+
+
+def with_common_constants(model: Model, recordings: Sequence[Recording]) -> Model:
+    """The model with the constants that all recordings share.
+
+    Raises:
+        InputError: Constants that differ between recordings.
+    """
+    known = known_values(model, recordings)
+    differ = ~np.all((known == known[:1]) | np.isnan(known) & np.isnan(known[:1]), axis=0)
+    if np.any(differ):
+        names = [n for n, d in zip(model.mechanism.parameter_names, differ, strict=True) if d]
+        raise InputError(
+            f"The recordings differ in {', '.join(names)}, but here all share one set of numbers; give "
+            "recordings with the same constants, or use `fit`."
+        )
+    return model.at(recordings[0])
 
 
 def padded_length(recordings: Sequence[Recording]) -> int:

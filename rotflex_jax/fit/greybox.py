@@ -163,7 +163,7 @@ class GreyBoxProblem:
         return FitAttempt(flat, inputs, status, steps, history, start_error, cost)
 
     def _model(self, flat: np.ndarray) -> Model:
-        values = self.free.coordinates.values(flat).mean(axis=0)
+        values = _common_values(self.model.mechanism, self.free.coordinates.values(flat))
         return dataclasses.replace(self.model, mechanism=self.model.mechanism.with_values(values))
 
     def _with_free(self, flat: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -179,9 +179,11 @@ class GreyBoxProblem:
         return flat
 
     def _inputs(self, flat: np.ndarray, stage: ProcessNoise, scale: np.ndarray) -> RunInputs:
-        m = self._model(flat).mechanism
-        K = np.stack([kalman_gains(m, [stage or {}], self.noise, float(Ts))[0] for Ts in self.data.Ts])
-        return RunInputs(*jax.tree.map(jnp.asarray, (np.ones(len(m.effects)), self.data, K, scale)))
+        here = self._model(flat)
+        gain = lambda r: kalman_gains(here.at(r).mechanism, [stage or {}], self.noise, r.Ts)[0]  # noqa: E731
+        K = np.stack([gain(r) for r in self.recordings])
+        gates = np.ones(len(here.mechanism.effects))
+        return RunInputs(*jax.tree.map(jnp.asarray, (gates, self.data, K, scale)))
 
     def _minimum(self, flat: np.ndarray, inputs: RunInputs, tolerance: float) -> Minimum:
         """The least squared error near a point, by the free coordinates."""
@@ -204,6 +206,12 @@ class GreyBoxProblem:
             max_steps=self.max_steps,
             report=tell,
         )
+
+
+def _common_values(m: Mechanism, values: Float[np.ndarray, "R P"]) -> Float[np.ndarray, " P"]:
+    """Means over recordings; what is trusted is the mechanism's own, whatever a recording knows of it."""
+    free = np.array([name not in m.trusted for name in m.parameter_names])
+    return np.where(free, values.mean(axis=0), m.values)
 
 
 def report(
@@ -235,6 +243,7 @@ def report(
     for i in coordinates.local:
         z[:, i] = [end.flat[coordinates.local_index(r, i)] for r in each]
     values, stretch = coordinates.transform.physical(z)
+    common = _common_values(m, values)
     H = curvature(parts, len(index))
     covariance = sandwich(parts, H)
     row_of = {int(k): row for row, k in enumerate(index)}
@@ -262,10 +271,10 @@ def report(
     deviation = np.sqrt(np.mean(residual**2, axis=0)) * np.asarray(end.inputs.scale)
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
     return Fit(
-        model=dataclasses.replace(model, mechanism=m.with_values(values.mean(axis=0))),
+        model=dataclasses.replace(model, mechanism=m.with_values(common)),
         cost=cost,
         status=end.status,
-        parameters=estimates(names, values.mean(axis=0), specs, combinations, covariance),
+        parameters=estimates(names, common, specs, combinations, covariance),
         noise=dict(zip(m.channels, deviation.tolist(), strict=True)),
         covariance=combined_covariance(covariance, free),
         free_names=free_names,
@@ -355,10 +364,12 @@ def fit(
     check_signs(model, listed)
     indices = tuple(names.index(n) for n in local)
     listed, windows_of = _windows(listed, window_seconds)
-    coordinates = Coordinates(m.structure, indices, len(listed), windows_of)
     dataset = prepare(model, listed)
+    known = np.flatnonzero(np.any(~np.isnan(dataset.constants), axis=0)).tolist()
+    coordinates = Coordinates(m.structure, (*indices, *known), len(listed), windows_of)
     say = progress or (lambda _: None)
     flat = coordinates.flatten(m.values, dataset.first_states)
+    flat = coordinates.with_constants(flat, dataset.constants)
     parameters = tuple(names.index(n) for n in m.free_names)
     mesh = mesh_of(devices) if len(listed) > 1 else None
     measured = first == "measured"

@@ -13,7 +13,13 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import StackedRecordings, first_states, sensor_noise, stack
+from rotflex_jax.fit.dataset import (
+    StackedRecordings,
+    first_states,
+    sensor_noise,
+    stack,
+    with_common_constants,
+)
 from rotflex_jax.fit.problem import (
     LARGEST_STEP,
     directions,
@@ -296,6 +302,8 @@ def many_starts(
             "None."
         )
     check_signs(model, listed)
+    model = with_common_constants(model, listed)
+    m = model.mechanism
     free = np.array([m.parameter_names.index(n) for n in m.free_names])
     transform = Transform.of(m.parameter_specifications)
     z = transform.unconstrain(_box(m, free, starts, spread, seed))[:, free]

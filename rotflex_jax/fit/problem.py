@@ -45,7 +45,7 @@ class Coordinates:
 
     Attributes:
         structure: Mechanism without numbers.
-        local: Indices of parameters that each recording has for itself.
+        local: Indices of parameters that each recording has for itself, known constants among them.
         recordings: How many recordings, or windows of them, each with a first state.
         windows_of: Which recording each window is of; empty where none is cut.
     """
@@ -115,6 +115,16 @@ class Coordinates:
         z = self.transform.unconstrain(values)
         own = np.tile(z[list(self.local)], self.owning)
         return np.concatenate([z, own, np.asarray(x0, float).ravel()])
+
+    def with_constants(
+        self, flat: Float[np.ndarray, " F"], constants: Float[np.ndarray, "R P"]
+    ) -> Float[np.ndarray, " F"]:
+        """The flat vector with the values that recordings know; nan where the common one counts."""
+        flat, z = flat.copy(), self.transform.unconstrain(constants)
+        for r, own in enumerate(self.owners):
+            for i in np.flatnonzero(~np.isnan(constants[r])).tolist():
+                flat[self.local_index(own, i)] = z[r, i]
+        return flat
 
 
 @persistent_jit(static=1)

@@ -32,10 +32,10 @@ def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
     Raises:
         InputError: Channels that move in the opposite direction.
     """
-    linear = linearise(model.mechanism)
     against: set[str] = set()
     worst = 0.0
     for recording in recordings:
+        linear = linearise(model.at(recording).mechanism)
         r = recording.slice(0, min(recording.N, MAX_SIGN_SAMPLES))
         y, would = model.measured(r).astype(float), _response(linear.discretise(r.Ts), linear.C, r.u)
         if not np.all(np.isfinite(would)):

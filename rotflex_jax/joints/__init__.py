@@ -1,4 +1,4 @@
-"""Ready-made mechanisms: joints of the paper and the maker, a link, a single inertia, public machines."""
+"""Ready-made mechanisms: joints of the paper and the maker, a link, an inertia, servos, public machines."""
 
 from rotflex_jax.joints.flexible_link import flexible_link
 from rotflex_jax.joints.public_machines import emps, rotary_arm, silverbox, two_dof_link
@@ -10,6 +10,7 @@ from rotflex_jax.joints.rotary_flexible import (
     quanser_2002,
     quanser_2010,
 )
+from rotflex_jax.joints.servos import position_servo, xl330_pendulum
 from rotflex_jax.joints.single_inertia import single_inertia
 from rotflex_jax.joints.springs import SPRINGS, SpringType, spring_settings, spring_stiffness
 
@@ -24,6 +25,8 @@ __all__ = [
     "silverbox",
     "rotary_arm",
     "two_dof_link",
+    "position_servo",
+    "xl330_pendulum",
     "arm_inertia",
     "hub_inertia",
     "spring_stiffness",

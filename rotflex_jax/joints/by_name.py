@@ -12,7 +12,15 @@ from typing import Any
 
 from rotflex_jax.errors import InputError
 
-JOINTS = ("paper", "quanser_2002", "quanser_2010", "flexible_link", "single_inertia")
+JOINTS = (
+    "paper",
+    "quanser_2002",
+    "quanser_2010",
+    "flexible_link",
+    "single_inertia",
+    "position_servo",
+    "xl330_pendulum",
+)
 
 
 def choose(name: str, choices: Iterable[str], what: str) -> str:
@@ -46,8 +54,8 @@ def _model(text: str) -> Any:
     if text.endswith(".json") or (separator and "=" not in values and name not in JOINTS):
         return named(text)
     preset = getattr(joints, choose(name, JOINTS, "joint"))
-    # A motor is not a number; whoever needs another one writes Python.
-    names = [key for key in inspect.signature(preset).parameters if key != "motor"]
+    # A motor or a servo is not a number; whoever needs another one writes Python.
+    names = [key for key in inspect.signature(preset).parameters if key not in ("motor", "servo")]
     return Model(preset(**_numbers(values, names, f"option of {name}")))
 
 

@@ -197,4 +197,5 @@ def two_dof_link(stage: int = 1) -> Mechanism:
         ),
         outputs={"theta": "hub", "alpha": "joint"},
         trusted=("hub.current_drive.gain",),
+        units=Units(input="A"),
     )

@@ -62,7 +62,7 @@ class AveragingRun(NamedTuple):
         reach = 2 * memory if reach is None else reach
         x0 = rest_state(s.mechanism.structure, np.float64)
         channel = s.mechanism.channels[s.output]
-        unit, skip = ("V", s.unit), reach
+        unit, skip = (s.mechanism.units.input, s.unit), reach
         if isinstance(data, Recording):
             m, Ts, u = data.n_init, data.Ts, data.u.astype(float)
             unit = (data.input_unit, dict(zip(data.channels, data.units, strict=True)).get(channel, s.unit))

@@ -91,8 +91,9 @@ def local_kernels(
         h2=np.asarray(h2),
         about=float(voltage),
         kind="local",
-        input=f"small changes about {voltage:g} V",
+        input=f"small changes about {voltage:g} {s.mechanism.units.input}",
         h3_diagonal=np.asarray(h3) if cubic else None,
+        input_unit=s.mechanism.units.input,
         output_unit=s.unit,
     )
 

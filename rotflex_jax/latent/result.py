@@ -130,6 +130,7 @@ class LatentTorque:
         linear: Torques of the model's own dampers and springs at these ports, `port.effect` ->
             torque [N m]; what `given_back` can add.
         motion: Unit of positions.
+        input: Unit of the input.
         effort: Unit of torques.
         added: Which of them are in `torque`.
     """
@@ -148,6 +149,7 @@ class LatentTorque:
     scale: float
     linear: dict[str, Float[np.ndarray, " N"]]
     motion: str = "rad"
+    input: str = "V"
     effort: str = "N m"
     added: tuple[str, ...] = ()
 
@@ -211,7 +213,7 @@ class LatentTorque:
                 f"{'deflection' if sprung else 'position'} of the {port}",
                 "rad",
             ),
-            "voltage": (self.voltage, "voltage", "V"),
+            "voltage": (self.voltage, "voltage" if self.input == "V" else "input", self.input),
             "time": (self.time, "time", "s"),
         }
         if against not in known:
@@ -302,6 +304,7 @@ def latent_torque_result(
         scale=scale,
         linear=_linear_torques(m, ports, position, speed),
         motion=m.units.motion,
+        input=m.units.input,
         effort=m.units.effort,
     )
 

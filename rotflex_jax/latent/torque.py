@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports
+from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports, with_common_constants
 from rotflex_jax.latent.augmented_model import AugmentedStep, UnknownTorque, linearise_along, predicted_states
 from rotflex_jax.latent.result import LatentTorque, latent_torque_result
 from rotflex_jax.latent.smoother import InitialDistribution, IntensityEstimator, LinearTimeVaryingModel
@@ -64,6 +64,7 @@ def latent_torque(
     """
     model = model if isinstance(model, Model) else Model(model)
     listed = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    model = with_common_constants(model, listed) if listed else model
     m, say = model.mechanism, progress or (lambda _: None)
     chosen = tuple(process_noise_ports(m, 1.0)) if ports is None else _checked_ports(m, ports)
     dataset = prepare(model, listed)

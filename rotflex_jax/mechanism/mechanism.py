@@ -195,14 +195,14 @@ class Mechanism:
         """Unit, bounds and size of each parameter, in the order of `values`."""
         u = self.units
         return tuple(
-            dataclasses.replace(s, unit=u.unit(s.unit), typical=s.typical * u.size(s.unit))
+            dataclasses.replace(s, unit=u.unit(s.unit, e.volts_of_input), typical=s.typical * u.size(s.unit))
             for e in self.effects
             for s in specifications(e).values()
         )
 
     def sentence(self, effect: Effect) -> str:
         """An effect in words, in the units of this mechanism."""
-        return self.units.sentence(effect.sentence())
+        return self.units.sentence(effect.sentence(), effect.volts_of_input)
 
     @property
     def values(self) -> Float[np.ndarray, " P"]:
@@ -292,5 +292,6 @@ class Mechanism:
                 full = f"{e.at}.{e.name}.{name}"
                 held = "  (trusted)" if full in self.trusted else ""
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
-                lines.append(f"  {full} = {number} {self.units.unit(specifications(e)[name].unit)}{held}")
+                unit = self.units.unit(specifications(e)[name].unit, e.volts_of_input)
+                lines.append(f"  {full} = {number} {unit}{held}")
         return "\n".join(lines)

@@ -25,7 +25,7 @@ def port_roles(mechanism: Mechanism, port: str) -> set[str]:
         return {port}
     if mechanism.on_rotor(port) or all(name in mechanism.port_vectors for name in PORTS):
         return set()
-    stiff = any(float(e.stamp().stiffness) != 0 for e in mechanism.linear_effects(port))
+    stiff = any(float(e.stamp().stiffness) != 0 for e in mechanism.linear_effects(port) if not e.motor)
     roles = {"hub"} if mechanism.has_motor(port) else set()
     roles |= {"joint"} if stiff else set()
     along = {"axis"} if mechanism.units.motion == "m" else set()

@@ -102,7 +102,7 @@ class SmoothRK4:
             return dL
         total = torques(mechanism, L, z, v, c.gates)
         position, speed = port_motion(layout, L)
-        load = transmitted_torques(c.load, L, v)
+        load = transmitted_torques(mechanism, c.load, L, z, v, c.gates)
         for i, e in effects_of(mechanism, DryFriction):
             k = layout.torque_ports.index(e.at)
             size = jnp.abs(speed[k])

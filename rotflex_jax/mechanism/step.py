@@ -52,13 +52,15 @@ def motor_torque(
     values at the ends of a step say nothing about its mean.
     """
     layout = Layout.of(mechanism.structure)
-    speed = sparse_matvec((mechanism.port_vectors[at],), x[layout.n : 2 * layout.n])[0]
+    port = (mechanism.port_vectors[at],)
+    position = sparse_matvec(port, x[: layout.n])[0]
+    speed = sparse_matvec(port, x[layout.n : 2 * layout.n])[0]
     total = jnp.zeros_like(speed)
     for i, e in effects_of(mechanism, Linear):
         if not (e.motor and e.at == at):
             continue
         stamp = e.stamp()
-        total = total + gates[i] * (stamp.drive * v - stamp.damping * speed)
+        total = total + gates[i] * (stamp.drive * v - stamp.damping * speed - stamp.stiffness * position)
         if e.order:
             own = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in row]) for row in stamp.own])
             columns = (stamp.from_speed, stamp.from_voltage)
@@ -71,15 +73,20 @@ def motor_torque(
 
 
 class LoadRows(NamedTuple):
-    """The torque that the motors transmit through each friction port, linear in state and voltage.
+    """The torque that the motors transmit through each friction port, as a sum over what makes it up.
 
     Attributes:
         state: Coefficients of the linear states.
         voltage: Coefficients of the voltage.
+        torques: Coefficients of the torques of forces and memories at the torque ports.
+        motors: One where those of the motors at the port itself count as the motors', zero where no friction
+            depends on the torque.
     """
 
     state: Float[Array, "k m *D"]
     voltage: Float[Array, "k *D"]
+    torques: Float[Array, "k p *D"]
+    motors: Float[Array, "k *D"]
 
 
 def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | None:
@@ -87,7 +94,9 @@ def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | Non
 
         load = (motor - rest) / 2,   rest = inertia p.ddq - motor
 
-    The inertia that is entered at the port lies between both sides, and accelerates by the linear part.
+    The inertia that is entered at the port lies between both sides. It accelerates by all torques but dry
+    friction, which is what the load determines. With `motor = a + f` and `inertia p.ddq = b + g`, where a and
+    b are linear and f and g are those of forces and memories, the load is `a - b / 2 + f - g / 2`.
 
     Args:
         mechanism: With (traced) parameter values.
@@ -98,16 +107,18 @@ def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | Non
     if not ports:
         return None
     eq = equations(mechanism, gates)
-    m, n = layout.linear, layout.n
+    m, n, p = layout.linear, layout.n, len(layout.torque_ports)
     # Columns: each state alone, then the voltage alone.
     x, v = jnp.eye(m, m + 1, dtype=gates.dtype), jnp.eye(1, m + 1, m, dtype=gates.dtype)[0]
-    slope = jnp.concatenate([eq.A, eq.B[:, None]], axis=1)
+    slope = jnp.concatenate([eq.A, eq.B[:, None], eq.ports], axis=1)
     rows = []
     for port in layout.torque_ports[: layout.contacts]:
         if port not in ports:
-            rows.append(jnp.zeros(m + 1, gates.dtype))
+            rows.append(jnp.zeros(m + 2 + p, gates.dtype))
             continue
-        acceleration = sparse_matvec((mechanism.port_vectors[port],), slope[n : 2 * n])[0]
+        vector = (mechanism.port_vectors[port],)
+        acceleration = sparse_matvec(vector, slope[n : 2 * n])[0]
+        position, speed = sparse_matvec(vector, x[:n])[0], sparse_matvec(vector, x[n : 2 * n])[0]
         here = [(i, e.stamp(), e) for i, e in effects_of(mechanism, Linear) if e.at == port]
         inertia = sum(gates[i] * stamp.inertia for i, stamp, _ in here)
         # What the current gives now is what accelerates; what it gives over a step is its steady value.
@@ -115,21 +126,47 @@ def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | Non
         now = jnp.zeros(m + 1, gates.dtype)
         for i, stamp, e in here:
             if e.motor:
-                speed = sparse_matvec((mechanism.port_vectors[port],), x[n : 2 * n])[0]
-                now = now + gates[i] * (stamp.drive * v - stamp.damping * speed)
+                given = stamp.drive * v - stamp.damping * speed - stamp.stiffness * position
+                now = now + gates[i] * given
                 for row, torque in zip(own.get(i, ()), stamp.torque, strict=True):
                     now = now + gates[i] * torque * x[row]
         motor = motor_torque(mechanism, port, x, v, gates)
-        rows.append((motor - (inertia * acceleration - now)) / 2)
+        linear = (motor - (inertia * acceleration[: m + 1] - now)) / 2
+        one = jnp.ones(1, gates.dtype)
+        rows.append(jnp.concatenate([linear, -inertia * acceleration[m + 1 :] / 2, one]))
     found = jnp.stack(rows)
-    return LoadRows(found[:, :m], found[:, m])
+    return LoadRows(found[:, :m], found[:, m], found[:, m + 1 : -1], found[:, -1])
 
 
 def transmitted_torques(
-    rows: LoadRows | None, x: Float[Array, "m *S"], v: Float[Array, "*S"]
+    mechanism: Mechanism,
+    rows: LoadRows | None,
+    x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
 ) -> Float[Array, "k *S"] | None:
-    """Torques [N m] through the friction ports at linear states; None where none is asked for."""
-    return None if rows is None else matvec(rows.state, x) + scaled_vector(rows.voltage, v)
+    """Torques [N m] through the friction ports; None where none is asked for.
+
+    Args:
+        mechanism: With (traced) parameter values.
+        rows: From `load_rows`.
+        x: Linear part of the state.
+        z: Memories.
+        v: Voltage [V].
+        gates: One factor per effect.
+    """
+    if rows is None:
+        return None
+    load = matvec(rows.state, x) + scaled_vector(rows.voltage, v)
+    if not effects_of(mechanism, Force) and not effects_of(mechanism, Memory):
+        return load
+    layout = Layout.of(mechanism.structure)
+    motors = [
+        motor_correction(mechanism, port, x, z, v, gates) for port in layout.torque_ports[: layout.contacts]
+    ]
+    load = load + matvec(rows.torques, torques(mechanism, x, z, v, gates))
+    return load + expand_axes(rows.motors, load) * jnp.stack(motors)
 
 
 def friction_level(
@@ -153,9 +190,56 @@ def friction_level(
     return evaluate_effect(e, limit, *signals)
 
 
-def _drive(mechanism: Mechanism, e: Memory, x: Array, v: Array, gates: Array) -> Array:
-    """Last argument of `flow` and `force` of a memory."""
-    return v if e.driven_by == "voltage" else motor_torque(mechanism, e.at, x, v, gates)
+def motor_limit(
+    mechanism: Mechanism,
+    at: str,
+    x: Float[Array, "m *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "*S"]:
+    """Torque [N m] that their limits take from the motors at a port, beyond `motor_torque`."""
+    layout = Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    total = jnp.zeros(x.shape[1:], x.dtype)
+    for i, e in effects_of(mechanism, Force):
+        if isinstance(e, Linear) and e.motor and e.at == at:
+            k = layout.torque_ports.index(at)
+            given = evaluate_effect(e, lambda e, *signals: e.force(*signals), position[k], speed[k], v)
+            total = total + gates[i] * given
+    return total
+
+
+def motor_correction(
+    mechanism: Mechanism,
+    at: str,
+    x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "*S"]:
+    """Torque [N m] of the motors at a port beyond their linear part: less for a limit or for heat."""
+    layout = Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    total = motor_limit(mechanism, at, x, v, gates)
+    for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
+        if e.driven_by == "motor" and e.at == at:
+            k, drive = layout.torque_ports.index(at), memory_drive(mechanism, e, x, v, gates)
+            force = lambda e, *signals: e.force(*signals)  # noqa: E731
+            total = total + gates[i] * evaluate_effect(e, force, z[m], position[k], speed[k], drive)
+    return total
+
+
+def memory_drive(
+    mechanism: Mechanism,
+    e: Memory,
+    x: Float[Array, "m *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "*S"]:
+    """Last argument of `flow` and `force` of a memory: the voltage, or the torque of the motors [N m]."""
+    if e.driven_by == "voltage":
+        return v
+    return motor_torque(mechanism, e.at, x, v, gates) + motor_limit(mechanism, e.at, x, v, gates)
 
 
 def torques(
@@ -183,7 +267,7 @@ def torques(
         total[k] = total[k] + gates[i] * evaluate_effect(e, force, position[k], speed[k], v)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = _drive(mechanism, e, x, v, gates)
+        drive = memory_drive(mechanism, e, x, v, gates)
         total[k] = total[k] + gates[i] * evaluate_effect(e, force, z[m], position[k], speed[k], drive)
     return jnp.stack(total)
 
@@ -201,7 +285,7 @@ def memory_rates(
     rates, flow = [], lambda e, *signals: e.flow(*signals)
     for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = _drive(mechanism, e, x, v, gates)
+        drive = memory_drive(mechanism, e, x, v, gates)
         rates.append(jnp.asarray(evaluate_effect(e, flow, z[m], position[k], speed[k], drive)))
     return jnp.stack(rates)
 
@@ -307,10 +391,10 @@ def _advance_smooth(
         return start
     smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
     if not smooth:
-        return _with_dry_friction(mechanism, L, start, v, c, solver.passes)
+        return _with_dry_friction(mechanism, L, start, z, v, c, solver.passes)
     f0 = torques(mechanism, L, z, v, c.gates)
     guess = start + matvec(c.hold, f0)
-    brake = _predicted_friction(mechanism, L, guess, v, c) if layout.contacts else None
+    brake = _predicted_friction(mechanism, L, guess, z, v, c) if layout.contacts else None
     end = guess if brake is None else guess + matvec(c.hold, brake)
     z1 = advance_memories(mechanism, z, (L + end) / 2, v, c.gates, c.h)
     if solver.order == 2:
@@ -318,7 +402,7 @@ def _advance_smooth(
     else:
         own = end if extra is None else end - extra
         final = guess + _fourth_order(mechanism, L, z, z1, v, f0, brake, own, c)
-    final = _with_dry_friction(mechanism, L, final, v, c, solver.passes)
+    final = _with_dry_friction(mechanism, L, final, z1, v, c, solver.passes)
     return jnp.concatenate([final, z1]) if z.shape[0] else final
 
 
@@ -340,13 +424,13 @@ def _fourth_order(mechanism, L, z, z1, v, f0, brake, end, c):  # noqa: ANN001, A
 
 
 def _friction_levels(
-    mechanism: Mechanism, x: Array, end: Array, v: Array, c: Constants
+    mechanism: Mechanism, x: Array, end: Array, z: Array, v: Array, c: Constants
 ) -> tuple[Array, Array]:
     """Friction levels against positive and negative motion of each friction port."""
     layout = Layout.of(mechanism.structure)
     position, before = port_motion(layout, x)
     speed = jnp.abs(before + port_motion(layout, end)[1]) / 2
-    load = transmitted_torques(c.load, (x + end) / 2, v)
+    load = transmitted_torques(mechanism, c.load, (x + end) / 2, z, v, c.gates)
     up = [jnp.zeros(x.shape[1:], x.dtype)] * layout.contacts
     down = list(up)
     for i, e in effects_of(mechanism, DryFriction):
@@ -357,11 +441,13 @@ def _friction_levels(
     return jnp.stack(up), jnp.stack(down)
 
 
-def _predicted_friction(mechanism: Mechanism, x: Array, end: Array, v: Array, c: Constants) -> Array:
+def _predicted_friction(
+    mechanism: Mechanism, x: Array, end: Array, z: Array, v: Array, c: Constants
+) -> Array:
     """Friction torques for the stages: exact where a port slides, contacts uncoupled."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
-    up, down = _friction_levels(mechanism, x, end, v, c)
+    up, down = _friction_levels(mechanism, x, end, z, v, c)
     own = jnp.stack([1 / c.stop[i, i] for i in range(k)])
     needed = -port_motion(layout, end)[1][:k]
     needed = needed * expand_axes(own, needed)
@@ -370,7 +456,7 @@ def _predicted_friction(mechanism: Mechanism, x: Array, end: Array, v: Array, c:
 
 
 def _with_dry_friction(
-    mechanism: Mechanism, x: Array, end: Array, v: Array, c: Constants, passes: int | None
+    mechanism: Mechanism, x: Array, end: Array, z: Array, v: Array, c: Constants, passes: int | None
 ) -> Array:
     """The state at the end of the step with dry friction, positions matched to the stop inside it."""
     layout = Layout.of(mechanism.structure)
@@ -379,11 +465,11 @@ def _with_dry_friction(
         return end
     q0, v0 = (m[:k] for m in port_motion(layout, x))
     free, stop = port_motion(layout, end)[1][:k], c.stop[:k, :k]
-    levels = _friction_levels(mechanism, x, end, v, c)
+    levels = _friction_levels(mechanism, x, end, z, v, c)
     if not all(e.steady for _, e in effects_of(mechanism, DryFriction)):
         # The level belongs to the speed that friction leaves, not to the one without it.
         rough = coupled_contacts(v0, free, stop, *levels, passes=1)
-        levels = _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], rough.torque), v, c)
+        levels = _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], rough.torque), z, v, c)
     found = coupled_contacts(v0, free, stop, *levels, passes=passes)
     end = end + matvec(c.hold[:, :k], found.torque)
     q1, v1 = (m[:k] for m in port_motion(layout, end))

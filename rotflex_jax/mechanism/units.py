@@ -11,6 +11,7 @@ from typing import NamedTuple
 _UNIT = re.compile(
     r"kg m\^2|\(N m\)\^2|N m\b(?: s(?:\^\d)?(?![a-z]))?(?:/(?:rad|s|A|V)(?:\^\d)?)*|rad\b(?:/s(?:\^\d)?)?"
 )
+_VOLTS = re.compile(r"\b(m?)V\b")
 _ANGLE_TOO = re.compile(r" \([-+]?[\d.e+-]+ degrees\)")
 _WORDS = (("torque", "force"), ("turning", "moving"), ("turns", "moves"), ("turned", "moved"))
 
@@ -23,22 +24,34 @@ class Units(NamedTuple):
         effort: Unit of the force or torque.
         motion_size: Typical size of its positions, relative to the radians of a small joint.
         effort_size: The same for the force or torque, relative to newton metres.
+        input: Unit of the input that drives it, where that is no voltage: of a goal angle, of a current.
     """
 
     motion: str = "rad"
     effort: str = "N m"
     motion_size: float = 1.0
     effort_size: float = 1.0
+    input: str = "V"
 
-    def unit(self, declared: str) -> str:
+    def unit(self, declared: str, of_input: bool = False) -> str:
         """The unit of this machine for a unit that an effect declares.
+
+        Args:
+            declared: As the effect has it.
+            of_input: Whether its volts are the unit of the input, whatever that is.
 
         >>> Units("m", "N").unit("N m s/rad"), Units("m", "N").unit("kg m^2")
         ('N s/m', 'kg')
+        >>> Units(input="A").unit("N m/V", of_input=True), Units(input="rad").unit("V")
+        ('N m/A', 'V')
         """
-        if (self.motion, self.effort) == ("rad", "N m"):
+        driven = of_input and self.input != "V"
+        if (self.motion, self.effort) == ("rad", "N m") and not driven:
             return declared
         powers = _powers(declared)
+        if driven and "V" in powers:
+            volts = powers.pop("V")
+            powers[self.input] = powers.get(self.input, 0) + volts
         Q, E = powers.pop("rad", 0), powers.pop("N m", 0)
         if (self.motion, self.effort, powers.get("s", 0), E, Q) == ("m", "N", 2, 1, -1):
             powers, E, Q = {"kg": 1} | {k: v for k, v in powers.items() if k != "s"}, 0, 0
@@ -52,12 +65,20 @@ class Units(NamedTuple):
         powers = _powers(declared)
         return self.effort_size ** powers.get("N m", 0) * self.motion_size ** powers.get("rad", 0)
 
-    def sentence(self, text: str) -> str:
+    def sentence(self, text: str, of_input: bool = False) -> str:
         """What an effect says of itself, in the units and words of this machine.
+
+        Args:
+            text: As the effect says it.
+            of_input: Whether its volts are the unit of the input, whatever that is.
 
         >>> Units("m", "N").sentence("the axis meets a torque of 20 N m whichever way it turns")
         'the axis meets a force of 20 N whichever way it moves'
+        >>> Units(input="rad").sentence("voltages between -0.1 V and 0.2 V have no effect", of_input=True)
+        'inputs between -0.1 rad and 0.2 rad have no effect'
         """
+        if of_input and self.input != "V":
+            text = _VOLTS.sub(lambda found: found.group(1) + self.input, text).replace("voltage", "input")
         if self.motion == "rad":
             return text
         text = _ANGLE_TOO.sub("", text)

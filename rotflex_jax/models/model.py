@@ -73,6 +73,24 @@ class Model:
 
         return read(path).model
 
+    def at(self, recording: Recording) -> "Model":
+        """The model with the constants of a recording in the place of its own.
+
+        Raises:
+            InputError: A constant of an effect that the model has, under a name that the effect has not.
+        """
+        names, effects = self.mechanism.parameter_names, {(e.at, e.name) for e in self.mechanism.effects}
+        for name in recording.constants:
+            head, _, parameter = name.rpartition(".")
+            if name not in names and tuple(head.split(".")) in effects:
+                own = ", ".join(n for n in names if n.startswith(f"{head}."))
+                raise InputError(
+                    f"The recording has the constant {name!r}, but {head} of the model has no parameter "
+                    f"{parameter!r}; use one of {own}."
+                )
+        known = {n: v for n, v in recording.constants.items() if n in names}
+        return dataclasses.replace(self, mechanism=self.mechanism.with_values(known)) if known else self
+
     def measured(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """The channels of a recording that the mechanism has as outputs, in its order."""
         missing = [c for c in self.mechanism.channels if c not in recording.channels]
@@ -93,15 +111,15 @@ class Model:
 
     def _behind_actuation(self, recording: Recording) -> tuple[np.ndarray, "Model"]:
         """The voltage (N,) [V] that reaches the motor, and the model without its actuation."""
-        u, acting = recording.u.astype(float), effects_of(self.mechanism, Actuation)
+        u, acting, here = recording.u.astype(float), effects_of(self.mechanism, Actuation), self.at(recording)
         if not acting:
-            return u, self
+            return u, here
         gates = self._switches()
         with double_precision():
-            given = map(jnp.asarray, (self.mechanism.values, gates, u, float(recording.Ts)))
+            given = map(jnp.asarray, (here.mechanism.values, gates, u, float(recording.Ts)))
             v = np.asarray(_motor_voltage(self.mechanism.structure, *given))
         gates[[i for i, _ in acting]] = 0.0
-        return v, dataclasses.replace(self, gates=tuple(gates.tolist()))
+        return v, dataclasses.replace(here, gates=tuple(gates.tolist()))
 
     def behind_actuation(self, recording: Recording) -> tuple["Model", Recording]:
         """The model without its actuation, and the recording with the voltage that reaches the motor.
@@ -128,7 +146,7 @@ class Model:
         if before is not None and len(rest_state(self.mechanism.structure, np.float64)) > moving:
             left = self._run(before, self._start(before))[0][-1:, moving:]
             hidden = left if np.all(np.isfinite(left)) else None
-        return self._starts(u[None, :m], y[None, :m], recording.Ts, hidden)[0]
+        return self.at(recording)._starts(u[None, :m], y[None, :m], recording.Ts, hidden)[0]
 
     def _run(self, recording: Recording, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (N, n) and outputs (N, C) of a free run."""
@@ -136,7 +154,7 @@ class Model:
             run = _free(
                 self.mechanism.structure,
                 self.solver,
-                *self.parameters_and_gates(),
+                *self.at(recording).parameters_and_gates(),
                 jnp.asarray(start),
                 jnp.asarray(recording.u.astype(float)),
                 jnp.asarray(float(recording.Ts)),
@@ -218,13 +236,14 @@ class Model:
             noise: Standard deviation of the sensor noise per channel.
         """
         u, y = recording.u.astype(float), self.measured(recording).astype(float)
-        K = kalman_gains(self.mechanism, [process_noise], noise, recording.Ts)[0]
+        here = self.at(recording)
+        K = kalman_gains(here.mechanism, [process_noise], noise, recording.Ts)[0]
         x0 = self._start(recording)
         with double_precision():
             run = _predict(
                 self.mechanism.structure,
                 self.solver,
-                *self.parameters_and_gates(),
+                *here.parameters_and_gates(),
                 jnp.asarray(x0),
                 *map(jnp.asarray, (u, y, np.ones(len(u)), K)),
                 jnp.asarray(float(recording.Ts)),

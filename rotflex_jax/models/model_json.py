@@ -117,7 +117,8 @@ def to_dict(saved: Saved) -> dict[str, Any]:
             "ports": {name: list(vector) for name, vector in mechanism.ports},
             "outputs": {name: {"port": port, "what": what} for name, (port, what) in mechanism.outputs},
             "effects": [_effect(e, mechanism) for e in mechanism.effects],
-            "units": list(mechanism.units),
+            "units": list(mechanism.units[:4]),
+            "input_unit": mechanism.units.input,
         },
         "solver": {"rule": type(model.solver).__name__, **dataclasses.asdict(model.solver)},
         "gates": None if model.gates is None else list(model.gates),
@@ -146,7 +147,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
     parameters = {
         name: {
             "value": _json(float(value)),
-            "unit": mechanism.units.unit(declared[name].unit),
+            "unit": mechanism.units.unit(declared[name].unit, effect.volts_of_input),
             "bounds": [_json(declared[name].lower), _json(declared[name].upper)],
             "trusted": f"{effect.at}.{effect.name}.{name}" in mechanism.trusted,
             "meaning": declared[name].meaning,
@@ -268,7 +269,7 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
     for part in (*data["mechanism"]["effects"], data["solver"]):
         _check_settings(part.get("settings", part), part.get("effect", "the solver"))
     given = data["mechanism"]
-    units = Units(*given["units"])
+    units = Units(*given["units"], input=given.get("input_unit", "V"))
     built = [_effect_back(e, units) for e in given["effects"]]
     trusted = [
         f"{e['at']}.{e['effect']}.{name}"
@@ -322,8 +323,8 @@ def _effect_back(given: Mapping[str, Any], units: Units) -> Effect:
     effect = cls(at=given["at"], **settings)
     declared = cls.declared() | specifications(effect)
     for key, p in parameters.items():
-        if key not in declared or units.unit(declared[key].unit) != p["unit"]:
-            has = ", ".join(f"{n} [{units.unit(s.unit)}]" for n, s in declared.items())
+        if key not in declared or units.unit(declared[key].unit, cls.volts_of_input) != p["unit"]:
+            has = ", ".join(f"{n} [{units.unit(s.unit, cls.volts_of_input)}]" for n, s in declared.items())
             raise InputError(
                 f"The file gives {name!r} the parameter {key} [{p['unit']}], but the effect has {has}; "
                 f"use the version of the effect that the file was written with."

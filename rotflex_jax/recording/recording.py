@@ -15,6 +15,7 @@ from rotflex_jax.recording.samples import (
     aligned,
     finite,
     initial_samples,
+    known_constants,
     labels,
     real_numbers,
     sampling_period,
@@ -50,6 +51,9 @@ class Recording:
         resolution: quantisation step by channel, where it is known; found from the data otherwise.
         continues: the recording that ended where this one starts, if any; a part of a recording knows the
             part before it. States that no sensor shows (a warm motor) continue from there.
+        constants: what is known of the machine in this recording and may be otherwise in another, such as the
+            gain that a servo was set to: full name of a parameter to its value. A model simulates this
+            recording with it, and a fit holds it; what a model has not is no concern of it.
 
     Raises:
         InputError: the data are not what they must be.
@@ -76,6 +80,7 @@ class Recording:
     accept: tuple[str, ...]
     resolution: Mapping[str, float | None]
     continues: "Recording | None"
+    constants: Mapping[str, float]
 
     def __init__(
         self,
@@ -92,6 +97,7 @@ class Recording:
         accept: str | Sequence[str] = (),
         resolution: Mapping[str, float | None] | None = None,
         continues: "Recording | None" = None,
+        constants: Mapping[str, float] | None = None,
     ) -> None:
         u, y = aligned(real_numbers(u, "Argument `u`"), real_numbers(y, "Argument `y`"))
         Ts = sampling_period(Ts)
@@ -117,6 +123,7 @@ class Recording:
                 for x, name in zip(y.T, names, strict=True)
             },
             "continues": continues,
+            "constants": known_constants(constants),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)

@@ -1,6 +1,8 @@
 """Checks of samples: real, finite, aligned, evenly spaced; sampling period and initial samples."""
 
-from collections.abc import Sequence
+import math
+import numbers
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -211,3 +213,17 @@ def labels(
 
 def _tuple(words: str | Sequence[str]) -> tuple[str, ...]:
     return (words,) if isinstance(words, str) else tuple(words)
+
+
+def known_constants(given: Mapping[str, float] | None) -> Mapping[str, float]:
+    """Parameter name -> known value, each a finite number."""
+    found = {}
+    for name, value in (given or {}).items():
+        if not isinstance(name, str) or not isinstance(value, numbers.Real) or not math.isfinite(value):
+            raise InputError(
+                f"The recording was given the constant {name!r} with the value {value!r}, but it needs the "
+                "full name of a parameter and a finite number; write for instance "
+                "constants={'hub.position_servo.gain': 400.0}."
+            )
+        found[name] = float(value)
+    return found

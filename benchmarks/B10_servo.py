@@ -1,0 +1,123 @@
+"""B10: a hobby servo under its own firmware, beside the extended friction models of arXiv 2410.08650.
+
+    python benchmarks/B10_servo.py
+    python benchmarks/B10_servo.py --only "gain 200" --parts models fits
+    python benchmarks/B10_servo.py --fresh --rollouts 100000
+
+An XL-330 lifts a pendulum at four gains in three motions. Every motion and every gain is left out once: M1
+to M6 are fitted to the rest by evolution, as their authors do (`servo/friction_models.py` has the laws), the
+grey box by `rf.fit` with the frictions of the catalogue and with what `rf.discover` finds. Compared are free
+runs of what was left out. Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by
+`ROTFLEX_DATA`. What `results/B10.json` has already is kept unless `--fresh` is given; writes it and
+`results/B10.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+if str(HERE) not in sys.path:
+    sys.path.insert(0, str(HERE))
+
+# Matrices of ten rows: threads would only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax
+import numba
+
+import rotflex_jax as rf
+
+rf.enable_fast_loops()
+rf.enable_compilation_cache()
+
+from servo.arm import arm
+from servo.evolved import evolved
+from servo.friction_models import MODELS
+from servo.grey_box import FRICTION, direction, fitted, searched, servo
+from servo.page import page, summary
+from servo.recordings import Split, splits
+
+RESULTS = HERE / "results"
+PARTS = ("models", "fits", "search", "direction", "so101")
+
+
+def machine() -> dict[str, Any]:
+    """Where the numbers come from."""
+    git = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True)
+    return {
+        "commit": git.stdout.strip(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "numba": numba.__version__,
+        "date": datetime.date.today().isoformat(),
+    }
+
+
+def rows(split: Split, parts: list[str], rollouts: int, say: Callable[[str], None]) -> dict[str, Callable]:
+    """Name of each row of a split -> what computes it."""
+    jobs: dict[str, Callable[[], dict[str, Any]]] = {}
+    if "models" in parts:
+        jobs |= {name: lambda name=name: evolved(name, split, rollouts, seed=1) for name in MODELS}
+    if "fits" in parts:
+        jobs |= {name: lambda e=effects: fitted(servo(e), split)[1] for name, effects in FRICTION.items()}
+    if "search" in parts:
+        jobs["search"] = lambda: searched(split, own=False, say=say)
+        jobs["search, own effect"] = lambda: searched(split, own=True, say=say)
+    return jobs
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="*", help="What is left out, for instance 'gain 200'.")
+    parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--rollouts", type=int, default=20_000, help="Free runs of each evolution.")
+    parser.add_argument("--fresh", action="store_true", help="Run again what the results have already.")
+    parser.add_argument("--out", type=Path, default=RESULTS / "B10.json")
+    given = parser.parse_args()
+    found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.is_file() else {"splits": {}}
+    began = time.perf_counter()
+
+    def say(text: str) -> None:
+        print(f"{time.perf_counter() - began:6.1f} s  {text}", flush=True)
+
+    def keep() -> None:
+        found["machine"], found["summary"] = machine(), summary(found["splits"])
+        given.out.parent.mkdir(exist_ok=True)
+        given.out.write_text(json.dumps(found, indent=1) + "\n")
+        given.out.with_suffix(".md").write_text(page(found))
+
+    known = splits(rf.data.load_dataset("bam_xl330"))
+    for name in given.only or known:
+        case = found["splits"].setdefault(name, {})
+        for row, compute in rows(known[name], given.parts, given.rollouts, say).items():
+            if row in case and not given.fresh:
+                continue
+            case[row] = compute()
+            test = {k: round(v["mean"], 2) for k, v in case[row]["test"].items()}
+            say(f"{name} left out, {row}: {test}")
+            keep()
+    if "direction" in given.parts and ("direction" not in found or given.fresh):
+        found["direction"] = direction(known["gain 200"], say)
+        keep()
+    if "so101" in given.parts and ("so101" not in found or given.fresh):
+        found["so101"] = arm(say)
+        keep()
+    keep()
+    print(page(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""The grey box: the ready-made servo with friction, fitted by free runs, and the structure a search finds."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+import rotflex_jax as rf
+from rotflex_jax import effects as fx
+from rotflex_jax.effects import DryFriction, Probe, Scale, register
+from rotflex_jax.effects.base import Scalar
+from rotflex_jax.mechanism.roles import search_places
+from rotflex_jax.parameters import parameter
+from servo.recordings import LENGTH, MASS, Split, errors
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class WeightFriction(DryFriction):
+    """Friction of a gear that grows with the weight it carries. |tau| = level |sin(position)|
+
+    An effect of one's own, as CONTRIBUTING shows it: M3 with the load alone. The motor's share of the
+    load follows the weight except while it accelerates.
+    """
+
+    name: ClassVar[str] = "weight_friction"
+    title: ClassVar[str] = "friction in proportion to the weight"
+    equation: ClassVar[str] = "tau = -level * |sin(position)| * sign(speed)"
+    amplitudes: ClassVar[tuple[str, ...]] = ("level",)
+    searched: ClassVar[tuple[str, ...]] = ("hub",)
+
+    level: float = parameter(0.1, unit="N m", lower=0.0, meaning="friction with the pendulum horizontal")
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+        """Level [N m] that opposes motion."""
+        return self.level * jnp.abs(jnp.sin(position))
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"level": 0.1 * scale.torque}]]
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class LiftingFriction(DryFriction):
+    """What friction is more while the weight is lifted. |tau| = level max(0, direction sin(position))
+
+    Beside `WeightFriction` it is the directional term of M5.
+    """
+
+    name: ClassVar[str] = "lifting_friction"
+    title: ClassVar[str] = "friction that is more while the weight is lifted"
+    equation: ClassVar[str] = "tau = -level * max(0, sign(speed) * sin(position)) * sign(speed)"
+    amplitudes: ClassVar[tuple[str, ...]] = ("level",)
+
+    level: float = parameter(0.1, unit="N m", lower=0.0, meaning="excess with the pendulum horizontal")
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
+        """Level [N m] that opposes motion in `direction`."""
+        rising = direction * jnp.sin(position)
+        return self.level * jnp.where(rising > 0, rising, 0.0)
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"level": 0.1 * scale.torque}]]
+
+
+FRICTION: dict[str, tuple[fx.Effect, ...]] = {
+    "no friction": (),
+    "Coulomb": (fx.Coulomb("hub", level=0.03),),
+    "Stribeck": (fx.Stribeck("hub", level=0.03, excess=0.01),),
+    "LuGre": (fx.LuGre("hub"),),
+    "weight friction": (WeightFriction("hub"),),
+    "weight friction, Stribeck": (WeightFriction("hub"), fx.Stribeck("hub", level=0.003, excess=0.01)),
+}
+"""Structures that are fitted everywhere, beside the one that a search finds."""
+
+
+def servo(effects: tuple[fx.Effect, ...] = ()) -> rf.Mechanism:
+    """The ready-made servo with friction."""
+    mechanism = rf.joints.xl330_pendulum(MASS, LENGTH)
+    for effect in effects:
+        mechanism = mechanism + effect
+    return mechanism
+
+
+def fitted(mechanism: rf.Mechanism, split: Split) -> tuple[rf.Fit, dict[str, Any]]:
+    """A fit by free runs and its row of the results."""
+    began = time.perf_counter()
+    fit = rf.fit(mechanism, split.train)
+    seconds = time.perf_counter() - began
+    runs = lambda of: [fit.model.simulate(r) for r in of]  # noqa: E731
+    return fit, {
+        "status": fit.status,
+        "seconds": seconds,
+        "rollouts": fit.steps * len(split.train),
+        "parameters": {e.name: [e.value, e.std] for e in fit.parameters if e.free},
+        "train": errors(runs(split.train), split.train),
+        "test": errors(runs(split.test), split.test),
+    }
+
+
+def searched(split: Split, own: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """The structure that a search of the training recordings finds, fitted by free runs to all of them.
+
+    Args:
+        split: What is learnt from.
+        own: Whether the search knows `WeightFriction`.
+        say: Called with lines of progress.
+    """
+    base = servo()
+    places = [(cls, at) for cls, at in search_places(base) if own or cls is not WeightFriction]
+    began = time.perf_counter()
+    found = rf.discover(base, split.search, split.validation, candidates=places, progress=say)
+    seconds = time.perf_counter() - began
+    _, row = fitted(found.model.mechanism, split)
+    return row | {
+        "verdict": str(found.verdict.value),
+        "sentence": found.sentence,
+        "effects": [f"{r.effect} at {r.port}" for r in found.rounds],
+        "search seconds": seconds,
+        "ranking": [
+            {
+                "effect": r.effect,
+                "port": r.port,
+                "nats": r.score,
+                "excited": r.excited,
+                "unconfounded": r.unconfounded,
+            }
+            for r in found.ranking
+        ],
+    }
+
+
+def direction(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
+    """Whether the recordings tell friction while lifting from friction while lowering, one mass as they are.
+
+    With both levels free, the torque constant, the resistance and the inertia can grow with their difference
+    as if the weight were another: the level of a fit has no bound in sight, and a search says so.
+    """
+    base = servo((WeightFriction("hub"),))
+    both, row = fitted(base + LiftingFriction("hub"), split)
+    found = rf.discover(
+        base, split.search, split.validation, candidates=[(LiftingFriction, "hub")], rounds=1, progress=say
+    )
+    ranked = found.ranking[0]
+    names = ("hub.weight_friction.level", "hub.lifting_friction.level", "hub.inertia.inertia")
+    return {
+        "fit": {n: [both[n].value, both[n].std] for n in names},
+        "alone": row["status"],
+        "verdict": str(found.verdict.value),
+        "excited": ranked.excited,
+        "unconfounded": ranked.unconfounded,
+        "detectable": ranked.smallest,
+    }

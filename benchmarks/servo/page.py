@@ -1,0 +1,103 @@
+"""Results of B10 as markdown."""
+
+from __future__ import annotations
+
+import statistics
+from typing import Any
+
+SEARCHES = {"search": "search of the catalogue", "search, own effect": "search, `weight_friction` added"}
+
+
+def mean(row: dict[str, Any], part: str, kind: str) -> float:
+    """Error of a part of the recordings, averaged over them [deg]."""
+    return statistics.mean(e[kind] for e in row[part].values())
+
+
+def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """What each model has over all that was left out: errors [deg], medians of free runs and times [s]."""
+    out = {}
+    for name in next(iter(splits.values()), {}):
+        if all(name in case for case in splits.values()):
+            rows = [case[name] for case in splits.values()]
+            out[name] = {
+                kind: statistics.mean(mean(r, "test", kind) for r in rows) for kind in ("mean", "rms")
+            }
+            out[name] |= {key: statistics.median(r[key] for r in rows) for key in ("rollouts", "seconds")}
+    return out
+
+
+def page(found: dict[str, Any]) -> str:
+    """The page."""
+    splits = found["splits"]
+    names = list(dict.fromkeys(name for case in splits.values() for name in case))
+    lines = [
+        "# B10: a hobby servo under its firmware",
+        "",
+        "Written by `python benchmarks/B10_servo.py`. Errors are those of free runs of the angle over whole "
+        "recordings [deg], the goal and the first samples known; recordings of the motion or of the gain in "
+        "the head of a column were left out of the fit. M1 to M6 are the models of arXiv 2410.08650, fitted "
+        "by CMA-ES to the mean absolute error of the training recordings; the grey box is fitted by least "
+        "squares.",
+        "",
+    ]
+    for kind, title in (("mean", "Mean absolute error"), ("rms", "Root mean square error")):
+        lines += [f"## {title} of what was left out", ""]
+        lines += ["| model | " + " | ".join(splits) + " | all |", "|---|" + "---:|" * (len(splits) + 1)]
+        for name in names:
+            values = [mean(case[name], "test", kind) if name in case else None for case in splits.values()]
+            known = [v for v in values if v is not None]
+            cells = ["" if v is None else f"{v:.2f}" for v in values]
+            cells.append(f"{statistics.mean(known):.2f}" if len(known) == len(values) else "")
+            lines.append(f"| {SEARCHES.get(name, name)} | " + " | ".join(cells) + " |")
+        lines.append("")
+    lines += ["## What it takes", "", "| model | free runs of a recording | fit [s] | search [s] |"]
+    lines += ["|---|---:|---:|---:|"]
+    for name in names:
+        rows = [case[name] for case in splits.values() if name in case]
+        middle = lambda key, rows=rows: statistics.median(r.get(key, 0.0) for r in rows)  # noqa: E731
+        search = f"{middle('search seconds'):.0f}" if "search seconds" in rows[0] else ""
+        lines.append(
+            f"| {SEARCHES.get(name, name)} | {middle('rollouts'):.0f} | {middle('seconds'):.1f} | {search} |"
+        )
+    lines += [
+        "",
+        "Medians over what was left out, on a machine with other work. A free run of the grey box carries "
+        "the derivatives along.",
+        "",
+    ]
+    lines += ["## What the search found", ""]
+    for split, case in splits.items():
+        for name, title in SEARCHES.items():
+            if name in case:
+                row = case[name]
+                effects = ", ".join(row["effects"]) or "nothing"
+                lines.append(f"- {split} left out, {title}: {effects} (`{row['verdict']}`)")
+    if "direction" in found:
+        d = found["direction"]
+        fits = ", ".join(f"{n} = {v:.3g} ± {1.96 * s:.2g}" for n, (v, s) in d["fit"].items())
+        lines += ["", "## Friction that knows the direction of the load", ""]
+        lines += [
+            f"Fitted with a level for lifting and one for lowering: {fits}. As a candidate beside friction "
+            f"in proportion to the weight: excited {str(d['excited']).lower()}, {d['unconfounded']:.1g} of "
+            f"its derivative unconfounded, verdict `{d['verdict']}`. One mass does not tell a directional "
+            "friction from another torque constant.",
+        ]
+    if "so101" in found:
+        lines += [
+            "",
+            "## SO-101",
+            "",
+            "| joint | motion left out | range | goal itself | no friction | Coulomb |",
+        ]
+        lines += ["|---|---|---:|---:|---:|---:|"]
+        for row in found["so101"]:
+            cells = [f"{row[k]:.2f}" for k in ("range", "goal", "no friction", "Coulomb")]
+            lines.append(f"| {row['joint']} | {row['motion']} | " + " | ".join(cells) + " |")
+        lines += ["", "Root mean square errors of free runs, and the range of the angle [deg]."]
+    m = found["machine"]
+    lines += [
+        "",
+        f"{m['processor']}, {m['cores']} cores, Python {m['python']}, jax {m['jax']}, {m['date']}, "
+        f"{m['commit']}.",
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,94 @@
+"""Hobby servos under the position loop of their firmware: the input is a goal angle."""
+
+import dataclasses
+
+from rotflex_jax.effects import Gravity, Inertia, PositionServo
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.units import Units
+
+FREE_FALL = 9.80665
+"""Acceleration of free fall [m/s^2]."""
+
+FIRMWARE = ("gain", "gain_scale", "limit", "supply", "period")
+"""Parameters of `PositionServo` that its user has set."""
+
+
+def position_servo(
+    inertia: float = 0.005, *, servo: PositionServo | None = None, weight: float = 0.0
+) -> Mechanism:
+    """A joint on a hobby servo, from goal angle to angle.
+
+        inertia theta'' = servo(goal, theta, theta') - sine sin(theta) - cosine cos(theta)
+
+    The firmware is trusted, and so is the inertia: goal and angle determine torques only up to a common
+    factor. Torque constant, resistance and both amplitudes of the weight are free. Where the gain is not
+    known, release it: stiffness, damping and largest torque are three numbers for three.
+
+    Args:
+        inertia: Of the joint with rotor and gear [kg m^2].
+        servo: The servo with its firmware; None for a Dynamixel XL-330.
+        weight: Torque of the weight when the angle is a quarter turn, where to start [N m].
+
+    Returns:
+        Mechanism with the output `theta` [rad] and the port `hub`; its input is the goal [rad].
+
+    Source: Newton 1687; the servo as in `rotflex_jax.effects.PositionServo`.
+
+    >>> position_servo().free_names[:2]
+    ('hub.position_servo.torque_constant', 'hub.position_servo.resistance')
+    """
+    return Mechanism(
+        coordinates=("theta",),
+        ports={"hub": (1.0,)},
+        effects=(
+            Inertia(at="hub", inertia=inertia),
+            dataclasses.replace(servo or PositionServo(), at="hub"),
+            Gravity(at="hub", sine=weight),
+        ),
+        outputs={"theta": "hub"},
+        trusted=(*(f"hub.position_servo.{name}" for name in FIRMWARE), "hub.inertia.inertia"),
+        units=Units(input="rad"),
+    )
+
+
+def xl330_pendulum(
+    mass: float = 0.49,
+    length: float = 0.1,
+    *,
+    gain: float = 400.0,
+    supply: float = 7.4,
+    rotor_inertia: float = 0.002,
+) -> Mechanism:
+    """A Dynamixel XL-330 with a pendulum on its shaft, from goal angle to angle, zero at the lowest point.
+
+        (mass length^2 + rotor_inertia) theta'' = servo(goal, theta, theta') - mass g length sin(theta)
+
+    The weight is known and sets the scale of all torques, so the inertia is free beside torque constant and
+    resistance, and so is the cosine of the weight, by which the zero of the encoder may be off the lowest
+    point. Gain and supply follow the recording where it knows them. Friction is not in it: without any, a
+    fit takes it for back-EMF.
+
+    Args:
+        mass: At the end of the pendulum [kg].
+        length: Of the pendulum [m].
+        gain: P gain of the firmware, where a recording does not know it.
+        supply: Supply voltage, where a recording does not know it [V].
+        rotor_inertia: Of rotor and gear, seen behind the gear, where to start [kg m^2].
+
+    Returns:
+        Mechanism with the output `theta` [rad] and the port `hub`; its input is the goal [rad].
+
+    Source: Duclusaud, Passault, Padois, Ly 2024, arXiv 2410.08650, section II.
+
+    >>> xl330_pendulum().free_names[:3]
+    ('hub.inertia.inertia', 'hub.position_servo.torque_constant', 'hub.position_servo.resistance')
+    """
+    return (
+        position_servo(
+            mass * length**2 + rotor_inertia,
+            servo=PositionServo(gain=gain, supply=supply),
+            weight=mass * FREE_FALL * length,
+        )
+        .release("hub.inertia.inertia")
+        .trust("hub.gravity.sine")
+    )
