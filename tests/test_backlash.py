@@ -308,7 +308,7 @@ def test_a_search_meets_play_at_its_size():
     gentle = s.with_family(s.gates(()), [c for c in s.candidates.values() if not c.threshold]).mechanism
     assert not any(isinstance(e, fx.Gear) for e in (*off.effects, *gentle.effects))
     assert any(isinstance(e, fx.Gear) for e in on.effects)
-    assert h.initial_state_for(s, (PLACE,)).shape == (1, 6)
+    assert h.initial_state_for(s, (PLACE,)).shape == (1, 1, 6)
 
     best, *others = scores(problem, h)
     assert best.location == PLACE and best.nats > 2 * max(o.nats for o in others) and best.excited

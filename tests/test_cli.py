@@ -18,6 +18,7 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.cli import app, terminal
 from rotflex_jax.data.datasets import DATASETS
+from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime import xla
@@ -291,11 +292,20 @@ class FakeSearch:
     def __init__(self) -> None:
         self.calls: list[tuple] = []
 
-    def __call__(self, joint, train, test, progress=None) -> SimpleNamespace:
-        self.calls.append((joint, train, test))
+    def __call__(self, joint, train, validation, progress=None, **options) -> SimpleNamespace:
+        self.calls.append((joint, train, validation))
+        self.options = options
         progress("Fitting the [baseline]")
         rmse = {"theta": 0.1, "alpha": 0.01}
-        stage = SimpleNamespace(held_out_rmse=rmse, held_out_rmse_windows=rmse, window_seconds=2.0)
+        stage = SimpleNamespace(
+            held_out_rmse=rmse,
+            held_out_rmse_windows=rmse,
+            window_seconds=2.0,
+            calibrate_seconds=2.0,
+            calibrated=RunErrors(rmse, {"theta": 0.2, "alpha": 0.01}),
+            test=None,
+            test_calibrated=None,
+        )
         level = SimpleNamespace(value=0.03, std=1e-3, ci95=(0.028, 0.032), unit="N m")
         turn = SimpleNamespace(
             effect="coulomb",
@@ -304,13 +314,16 @@ class FakeSearch:
             equation="tau = -level * sign(speed)",
             parameters={"level": level},
             equivalent=(("stribeck", "hub"),),
+            doubt="these recordings cannot distinguish it from stribeck at hub",
             stage=stage,
         )
         return SimpleNamespace(
+            stages=(stage, stage),
+            test=(),
             verdict=Verdict.FOUND,
             sentence="The rounds explain the record.",
             train=train,
-            validation=test,
+            validation=validation or train,
             baseline=stage,
             rounds=[turn],
             noise_floor={"theta": 5e-4, "alpha": 5e-4},
@@ -335,6 +348,21 @@ def search(monkeypatch: pytest.MonkeyPatch) -> FakeSearch:
     return fake
 
 
+def test_several_files_validate_each_other(run, search, recorded, tmp_path) -> None:
+    """Unless --split or --held-out says otherwise; a file that has no say is passed on as such."""
+    other, third = (write(tmp_path / name, DEMO[:400]) for name in ("other.csv", "third.csv"))
+    status, out, _ = run("discover", recorded, other, "--test", third, "--calibrate", 1)
+    assert status == 0
+    ((_, train, validation),) = search.calls
+    assert [recording.N for recording in train] == [600, 400] and validation == []
+    assert [recording.N for recording in search.options["test"]] == [400]
+    assert search.options["calibrate_seconds"] == 1.0
+    assert "of its own first 2 s" in out and "11.5" in out  # 0.2 rad
+    status, _, err = run("discover", recorded, other, "--test", other)
+    assert status == 2
+    assert_one_sentence(err, "other.csv", "given twice")
+
+
 def test_discover_splits_each_file(run, search, recorded, tmp_path) -> None:
     other = write(tmp_path / "other.csv", DEMO[:400])
     status, out, err = run("discover", recorded, other, "--split", 0.75)
@@ -347,7 +375,7 @@ def test_discover_splits_each_file(run, search, recorded, tmp_path) -> None:
         "FOUND",
         "the hub meets friction [N m]",
         "0.028 .. 0.032",
-        "cannot distinguish it from: stribeck at hub",
+        "cannot distinguish it from stribeck at hub",
         "5.73",
         "reversals",
         "a [note] to read",

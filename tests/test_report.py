@@ -300,7 +300,7 @@ def test_what_a_reader_must_learn_is_there(page, discovery) -> None:
     assert "Coulomb at hub and cubic spring at joint explain the recording." in text
     assert "The hub meets a constant friction torque of 0.03 N m." in text
     assert "τ = −stiffness · position³" in text
-    assert "These recordings cannot distinguish it from stribeck at hub." in text
+    assert "these recordings cannot distinguish it from stribeck at hub" in text
     assert "0.03000 N m" in text
     assert "0.02980 … 0.03020" in text
     assert "40.00 N m/rad³" in text

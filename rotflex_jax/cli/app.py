@@ -90,7 +90,9 @@ def discover(
     files: given.Files,
     joint: given.JointName = "paper",
     held_out: given.HeldOut = None,
+    test: given.Test = None,
     split: given.Share = None,
+    calibrate: given.Calibrate = 2.0,
     input_column: given.InputColumn = None,
     output_columns: given.OutputColumns = None,
     degrees: given.Degrees = False,
@@ -104,12 +106,14 @@ def discover(
     scheduler: given.Scheduler = None,
     workers: given.Workers = None,
 ) -> None:
-    """Find the effects that the model lacks, with evidence on data the fit never saw."""
-    check_each(
-        each, {"scheduler": scheduler, "workers": workers}, {"held-out": held_out, "save-model": save_model}
-    )
+    """Find the effects that the model lacks, with evidence on data the fit never saw.
+
+    Several FILES without --held-out and --split validate each other: each decides on what the others found.
+    """
+    refused = {"held-out": held_out, "test": test, "save-model": save_model}
+    check_each(each, {"scheduler": scheduler, "workers": workers}, refused)
     share = given.check_split(split, held_out or [])
-    given.check_distinct(files, held_out or [])
+    given.check_distinct(files, [*(held_out or []), *(test or [])])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
     model, options = by_name.model(joint), (degrees, Ts, time_column, accept)
@@ -117,8 +121,14 @@ def discover(
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers)
         return
-    train, test = columns.load_parts(files, held_out or [], share)
-    _discover(model, train, test, report, json_file, save_model)
+    if len(files) > 1 and not held_out and split is None:
+        train, validation = [columns.load(file) for file in files], []
+    else:
+        train, validation = columns.load_parts(files, held_out or [], share)
+    no_say = [columns.load(file) for file in test or []]
+    _discover(
+        model, train, validation, report, json_file, save_model, test=no_say, calibrate_seconds=calibrate
+    )
 
 
 def compare(
@@ -181,19 +191,22 @@ def effects(
 def _discover(
     mechanism: Any,
     train: "list[Recording]",
-    test: "list[Recording]",
+    validation: "list[Recording]",
     report: Path | None,
     json_file: Path | None,
     save_model: Path | None = None,
+    *,
+    test: "Sequence[Recording]" = (),
+    **options: Any,
 ) -> None:
-    terminal.print_findings([*train, *test])
+    terminal.print_findings([*train, *validation, *test])
     from rotflex_jax.runtime.xla import enable_fast_start
 
     enable_fast_start()
     import rotflex_jax as rf
 
     with terminal.progress("Searching for missing effects") as step:
-        result = rf.discover(mechanism, train, test, progress=step)
+        result = rf.discover(mechanism, train, validation, test=test, progress=step, **options)
     _give(result, terminal.print_discovery, json_file)
     if save_model is not None:
         result.save(save_model)

@@ -75,6 +75,21 @@ HeldOut = Annotated[
     list[Path] | None,
     typer.Option("--held-out", metavar="FILE", help="Recording held out for validation; may be repeated."),
 ]
+Test = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--test", metavar="FILE", help="Recording that has no say, to report errors on; may be repeated."
+    ),
+]
+Calibrate = Annotated[
+    float,
+    typer.Option(
+        "--calibrate",
+        metavar="SECONDS",
+        min=0.0,
+        help="Report errors also with the offsets of each unseen recording's own first SECONDS; 0: not.",
+    ),
+]
 Share = Annotated[
     float | None,
     typer.Option("--split", metavar="SHARE", help="Share of each FILE to fit, the rest is held out: 0.7."),

@@ -72,7 +72,9 @@ def estimate_line(name: str, estimate: Any) -> str:
 
 
 def print_discovery(result: Any) -> None:
-    """Verdict, rounds, errors on held-out data and where the model failed."""
+    """Verdict, rounds, errors on validation and test data, and where the model failed."""
+    from rotflex_jax.discover.tables import error_lists, status_sentence
+
     console = output()
     units = {name: unit_of(result.validation[0], name) for name in result.baseline.held_out_rmse}
     console.print(result.verdict.label.upper(), style="bold", markup=False)
@@ -83,18 +85,18 @@ def print_discovery(result: Any) -> None:
             console.print(f"  {added.equation}", markup=False)
         for name, estimate in added.parameters.items():
             console.print(f"  {estimate_line(name, estimate)}", markup=False)
-        if added.equivalent:
-            others = ", ".join(f"{effect} at {port}" for effect, port in added.equivalent)
-            console.print(f"  These data cannot distinguish it from: {others}.", markup=False)
-    stages = [("baseline", result.baseline)]
-    stages += [(f"+ {added.effect} at {added.port}", added.stage) for added in result.rounds]
-    floor = ("noise floor of the sensor", result.noise_floor)
-    console.print("\nRMS error of a free run over the held-out data", style="bold")
-    console.print(error_table([*((n, s.held_out_rmse) for n, s in stages), floor], units))
-    seconds = digits(result.baseline.window_seconds)
-    console.print(f"\nThe same, restarted every {seconds} s", style="bold")
-    rows = [*((name, stage.held_out_rmse_windows) for name, stage in stages), floor]
-    console.print(error_table(rows, units))
+        console.print(f"  {status_sentence(added)}", markup=False)
+    names = ["baseline", *(f"+ {added.effect} at {added.port}" for added in result.rounds)]
+    floor, seconds = ("noise floor of the sensor", result.noise_floor), digits(result.baseline.window_seconds)
+    for title, note, errors in error_lists(result):
+        console.print(f"\n{title}", style="bold", markup=False)
+        console.print(note, markup=False)
+        for heading, each in (
+            ("RMS error of one free run over all of it", [e.whole for e in errors]),
+            (f"The same, restarted every {seconds} s", [e.windows for e in errors]),
+        ):
+            console.print(f"\n{heading}")
+            console.print(error_table([*zip(names, each, strict=True), floor], units))
     if result.where:
         console.print("\nWhere the baseline failed", style="bold")
         for place in result.where:

@@ -147,7 +147,7 @@ class Projection:
 
 def _basis(rows: np.ndarray) -> np.ndarray:
     """Orthonormal rows (B, M) that span some signals (K, ...)."""
-    flat = rows.reshape(len(rows), -1)
+    flat = rows.reshape(len(rows), int(np.prod(rows.shape[1:])))
     size = np.linalg.norm(flat, axis=1)
     if not len(flat) or not size.max(initial=0.0) > 0:
         return np.zeros((0, flat.shape[1]))

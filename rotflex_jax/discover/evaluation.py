@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rotflex_jax.discover.coordinates import FitCoordinates
-from rotflex_jax.discover.horizon import Horizon, Horizons
+from rotflex_jax.discover.horizon import Horizons, SearchHorizon
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state, with_all_calibrations
 from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem
 from rotflex_jax.discover.refit import refit
@@ -301,7 +301,9 @@ class Evaluation:
         return dataclasses.replace(stage, **found)
 
 
-def estimates_of_validation(horizon: Horizon, found: ValidatedHypothesis) -> tuple[tuple[Estimate, ...], ...]:
+def estimates_of_validation(
+    horizon: SearchHorizon, found: ValidatedHypothesis
+) -> tuple[tuple[Estimate, ...], ...]:
     """The parameters of a model fitted to the validation recordings, from where training has left them.
 
     What agrees with the training recordings is a property of the machine; no choice rests on these fits.

@@ -13,7 +13,7 @@ from rotflex_jax.models.model import Model
 
 
 @dataclasses.dataclass(frozen=True)
-class Horizon:
+class SearchHorizon:
     """Training and validation recordings at one horizon.
 
     Attributes:
@@ -36,8 +36,8 @@ class Horizons:
         free_run: From the voltage alone, starting again every few seconds.
     """
 
-    prediction: Horizon
-    free_run: Horizon
+    prediction: SearchHorizon
+    free_run: SearchHorizon
 
     @classmethod
     def of(
@@ -60,7 +60,7 @@ class Horizons:
             sets = [ValidationSet.leave_one_out(p[0], seconds) for p in (whole, cut)]
         else:
             sets = [ValidationSet(p[1], seconds) for p in (whole, cut)]
-        return cls(Horizon("prediction", whole[0], sets[0]), Horizon("free_run", cut[0], sets[1]))
+        return cls(SearchHorizon("prediction", whole[0], sets[0]), SearchHorizon("free_run", cut[0], sets[1]))
 
     def validated(
         self, prediction: Hypothesis, free_run: Hypothesis, near: ValidatedHypothesis | None = None

@@ -113,7 +113,7 @@ class Round:
         held_out_gain_nats: Gain in log-likelihood of the validation recordings [nat].
         sentence: What was found, in words.
         equation: Its equation.
-        doubt: Why the effect may stand in for something else; empty where nothing speaks for that.
+        doubts: Further reasons why the effect may stand in for something else, in words.
         prediction: What it gained as a predictor when it was added; None for a calibration.
         free_run: What it gained in free runs.
     """
@@ -127,9 +127,16 @@ class Round:
     held_out_gain_nats: float
     sentence: str
     equation: str
-    doubt: str = ""
+    doubts: tuple[str, ...] = ()
     prediction: HorizonGain | None = None
     free_run: HorizonGain | None = None
+
+    @property
+    def doubt(self) -> str:
+        """Why the effect may stand in for something else, in words; empty where nothing speaks for that."""
+        alike = " or ".join(f"{effect} at {port}" for effect, port in self.equivalent)
+        reasons = [f"these recordings cannot distinguish it from {alike}"] if alike else []
+        return "; ".join([*reasons, *self.doubts])
 
     @property
     def status(self) -> str:

@@ -18,7 +18,7 @@ from rotflex_jax.discover.evaluation import (
     own_estimates,
     process_noise_gain,
 )
-from rotflex_jax.discover.horizon import Horizon, Horizons, as_prediction, fit_free_runs
+from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_prediction, fit_free_runs
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -50,7 +50,6 @@ from rotflex_jax.discover.stepwise import (
     nested_models,
     refit_candidates,
     remaining_rivals,
-    titled,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, build, scales
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
@@ -173,7 +172,7 @@ class SearchState:
         return self.horizons.prediction.validation
 
     @property
-    def reported(self) -> Horizon:
+    def reported(self) -> SearchHorizon:
         """The horizon whose parameters a user gets: that of predictions, unless free runs are clearly better.
 
         Where the model is complete both give the same within their scatter, and predictions have the narrower
@@ -184,7 +183,7 @@ class SearchState:
             return self.horizons.prediction
         return self.horizons.free_run
 
-    def at(self, horizon: Horizon, found: ValidatedHypothesis) -> ValidatedHypothesis:
+    def at(self, horizon: SearchHorizon, found: ValidatedHypothesis) -> ValidatedHypothesis:
         """A validated structure with the parameters of one horizon."""
         return found.free_run if horizon is self.horizons.free_run and found.free_run else found
 
@@ -470,10 +469,10 @@ def _rounds(
             parameters=own_estimates(stage, location),
             stage=stage,
             score=state.scores.get(location, state.worth.get(location, 0.0)),
-            held_out_gain_nats=stage.log_likelihood - before.log_likelihood,
+            held_out_gain_nats=_gain_of_predictions(state, location, stage, before),
             sentence=mechanism.sentence(mechanism.effect(*location)),
             equation=mechanism.effect(*location).equation,
-            doubt=_doubt(state, location, stages[-1], others),
+            doubts=_doubts(state, location, stages[-1], others),
             prediction=state.gains.get(location, (None, None))[0],
             free_run=state.gains.get(location, (None, None))[1],
         )
@@ -481,18 +480,22 @@ def _rounds(
     )
 
 
-def _doubt(
+def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: Stage, before: Stage) -> float:
+    """Log-likelihood of predictions that an effect gains on validation data [nat]; NaN if unknown."""
+    if stage.horizon == "prediction":
+        return stage.log_likelihood - before.log_likelihood
+    return state.gains[location][0].gain if location in state.gains else float("nan")
+
+
+def _doubts(
     state: SearchState, location: EffectLocation, final: Stage, others: Sequence[Sequence[Estimate]]
-) -> str:
-    """Why an effect may stand in for something else, in words; empty where nothing speaks for that."""
+) -> tuple[str, ...]:
+    """Why an effect that is distinguished from others may still stand in for something else, in words."""
     reasons = []
-    if rivals := state.rivals.get(location):
-        reasons.append("these recordings do not distinguish it from " + " or ".join(map(titled, rivals)))
     prediction, runs = state.gains.get(location, (None, None))
     if prediction is not None and not helps(prediction):
         reasons.append("predictions on validation data are no better with it")
     if runs is not None and not helps(runs):
         reasons.append("free runs over validation data are no better with it")
     differ = [d for other in others if (d := disagreement(final.estimates, other, location))]
-    reasons += differ[:1]
-    return "; ".join(reasons)
+    return (*reasons, *differ[:1])

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from enum import StrEnum
 
-from rotflex_jax.discover.result import NEAR_FLOOR, Ranked, SearchResult, Stage
+from rotflex_jax.discover.result import NEAR_FLOOR, Ranked, Round, RunErrors, SearchResult, Stage
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.text.numbers import plain_number, ratio, readable, unit_text, value_and_interval
 
@@ -45,17 +45,66 @@ def stage_labels(discovery: SearchResult) -> tuple[str, ...]:
     return ("baseline", *added)
 
 
-def error_rows(discovery: SearchResult) -> tuple[ErrorRow, ...]:
-    """Held-out errors of every stage."""
-    by_channel = channel_units(discovery)
+@dataclasses.dataclass(frozen=True)
+class ErrorTable:
+    """Errors of every stage on some recordings.
+
+    Attributes:
+        title: Which recordings, and with which offsets.
+        note: What say they had.
+        rows: One for each stage.
+    """
+
+    title: str
+    note: str
+    rows: tuple[ErrorRow, ...]
+
+
+def error_lists(discovery: SearchResult) -> list[tuple[str, str, list[RunErrors]]]:
+    """Errors of every stage on validation and on test data, with and without own offsets.
+
+    Returns:
+        Which recordings, what say they had, and the errors; what there is.
+    """
+    stages = discovery.stages
+    own = f", each recording with the offsets of its own first {stages[0].calibrate_seconds:g} s"
+    chose, no_say = "These recordings chose the model.", "No choice rests on these recordings."
+    if not discovery.test:
+        chose += " Recordings that had no say (test=) would show its error without favour."
+    listed = [
+        ("Validation data", chose, [RunErrors(s.held_out_rmse, s.held_out_rmse_windows) for s in stages]),
+        ("Validation data" + own, chose, [s.calibrated for s in stages]),
+        ("Test data", no_say, [s.test for s in stages]),
+        ("Test data" + own, no_say, [s.test_calibrated for s in stages]),
+    ]
+    known = [(title, note, [e for e in errors if e is not None]) for title, note, errors in listed]
+    return [(title, note, errors) for title, note, errors in known if errors]
+
+
+def error_tables(discovery: SearchResult) -> tuple[ErrorTable, ...]:
+    """The same as tables for people."""
+    by_channel, labels = channel_units(discovery), stage_labels(discovery)
 
     def cells(errors: dict[str, float]) -> tuple[ErrorCell, ...]:
         return tuple(_cell(errors[c], unit, discovery.noise_floor.get(c)) for c, unit in by_channel.items())
 
-    return tuple(
-        ErrorRow(label, cells(s.held_out_rmse_windows), cells(s.held_out_rmse))
-        for label, s in zip(stage_labels(discovery), discovery.stages, strict=True)
-    )
+    def rows(errors: list[RunErrors]) -> tuple[ErrorRow, ...]:
+        pairs = zip(labels, errors, strict=True)
+        return tuple(ErrorRow(label, cells(e.windows), cells(e.whole)) for label, e in pairs)
+
+    return tuple(ErrorTable(title, note, rows(errors)) for title, note, errors in error_lists(discovery))
+
+
+def error_rows(discovery: SearchResult) -> tuple[ErrorRow, ...]:
+    """Errors of every stage on validation data."""
+    return error_tables(discovery)[0].rows
+
+
+def status_sentence(added: Round) -> str:
+    """Whether an effect is established, and if not, why, as a sentence."""
+    if not added.doubt:
+        return "Established: it helps predictions and free runs, and its size is the same in all recordings."
+    return f"Provisional, it may stand in for something else: {added.doubt}."
 
 
 def _cell(value: float, unit: str, floor: float | None) -> ErrorCell:

@@ -14,13 +14,13 @@ from rotflex_jax.discover.tables import (
     Outcome,
     channel_headings,
     channel_units,
-    error_rows,
+    error_tables,
     next_steps,
-    noise_ratios,
     noise_row,
     outcomes,
     parameter_rows,
     stage_labels,
+    status_sentence,
 )
 from rotflex_jax.effects.labels import effect_label, effect_title, sentence
 from rotflex_jax.latent import LatentTorque
@@ -28,7 +28,7 @@ from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.text.colours import stage_colours
-from rotflex_jax.text.numbers import equation, plain_number, readable, together, value_and_interval
+from rotflex_jax.text.numbers import equation, plain_number, ratio, readable, together, value_and_interval
 from rotflex_jax.text.plotting import by_section
 from rotflex_jax.text.templates import as_json, fill_template, write_files
 
@@ -49,7 +49,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "notes": discovery.notes,
         "steps": next_steps(discovery),
         "stages": list(zip(labels, colours, strict=True)),
-        "errors": error_rows(discovery),
+        "error_tables": error_tables(discovery),
         "headings": channel_headings(discovery),
         "noise": noise_row(discovery),
         "at_noise": f"{NEAR_FLOOR:g}",
@@ -70,16 +70,20 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
 
 
 def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
-    """The error of each channel before and after, large."""
-    tiles, multiples = [], noise_ratios(discovery)
+    """The error of each channel before and after, large: on data that had no say, where there are any."""
+    tiles, data = [], "test" if discovery.test else "validation"
+    first, last = (
+        s.test.windows if s.test else s.held_out_rmse_windows for s in (discovery.baseline, discovery.final)
+    )
     for channel, unit in channel_units(discovery).items():
-        before, read = readable(discovery.baseline.held_out_rmse_windows[channel], unit)
-        after, _ = readable(discovery.final.held_out_rmse_windows[channel], unit)
-        times = multiples[channel]
-        text = f"{plain_number(times, 2)} × the sensor noise" if times == times else "held-out error"
+        before, read = readable(first[channel], unit)
+        after, _ = readable(last[channel], unit)
+        times = ratio(last[channel], discovery.noise_floor.get(channel))
+        text = f"{plain_number(times, 2)} × the sensor noise" if times == times else f"error on {data} data"
         tiles.append(
             {
                 "channel": channel,
+                "data": data,
                 "before": plain_number(before) if discovery.rounds else "",
                 "after": f"{plain_number(after)} {read}",
                 "note": text,
@@ -107,6 +111,8 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         ],
         "equivalent": " or ".join(effect_label(*pair) for pair in added.equivalent),
         "gain": plain_number(added.held_out_gain_nats),
+        "status": added.status,
+        "status_sentence": status_sentence(added),
         "score": plain_number(added.score),
         "falls": ", ".join(falls),
     }
@@ -143,7 +149,10 @@ def _ranked(r: Ranked, outcome: Outcome) -> dict[str, str]:
 
 
 def _recordings(discovery: SearchResult) -> list[dict[str, Any]]:
-    parts = [("fitted", r) for r in discovery.train] + [("held out", r) for r in discovery.validation]
+    alone = discovery.validation != discovery.train
+    parts = [("fitted" if alone else "fitted, and validated by fits without it", r) for r in discovery.train]
+    parts += [("validation", r) for r in discovery.validation] if alone else []
+    parts += [("test", r) for r in discovery.test]
     return [
         {
             "use": use,
