@@ -2,20 +2,32 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_problem as sp
 
+import rotflex_jax.effects as fx
 from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.evaluation import calibrate
 from rotflex_jax.discover.horizon import Horizons, as_free_run, fit_free_runs
+from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.score_test import scores
+from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
+from rotflex_jax.discover.supermodel import build, scales
 from rotflex_jax.discover.validation import validate
 from rotflex_jax.discover.windows import Windows
 from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.sensitivities import (
+    RecordingSamples,
+    RunParameters,
+    TangentDirections,
+    outputs_with_sensitivities,
+)
 from rotflex_jax.mechanism.simulate import simulate
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
+from rotflex_jax.runtime.xla import double_precision
 
 SECONDS = 0.6
 
@@ -77,6 +89,55 @@ def test_the_score_of_free_runs_foretells_what_a_fit_gains(horizons):
     h = fit_free_runs(problem, sp.fitted(horizons.prediction.problem))
     found = {x.location: x for x in scores(problem, h)}[sp.HUB]
     assert found.nats > 50 and found.start.values[0] == pytest.approx(0.02, rel=0.5)
+
+
+def test_sensors_with_states_of_their_own_start_again_too():
+    """A late channel with cross-talk in windows, free and as a predictor without gain: values and slopes."""
+    machine = sp.baseline() + fx.ChannelDelay("alpha", time=0.004) + fx.CrossTalk("alpha", share=0.02)
+    rng, Ts, N, (W, n), P = np.random.default_rng(3), 0.0025, 90, (3, 6), len(machine.values)
+    u, x0 = np.repeat(rng.uniform(-4, 4, N // 10), 10), rng.normal(0, 0.05, (W, n))
+    window = np.repeat(np.arange(W, dtype=np.int32), N // W)
+    name = machine.parameter_names.index("alpha.channel_delay.time")
+
+    def alone(values: np.ndarray) -> np.ndarray:
+        moved = machine.with_values(values)
+        return np.concatenate([simulate(moved, u[window == k], Ts, x0[k], sp.SOLVER) for k in range(W)])
+
+    values, nudge = machine.values, 1e-7 * (np.arange(P) == name)
+    expected, slope = alone(values), (alone(values + nudge) - alone(values - nudge)) / 2e-7
+    with double_precision():
+        gates = jnp.ones(len(machine.effects))
+        samples = RecordingSamples(*map(jnp.asarray, (u, np.zeros((N, 2)), np.ones(N), Ts, window)))
+        ways = TangentDirections(jnp.eye(P)[None, name], jnp.zeros((1, len(gates))), jnp.zeros((1, n)))
+        for K in (None, jnp.zeros((n, 2))):
+            numbers = RunParameters(jnp.asarray(values), gates, jnp.asarray(x0), K)
+            y, J = outputs_with_sensitivities(machine.structure, sp.SOLVER, numbers, ways, samples)
+            np.testing.assert_allclose(y, expected, rtol=0, atol=1e-11)
+            np.testing.assert_allclose(J[..., 0], slope, rtol=0, atol=1e-6 * np.abs(slope).max())
+
+
+def test_a_late_channel_is_seen_at_both_horizons():
+    """One sample late, taken from another row of the table; a candidate whose states begin at rest."""
+    made = [dataclasses.replace(r, y=late(r.y)) for r in sp.recordings(sp.records(0.0))]
+    data = sp.dataset(tuple(made))
+    wanted = [(fx.ChannelDelay, "alpha"), (fx.CrossTalk, "alpha"), *sp.WANTED]
+    s = build(sp.baseline(), wanted, scales(Model(sp.baseline()), made, data.torque_scale))
+    problem = LikelihoodProblem.of(s, sp.SOLVER, data, ("hub", "joint"))
+    both = Horizons.of(Model(sp.baseline()), problem, None, SECONDS)
+    h = fit_baseline(both.prediction.problem)
+    runs = fit_free_runs(both.free_run.problem, h)
+    for at, fitted in ((both.prediction.problem, h), (both.free_run.problem, runs)):
+        best, second, *_ = scores(at, fitted)
+        assert best.location == ("channel_delay", "alpha") and best.nats > 100 > second.nats
+        grown = refit_candidates(at, fitted, [best.start])[0]
+        assert grown.log_likelihood - fitted.log_likelihood > 0.9 * best.start.expected_gain
+        time = grown.mean_values(s)[s.parameter_indices(best.location)]
+        np.testing.assert_allclose(time, 1 / 400, rtol=0.05)
+
+
+def late(y: np.ndarray) -> np.ndarray:
+    """The second channel one sample later."""
+    return np.column_stack([y[:, 0], np.concatenate([y[:1, 1], y[:-1, 1]])])
 
 
 def test_a_recording_that_is_left_out_has_no_say(horizons):
