@@ -515,6 +515,7 @@ LADEN = {
         fx.ChannelDelay("theta", time=0.003),
         fx.ChannelDelay("alpha", time=0.005),
         fx.LoadFriction("hub", level=0.02, driving=0.2, driven=0.5),
+        fx.PositionServo("hub", gain=60.0, limit=0.2),
     ],
     "dry": [
         fx.CoulombAsymmetric("hub", 0.03, 0.02),
