@@ -131,6 +131,8 @@ DETECTABLE_CHI2 = 40.0
 PROBES_PER_BATCH = 8
 # An effect with a threshold acts at its size: this share of it at most.
 MAX_THRESHOLD_AMPLITUDE = 1.5
+# A candidate whose scores of both horizons add up to less than this share of the best one's is not refitted.
+LEAST_SHARE = 0.25
 # Shapes beside the best one at which a refit may start.
 EXTRA_SHAPES = 2
 
@@ -337,7 +339,8 @@ def promising_at_both(prediction: list[Score], free_run: list[Score], most: int)
     for listed, best in zip(worth, highest, strict=True):
         for s in listed:
             share[s.location] = share.get(s.location, 0.0) + s.nats / best
-    order = sorted(share, key=lambda p: share[p], reverse=True)
+    enough = LEAST_SHARE * max(share.values(), default=0.0)
+    order = sorted((p for p in share if share[p] >= enough), key=lambda p: share[p], reverse=True)
     chosen = [*order[:most], *(listed[0].location for listed in worth if listed)]
     first, second = ({s.location: s for s in listed} for listed in both)
     return [(first[p], second[p]) for p in dict.fromkeys(chosen)]

@@ -1,0 +1,101 @@
+"""What a search reports of a model: which data had a say, and whether an effect is established."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from test_report import two_rounds
+
+from rotflex_jax.discover.evaluation import SAME_SIZE, disagreement
+from rotflex_jax.discover.hypothesis import CandidateStart
+from rotflex_jax.discover.result import HorizonGain, RunErrors
+from rotflex_jax.discover.score_test import LEAST_SHARE, Score, promising_at_both
+from rotflex_jax.discover.selection import HELD_OUT_Z, helps
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.parameters import Estimate, Specification
+
+HUB = EffectLocation("coulomb", "hub")
+
+
+def level(value: float, std: float) -> tuple[Estimate, ...]:
+    """The friction of a hub with its standard deviation."""
+    return (Estimate.of("hub.coulomb.level", value, std, Specification("N m", 0.02)),)
+
+
+def test_sizes_agree_within_their_intervals_or_nearly():
+    assert disagreement(level(0.020, 1e-4), level(0.035, 1e-4), HUB) is not None
+    assert disagreement(level(0.020, 6e-3), level(0.035, 6e-3), HUB) is None
+    near = 0.020 / (1 - 0.9 * SAME_SIZE)
+    assert disagreement(level(0.020, 1e-6), level(near, 1e-6), HUB) is None
+    # What one set does not determine says nothing against the other.
+    assert disagreement(level(0.020, 1e-4), level(0.035, np.nan), HUB) is None
+    assert disagreement(level(0.020, 1e-4), (), HUB) is None
+    said = disagreement(level(0.018, 1e-4), level(0.035, 1e-4), HUB)
+    assert said and "0.018 N m" in said and "0.035 N m" in said
+
+
+def test_a_gain_counts_by_its_scatter():
+    assert helps(HorizonGain(10.0, HELD_OUT_Z + 0.1, 1.0))
+    assert not helps(HorizonGain(1e4, HELD_OUT_Z - 0.1, 0.5)) and not helps(HorizonGain(-1.0, 5.0, 1.0))
+
+
+def score(name: str, nats: float) -> Score:
+    start = CandidateStart(EffectLocation(name, "hub"), np.array([1.0]), expected_gain=nats + 5)
+    return Score(start, nats, True, 1.0, 1.0)
+
+
+def ranked(prediction: dict[str, float], free_run: dict[str, float], most: int = 2) -> list[str]:
+    listed = (
+        [score(n, nats) for n, nats in sorted(d.items(), key=lambda i: -i[1])] for d in (prediction, free_run)
+    )
+    return [a.location.effect for a, _ in promising_at_both(*listed, most)]
+
+
+def test_both_rankings_propose():
+    """Shares of the best add up; the best of each is always refitted; what is far below both is not."""
+    prediction = {"gravity": 100.0, "coulomb": 80.0, "cogging": 70.0, "viscous": 5.0, "dahl": -3.0}
+    runs = {"gravity": 10.0, "coulomb": 900.0, "cogging": 100.0, "viscous": 20.0, "dahl": 1000.0}
+    assert ranked(prediction, runs) == ["coulomb", "gravity", "dahl"]  # 1.7, 1.01, and best in free runs
+    few = ranked(prediction, runs, most=5)
+    assert few[0] == "coulomb" and "viscous" not in few
+    assert LEAST_SHARE * 1.7 > 5 / 100 + 20 / 1000
+    assert ranked({"dahl": -1.0}, {"dahl": -2.0}) == []
+
+
+def test_errors_name_the_data_they_are_on():
+    """JSON keys of data that chose the model and of data without a say, with and without own offsets."""
+    stage = two_rounds().final
+    assert set(stage.errors()) == {"held_out_rmse", "held_out_rmse_windows"}
+    errors = [
+        RunErrors({"theta": k, "alpha": k}, {"theta": 10 * k, "alpha": 10 * k}) for k in (1.0, 2.0, 3.0)
+    ]
+    names = ("calibrated", "test", "test_calibrated")
+    found = dataclasses.replace(stage, **dict(zip(names, errors, strict=True))).errors()
+    assert found["held_out_rmse_calibrated"]["theta"] == 1.0
+    assert found["held_out_rmse_windows_calibrated"] == {
+        "seconds": stage.window_seconds,
+        "theta": 10.0,
+        "alpha": 10.0,
+    }
+    assert found["test_rmse"]["theta"] == 2.0 and found["test_rmse_windows"]["theta"] == 20.0
+    assert found["test_rmse_calibrated"]["theta"] == 3.0
+    assert found["test_rmse_windows_calibrated"]["theta"] == 30.0
+    json.dumps(found)
+
+
+def test_an_effect_with_a_rival_or_a_reason_is_provisional():
+    first = two_rounds().rounds[0]
+    alone = dataclasses.replace(first, equivalent=(), doubts=())
+    assert alone.status == alone.to_dict()["status"] == "established" and alone.doubt == ""
+    rival = dataclasses.replace(alone, equivalent=(("dahl", "hub"),))
+    assert rival.status == "provisional" and "dahl at hub" in rival.doubt
+    reason = dataclasses.replace(alone, doubts=("free runs are no better with it",))
+    assert reason.to_dict()["status"] == "provisional" and reason.to_dict()["doubt"] == reason.doubts[0]
+
+
+@pytest.mark.parametrize("field", ["prediction", "free_run"])
+def test_gains_at_both_horizons_are_in_the_evidence(field: str):
+    first = two_rounds().rounds[0]
+    gained = dataclasses.replace(first, **{field: HorizonGain(12.0, 3.0, 0.5)})
+    assert gained.to_dict()["evidence"][field] == {"gain": 12.0, "z": 3.0, "error_ratio": 0.5}
