@@ -15,7 +15,7 @@ from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state, wit
 from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem
 from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.result import RunErrors, Stage
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, adapted_to_recordings
 from rotflex_jax.discover.windows import Windows
 from rotflex_jax.effects import CATALOG
@@ -205,13 +205,34 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
     )
 
 
+def differing(
+    training: Sequence[Estimate], validation: Sequence[Estimate]
+) -> list[tuple[Estimate, Estimate]]:
+    """Parameters that are not the same in two sets of recordings.
+
+    They agree where their difference lies within two of its standard deviations, or where it is no more than
+    `SAME_SIZE` of the larger one: intervals of an incomplete model are too narrow.
+
+    Args:
+        training: Estimates from the training recordings.
+        validation: Estimates of the same model from the validation recordings.
+    """
+    found, other = [], {e.name: e for e in validation}
+    for a in training:
+        if a.name not in other or not a.free:
+            continue
+        b = other[a.name]
+        spread = np.nan_to_num(np.hypot(a.std, b.std), nan=np.inf)
+        difference = abs(a.value - b.value)
+        if difference > 2 * spread and difference > SAME_SIZE * max(abs(a.value), abs(b.value)):
+            found.append((a, b))
+    return found
+
+
 def disagreement(
     training: Sequence[Estimate], validation: Sequence[Estimate], location: EffectLocation
 ) -> str | None:
     """Which amplitude of an effect differs between recordings, in words; None where all agree.
-
-    Amplitudes fitted to two sets of recordings agree where their difference lies within the intervals, or
-    where it is no more than `SAME_SIZE` of the larger one.
 
     Args:
         training: Estimates from the training recordings.
@@ -219,19 +240,34 @@ def disagreement(
         location: The effect.
     """
     head = f"{location.port}.{location.effect}."
-    other = {e.name: e for e in validation}
-    for e in training:
-        short = e.name.removeprefix(head)
-        if not e.name.startswith(head) or short not in CATALOG[location.effect].amplitudes:
-            continue
-        if e.name not in other:
-            continue
-        a, b = e, other[e.name]
-        spread = np.nan_to_num(np.hypot(a.std, b.std), nan=np.inf)
-        difference = abs(a.value - b.value)
-        if difference > 2 * spread and difference > SAME_SIZE * max(abs(a.value), abs(b.value)):
-            return f"{short} is {a.value:.3g} {a.unit} here and {b.value:.3g} {b.unit} in the validation data"
+    for a, b in differing(training, validation):
+        name = a.name.removeprefix(head)
+        if a.name.startswith(head) and name in CATALOG[location.effect].amplitudes:
+            return f"{name} is {a.value:.3g} {a.unit} here and {b.value:.3g} {b.unit} in the validation data"
     return None
+
+
+def difference_notes(
+    s: SuperModel, final: Sequence[Estimate], others: Sequence[Sequence[Estimate]]
+) -> tuple[str, ...]:
+    """What of the machine differs between recordings beyond its intervals, in sentences.
+
+    Args:
+        s: Its calibrations belong to a recording and are left out.
+        final: Estimates from the training recordings.
+        others: Estimates from the validation recordings, together or one by one.
+    """
+    own = {s.mechanism.parameter_names[i] for i in s.local}
+    known = {e.name: e for e in final}
+    pairs = [(a.name, b) for other in others for a, b in differing(final, other) if a.name not in own]
+    out = []
+    for name in dict.fromkeys(name for name, _ in pairs):
+        e, elsewhere = known[name], [f"{b.value:.3g}" for n, b in pairs if n == name]
+        out.append(
+            f"{name} is {e.value:.3g} {e.unit} fitted to the training data and {' and '.join(elsewhere)} "
+            f"{e.unit} fitted to the validation data: more than the intervals allow."
+        )
+    return tuple(out)
 
 
 def own_estimates(stage: Stage, location: EffectLocation) -> dict[str, Estimate]:

@@ -12,6 +12,7 @@ from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.end_state import end_state
 from rotflex_jax.discover.evaluation import (
     Evaluation,
+    difference_notes,
     disagreement,
     estimates_of_validation,
     evaluate,
@@ -417,7 +418,8 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     seconds, noise = validation.window_seconds, problem.noise
     residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
     floor = dict(zip(channels, noise.tolist(), strict=True))
-    rounds = _rounds(state, stages, estimates_of_validation(reported, validated[-1]))
+    others = estimates_of_validation(reported, validated[-1])
+    rounds = _rounds(state, stages, others)
     listed = [s for s, _ in state.ranking]
     verdict, sentence = end_state(rounds, stages[-1], floor, listed, held_back)
     return Discovery(
@@ -435,7 +437,11 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         where=locate(longest, residual, channels, noise, model.mechanism, window_seconds=seconds),
         noise_floor=floor,
         elapsed_s=time.perf_counter() - started,
-        notes=(*calibration_notes(problem.supermodel, validated[-1], state.own), *state.notes),
+        notes=(
+            *calibration_notes(problem.supermodel, validated[-1], state.own),
+            *difference_notes(problem.supermodel, stages[-1].estimates, others),
+            *state.notes,
+        ),
     )
 
 
