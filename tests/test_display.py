@@ -70,7 +70,7 @@ def test_a_discovery_shows_verdict_rounds_errors_and_doubts() -> None:
     for expected in (
         "Found, but not distinguished from others",
         "coulomb at hub",
-        "not distinguished from stribeck at hub",
+        "cannot distinguish it from stribeck at hub",
         "τ = −stiffness · position³",
         "78 % of the theta error",
         "sensor noise",

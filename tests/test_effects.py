@@ -481,7 +481,9 @@ def test_candidates_cover_the_first_family():
     assert {(name, p) for name in ("dahl", "lugre") for p in ("hub", "joint")} <= pairs
     assert {("sensor_cubic", "alpha"), ("rectifier", "alpha"), ("cross_talk", "alpha")} <= pairs
     assert {("eccentric_encoder", "theta"), ("channel_delay", "theta"), ("channel_delay", "alpha")} <= pairs
-    assert {("voltage_drift", "input"), ("amplifier_saturation", "input")} <= pairs
+    assert ("voltage_drift", "input") in pairs
+    # What ties with a simpler effect on most recordings is tried on request only.
+    assert not {"load_friction", "amplifier_saturation", "elastic_backlash"} & {n for n, _ in pairs}
     assert ("heating", "arm") not in pairs and ("heating", "joint") not in pairs  # no motor there
     assert ("sensor_bias", "alpha") in pairs and ("sensor_bias", "theta") not in pairs
     assert not {"inertia", "spring", "motor"} & {n for n, _ in pairs}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_report import two_rounds
 
-from rotflex_jax.discover.evaluation import SAME_SIZE, disagreement
+from rotflex_jax.discover.evaluation import SAME_SIZE, PairedEstimates, disagreement
 from rotflex_jax.discover.hypothesis import CandidateStart
 from rotflex_jax.discover.result import HorizonGain, RunErrors
 from rotflex_jax.discover.score_test import LEAST_SHARE, Score, promising_at_both
@@ -23,16 +23,27 @@ def level(value: float, std: float) -> tuple[Estimate, ...]:
     return (Estimate.of("hub.coulomb.level", value, std, Specification("N m", 0.02)),)
 
 
+def compared(a: tuple[Estimate, ...], b: tuple[Estimate, ...]) -> str:
+    return disagreement([PairedEstimates(a, b, "the validation data")], HUB)
+
+
 def test_sizes_agree_within_their_intervals_or_nearly():
-    assert disagreement(level(0.020, 1e-4), level(0.035, 1e-4), HUB) is not None
-    assert disagreement(level(0.020, 6e-3), level(0.035, 6e-3), HUB) is None
+    assert "0.035 N m" in compared(level(0.020, 1e-4), level(0.035, 1e-4))
+    assert compared(level(0.020, 6e-3), level(0.035, 6e-3)) == ""
     near = 0.020 / (1 - 0.9 * SAME_SIZE)
-    assert disagreement(level(0.020, 1e-6), level(near, 1e-6), HUB) is None
-    # What one set does not determine says nothing against the other.
-    assert disagreement(level(0.020, 1e-4), level(0.035, np.nan), HUB) is None
-    assert disagreement(level(0.020, 1e-4), (), HUB) is None
-    said = disagreement(level(0.018, 1e-4), level(0.035, 1e-4), HUB)
-    assert said and "0.018 N m" in said and "0.035 N m" in said
+    assert compared(level(0.020, 1e-6), level(near, 1e-6)) == ""
+    # What one part does not determine is no agreement either.
+    for other in (level(0.035, np.nan), ()):
+        assert "not determine" in compared(level(0.020, 1e-4), other)
+
+
+def test_what_belongs_to_a_recording_need_not_agree():
+    location = EffectLocation("voltage_drift", "input")
+    a, b = (
+        (Estimate.of("input.voltage_drift.rate", rate, 1e-4, Specification("V/s", 0.01)),)
+        for rate in (0.01, 0.05)
+    )
+    assert disagreement([PairedEstimates(a, b, "recording 1")], location) == ""
 
 
 def test_a_gain_counts_by_its_scatter():

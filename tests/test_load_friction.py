@@ -11,7 +11,6 @@ import rotflex_jax.effects as fx
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper, single_inertia, xl330_pendulum
 from rotflex_jax.mechanism import Exponential, SmoothRK4, free_run, simulate, simulate_states
-from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.mechanism.step import load_rows, transmitted_torques
 from rotflex_jax.runtime.xla import double_precision
 
@@ -193,5 +192,3 @@ def test_a_fit_finds_both_shares():
 def test_it_needs_a_motor_and_an_inertia():
     with pytest.raises(InputError, match="at 'arm', but it needs a port with a motor and an inertia"):
         _ = paper() + fx.LoadFriction("arm")
-    places = {(cls.name, place) for cls, place in search_places(paper())}
-    assert {place for name, place in places if name == "load_friction"} == {"hub"}

@@ -37,8 +37,9 @@ class Discovery(SearchResult):
     """What a search found, with its report, the torques that are missing, and the next experiment."""
 
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
-        """Torques that the baseline and the final model lack, on a fitted and a held-out recording."""
-        longest = [max(group, key=lambda r: r.N) for group in (self.train, self.validation)]
+        """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
+        groups = (self.train, self.validation) if self.validation != self.train else (self.train,)
+        longest = [max(group, key=lambda r: r.N) for group in groups]
         return compare_latent_torques(self.baseline, self.final if self.rounds else None, longest, progress)
 
     def learned_torque(
@@ -117,9 +118,9 @@ class Discovery(SearchResult):
         floor = {heading[c]: f * self.noise_floor.get(c, 0.0) for c, (f, _) in scale.items()}
         rounds, parameters = [], []
         for k, added in enumerate(self.rounds, 1):
-            alike = ", ".join(effect_label(*pair) for pair in added.equivalent)
-            doubt = f"not distinguished from {alike}" if alike else ""
-            rounds.append((str(k), effect_label(added.effect, added.port), equation(added.equation), doubt))
+            rounds.append(
+                (str(k), effect_label(added.effect, added.port), equation(added.equation), added.doubt)
+            )
             parameters += [
                 (f"{added.port}.{added.effect}.{n}", unit_text(e.unit), *value_and_interval(e))
                 for n, e in added.parameters.items()

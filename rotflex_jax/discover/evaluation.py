@@ -1,11 +1,11 @@
 """Reported of fitted models: errors of free runs, with and without a run's own offsets, and estimates.
 
-No choice of the search rests on anything here.
+No choice of effects rests on anything here.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, adapted_to_recordings
 from rotflex_jax.discover.windows import Windows
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.errors import InputError
 from rotflex_jax.fit import inference
 from rotflex_jax.fit.dataset import padded_length, prepare
 from rotflex_jax.fit.inference import Combination, RecordingSlopes, curvature, sandwich
@@ -40,7 +41,8 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
     Offsets belong to a run, not to the machine: an amplifier's offset of 0.04 V moves a servo by degrees
     within seconds. Free runs over the first seconds determine them, together with the first state, while all
     else is as trained. Errors of a free run are alike for half a second or so: a block of that length counts
-    as one measurement against what offsets usually are.
+    as one measurement against what offsets usually are. The recordings share the size of their errors, and a
+    recording no longer than these seconds has nothing left to judge its offsets by.
 
     Args:
         problem: Free runs over recordings that the hypothesis was not fitted to.
@@ -57,14 +59,14 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
     )
     start = with_all_calibrations(s, start)
     early = problem.first_seconds(seconds)
-    samples = BLOCK_SECONDS / float(np.min(problem.dataset.data.Ts))
+    prior = BLOCK_SECONDS / np.asarray(problem.dataset.data.Ts)
     own = start
     # Errors that an offset makes are no measure of how well it is determined.
     for _ in range(CALIBRATIONS):
-        e = early.innovations([own])[0]
-        if not np.all(np.isfinite(e)):
+        own = early.evaluated(own, early.innovations([own])[0])
+        if not np.isfinite(own.log_likelihood):
             return start
-        own = adapted_to_recordings(early, early.evaluated(own, e), prior=samples)
+        own = adapted_to_recordings(early, own, prior)
     return own
 
 
@@ -229,45 +231,61 @@ def differing(
     return found
 
 
-def disagreement(
-    training: Sequence[Estimate], validation: Sequence[Estimate], location: EffectLocation
-) -> str | None:
-    """Which amplitude of an effect differs between recordings, in words; None where all agree.
+class PairedEstimates(NamedTuple):
+    """One model fitted twice, to recordings that have nothing in common.
+
+    Attributes:
+        training: Estimates from some recordings.
+        other: Estimates from others.
+        where: The others, in words.
+    """
+
+    training: Sequence[Estimate]
+    other: Sequence[Estimate]
+    where: str
+
+
+def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> str:
+    """Why the size of an effect is not known to be the same in all recordings, in words; empty if it is.
 
     Args:
-        training: Estimates from the training recordings.
-        validation: Estimates from the validation recordings.
-        location: The effect.
+        pairs: Fits to compare.
+        location: The effect; one that has a value for each recording is no property of the machine.
     """
-    head = f"{location.port}.{location.effect}."
-    for a, b in differing(training, validation):
-        name = a.name.removeprefix(head)
-        if a.name.startswith(head) and name in CATALOG[location.effect].amplitudes:
-            return f"{name} is {a.value:.3g} {a.unit} here and {b.value:.3g} {b.unit} in the validation data"
-    return None
+    head, kind = f"{location.port}.{location.effect}.", CATALOG[location.effect]
+    if kind.per_recording or not kind.amplitudes:
+        return ""
+    names = {head + n for n in kind.amplitudes}
+    for training, other, where in pairs:
+        for a, b in differing(training, other):
+            if a.name in names:
+                return (
+                    f"{a.name.removeprefix(head)} is {a.value:.3g} {a.unit} fitted to one part of the "
+                    f"recordings and {b.value:.3g} {b.unit} fitted to {where}"
+                )
+        if not any(e.name in names and np.isfinite(e.std) for e in other):
+            return f"{where} alone {'does' if where.startswith('recording') else 'do'} not determine its size"
+    return ""
 
 
-def difference_notes(
-    s: SuperModel, final: Sequence[Estimate], others: Sequence[Sequence[Estimate]]
-) -> tuple[str, ...]:
+def difference_notes(s: SuperModel, pairs: Sequence[PairedEstimates]) -> tuple[str, ...]:
     """What of the machine differs between recordings beyond its intervals, in sentences.
 
     Args:
-        s: Its calibrations belong to a recording and are left out.
-        final: Estimates from the training recordings.
-        others: Estimates from the validation recordings, together or one by one.
+        s: Its calibrations, and effects with a value for each recording, are left out.
+        pairs: Fits to compare.
     """
     own = {s.mechanism.parameter_names[i] for i in s.local}
-    known = {e.name: e for e in final}
-    pairs = [(a.name, b) for other in others for a, b in differing(final, other) if a.name not in own]
-    out = []
-    for name in dict.fromkeys(name for name, _ in pairs):
-        e, elsewhere = known[name], [f"{b.value:.3g}" for n, b in pairs if n == name]
-        out.append(
-            f"{name} is {e.value:.3g} {e.unit} fitted to the training data and {' and '.join(elsewhere)} "
-            f"{e.unit} fitted to the validation data: more than the intervals allow."
-        )
-    return tuple(out)
+    for effect in s.mechanism.effects:
+        if effect.per_recording:
+            own |= {n for n in s.mechanism.parameter_names if n.startswith(f"{effect.at}.{effect.name}.")}
+    return tuple(
+        f"{a.name} is {a.value:.3g} {a.unit} fitted to one part of the recordings and {b.value:.3g} {b.unit} "
+        f"fitted to {where}: more than the intervals allow."
+        for training, other, where in pairs
+        for a, b in differing(training, other)
+        if a.name not in own
+    )
 
 
 def own_estimates(stage: Stage, location: EffectLocation) -> dict[str, Estimate]:
@@ -294,7 +312,16 @@ class Evaluation:
     def of(
         cls, model: Model, horizons: Horizons, test: Sequence[Recording], calibrate_seconds: float
     ) -> "Evaluation":
-        """What the recordings of a search and further ones are evaluated with."""
+        """What the recordings of a search and further ones are evaluated with.
+
+        Raises:
+            InputError: A recording without a channel of the model or against its signs, or a negative time.
+        """
+        if calibrate_seconds < 0:
+            raise InputError(
+                f"calibrate_seconds was given {calibrate_seconds:g}, but it is how much of a recording its "
+                "own offsets may be fitted to; give a time in seconds, or 0 for none."
+            )
         validation, other = horizons.free_run.validation, None
         if test:
             check_signs(model, test)
@@ -337,19 +364,23 @@ class Evaluation:
         return dataclasses.replace(stage, **found)
 
 
-def estimates_of_validation(
-    horizon: SearchHorizon, found: ValidatedHypothesis
-) -> tuple[tuple[Estimate, ...], ...]:
-    """The parameters of a model fitted to the validation recordings, from where training has left them.
+def paired_estimates(horizon: SearchHorizon, found: ValidatedHypothesis) -> tuple[PairedEstimates, ...]:
+    """The parameters of a model fitted to the training and, from there, to the validation recordings.
 
-    What agrees with the training recordings is a property of the machine; no choice rests on these fits.
-    Where runs validate each other, each is fitted alone.
+    What agrees is a property of the machine. Where runs validate each other, each is fitted alone and
+    compared with the fit to the others. No choice of effects rests on these fits.
     """
-    sets = [f.validation for f in horizon.validation.folds] or [horizon.validation]
-    starts = [found.hypothesis] * len(sets) if horizon.validation.folds else [found.adapted]
+    folds = horizon.validation.folds
+    if folds:
+        sets = [(f.train, h, f.validation.problem, h) for f, h in zip(folds, found.folds, strict=True)]
+        names = [f"recording {k + 1}" for k in range(len(sets))]
+    else:
+        sets = [(horizon.problem, found.hypothesis, horizon.validation.problem, found.adapted)]
+        names = ["the validation data"]
     out = []
-    for problem, h in zip((v.problem for v in sets), starts, strict=True):
-        start = problem.evaluated(h, problem.innovations([h])[0])
-        if np.isfinite(start.log_likelihood):
-            out.append(estimates(problem, refit(problem, [start], alternations=1)[0]))
+    for (problem, trained, other, start), where in zip(sets, names, strict=True):
+        begun = other.evaluated(start, other.innovations([start])[0])
+        fitted = refit(other, [begun], alternations=1)[0] if np.isfinite(begun.log_likelihood) else None
+        own = estimates(other, fitted) if fitted else ()
+        out.append(PairedEstimates(estimates(problem, trained), own, where))
     return tuple(out)

@@ -194,6 +194,11 @@ def learn_torque(
     model, say = model if isinstance(model, Model) else Model(model), progress or (lambda _: None)
     trained = (train,) if isinstance(train, Recording) else tuple(train)
     held_back = (test,) if isinstance(test, Recording) else tuple(test)
+    if any(a is b for a in trained for b in held_back):
+        raise InputError(
+            "The same recording was given to fit and to validate, but a map is kept only where data that no "
+            "fit has seen become likelier; give other recordings, or the two parts of recording.split(0.7)."
+        )
     position, speed = _motion(model, trained, at)
     dataset = prepare(model, trained, noise_of=held_back)
     torque = dataset.torque_scale

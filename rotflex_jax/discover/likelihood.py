@@ -24,6 +24,10 @@ from rotflex_jax.mechanism.assembly import Layout
 
 # Hypotheses are compared block by block, so that the scatter shows what is chance.
 BLOCK_SECONDS = 0.5
+# What a block says for a model that diverges: finite, so that it can be compared.
+DIVERGED = -1e9
+# Errors beyond so many times the noise of a sensor are those of a run that diverges.
+LARGEST_ERROR = 1e6
 # Least and largest process torque, as shares of the intensity that a torque as large as the motor's, drawn
 # again at each sample, would have.
 MIN_PROCESS_NOISE_SHARE, MAX_PROCESS_NOISE_SHARE = 1e-9, 1e-3
@@ -171,7 +175,7 @@ class LikelihoodProblem:
 
         Minus infinity where a run diverges.
         """
-        if not np.all(np.isfinite(e)):
+        if self._diverges(e):
             return -np.inf
         return float(np.sum(self.whitener(e).log_densities(e, self.seen)))
 
@@ -181,13 +185,18 @@ class LikelihoodProblem:
 
     def evaluated(self, h: Hypothesis, e: Float[np.ndarray, "R N C"]) -> Hypothesis:
         """The hypothesis with the whitener and the likelihood that its innovations give."""
-        if not np.all(np.isfinite(e)):
+        if self._diverges(e):
             scale = Whitener(np.ones((len(self.noise), 1)), np.diag(1 / self.noise))
-            return dataclasses.replace(h, whitener=scale, densities=np.array(-np.inf))
+            blocks = np.full_like(in_blocks(self.seen, self.dataset.data), DIVERGED)
+            return dataclasses.replace(h, whitener=scale, densities=np.array(-np.inf), blocks=blocks)
         whitener = self.whitener(e)
         densities = whitener.log_densities(e, self.seen)
         blocks = self._error_blocks(e) if self.free_run else in_blocks(densities, self.dataset.data)
         return dataclasses.replace(h, whitener=whitener, densities=densities, blocks=blocks)
+
+    def _diverges(self, e: np.ndarray) -> bool:
+        """Whether a run is not finite, or so far off that its covariance has no inverse any more."""
+        return not np.all(np.isfinite(e)) or bool(np.any(np.abs(e) > LARGEST_ERROR * self.noise))
 
     def _error_blocks(self, e: np.ndarray) -> np.ndarray:
         """Minus the logarithm of the error of each block, mean over channels.

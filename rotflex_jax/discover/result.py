@@ -162,6 +162,7 @@ class Round:
             },
             "status": self.status,
             "doubt": self.doubt,
+            "parameters_fitted_to": self.stage.horizon,
             "sentence": self.sentence,
             "equation": self.equation,
         }

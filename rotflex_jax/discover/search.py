@@ -12,11 +12,12 @@ from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.end_state import end_state
 from rotflex_jax.discover.evaluation import (
     Evaluation,
+    PairedEstimates,
     difference_notes,
     disagreement,
-    estimates_of_validation,
     evaluate,
     own_estimates,
+    paired_estimates,
     process_noise_gain,
 )
 from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_prediction, fit_free_runs
@@ -61,7 +62,6 @@ from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 from rotflex_jax.runtime.xla import one_thread
@@ -120,7 +120,7 @@ def milestone(
 
 Progress = Callable[[str], None]
 
-# Candidates that are refitted in a round, and rounds at most.
+# Candidates of both rankings together that are refitted in a round, the best of each beside them, and rounds.
 REFITTED, ROUNDS = 4, 4
 
 
@@ -201,9 +201,9 @@ class SearchState:
 def discover(
     mechanism: Mechanism | Model,
     train: Recording | Sequence[Recording],
-    validation: Recording | Sequence[Recording] = (),
+    validation: Recording | Sequence[Recording] | None = None,
     *,
-    test: Recording | Sequence[Recording] = (),
+    test: Recording | Sequence[Recording] | None = None,
     candidates: Iterable[tuple[type[Effect], str]] | None = None,
     rounds: int = ROUNDS,
     window_seconds: float = 2.0,
@@ -221,9 +221,11 @@ def discover(
     Args:
         mechanism: The user's model; its parameter values are the start.
         train: Recordings to fit.
-        validation: Recordings that no fit sees and that decide between models; at most their own first state
-            and offsets are adapted when likelihoods are compared, and only the first `n_init` samples for the
-            errors reported. Without any, every training recording validates what was fitted to the others.
+        validation: Recordings that decide between models, none of which is fitted to them; at most their own
+            first state and offsets are adapted when likelihoods are compared, and only the first `n_init`
+            samples for the errors reported. They also help to estimate the noise of the sensors, and the
+            model that was chosen is fitted to them once, to see whether its parameters are the same there.
+            Without any, every training recording validates what was fitted to the others.
         test: Recordings that have no say in anything; the errors on them are reported beside.
         candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
             answer to those of the flexible joint (`mechanism.roles`).
@@ -243,6 +245,7 @@ def discover(
     clear_compilation_caches()
     model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
     horizons = _prepare(model, _several(train), _several(validation), candidates, window_seconds)
+    evaluation = Evaluation.of(model, horizons, _several(test), calibrate_seconds)
     say("fitting the model as it is")
     state = _fit_as_it_is(model, horizons, say)
     for number in range(rounds):
@@ -258,11 +261,12 @@ def discover(
     say("checking that each effect is needed")
     _simplify(state)
     say("simulating the validation recordings")
-    evaluation = Evaluation.of(model, horizons, _several(test), calibrate_seconds)
     return with_proposal(_report(state, evaluation, started))
 
 
-def _several(recordings: Recording | Sequence[Recording]) -> tuple[Recording, ...]:
+def _several(recordings: Recording | Sequence[Recording] | None) -> tuple[Recording, ...]:
+    if recordings is None:
+        return ()
     return (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
 
 
@@ -418,8 +422,8 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     seconds, noise = validation.window_seconds, problem.noise
     residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
     floor = dict(zip(channels, noise.tolist(), strict=True))
-    others = estimates_of_validation(reported, validated[-1])
-    rounds = _rounds(state, stages, others)
+    pairs = paired_estimates(reported, validated[-1])
+    rounds = _rounds(state, stages, pairs)
     listed = [s for s, _ in state.ranking]
     verdict, sentence = end_state(rounds, stages[-1], floor, listed, held_back)
     return Discovery(
@@ -439,7 +443,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         elapsed_s=time.perf_counter() - started,
         notes=(
             *calibration_notes(problem.supermodel, validated[-1], state.own),
-            *difference_notes(problem.supermodel, stages[-1].estimates, others),
+            *difference_notes(problem.supermodel, pairs),
             *state.notes,
         ),
     )
@@ -457,14 +461,14 @@ def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stag
 
 
 def _rounds(
-    state: SearchState, stages: Sequence[Stage], others: Sequence[Sequence[Estimate]]
+    state: SearchState, stages: Sequence[Stage], pairs: Sequence[PairedEstimates]
 ) -> tuple[Round, ...]:
     """What was added, in order, each effect with the stage that it led to.
 
     Args:
         state: What was found.
         stages: Models, each with one effect more.
-        others: The parameters of the last one fitted to the validation recordings, together or one by one.
+        pairs: The last one fitted to different recordings.
     """
     mechanism = stages[-1].model.mechanism
     return tuple(
@@ -478,7 +482,7 @@ def _rounds(
             held_out_gain_nats=_gain_of_predictions(state, location, stage, before),
             sentence=mechanism.sentence(mechanism.effect(*location)),
             equation=mechanism.effect(*location).equation,
-            doubts=_doubts(state, location, stages[-1], others),
+            doubts=_doubts(state, location, pairs),
             prediction=state.gains.get(location, (None, None))[0],
             free_run=state.gains.get(location, (None, None))[1],
         )
@@ -494,14 +498,16 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
 
 
 def _doubts(
-    state: SearchState, location: EffectLocation, final: Stage, others: Sequence[Sequence[Estimate]]
+    state: SearchState, location: EffectLocation, pairs: Sequence[PairedEstimates]
 ) -> tuple[str, ...]:
     """Why an effect that is distinguished from others may still stand in for something else, in words."""
+    if location not in state.gains:  # a calibration, which has shown by other means that the machine has it
+        return ()
     reasons = []
-    prediction, runs = state.gains.get(location, (None, None))
-    if prediction is not None and not helps(prediction):
+    prediction, runs = state.gains[location]
+    if not helps(prediction):
         reasons.append("predictions on validation data are no better with it")
     if runs is not None and not helps(runs):
         reasons.append("free runs over validation data are no better with it")
-    differ = [d for other in others if (d := disagreement(final.estimates, other, location))]
-    return (*reasons, *differ[:1])
+    differs = disagreement(pairs, location)
+    return (*reasons, differs) if differs else tuple(reasons)

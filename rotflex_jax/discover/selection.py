@@ -201,7 +201,9 @@ def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bo
     """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
     if float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART:
         return True
-    a, b = (np.concatenate([t.blocks, t.hypothesis.blocks]) for t in (winner, rival))
+    # Where runs validate each other, the blocks of training are the same samples once more.
+    both = [(t.blocks,) if t.folds else (t.blocks, t.hypothesis.blocks) for t in (winner, rival)]
+    a, b = (np.concatenate(blocks) for blocks in both)
     return paired_gain(a, b)[1] >= SEPARATE_Z
 
 

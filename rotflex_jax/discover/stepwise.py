@@ -1,7 +1,6 @@
 """The stepwise search: fit the baseline, add, remove, swap and merge effects, assign calibrations."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -152,7 +151,7 @@ def eliminate(
         The model with what is needed at both horizons, and what each effect that was tested gains [nat].
     """
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
-    s, runs_need = problem.supermodel, functools.cache(lambda p: _needed_in_free_runs(runs_problem, runs, p))
+    s = problem.supermodel
     while tested := [p for p in h.locations if p not in added[-1:]]:
         rivals = refit(problem, [without(s, h, p) for p in tested], alternations=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
@@ -165,19 +164,18 @@ def eliminate(
             # An effect that gains in a few moments of the recording only is not needed.
             if paired_gain(h.blocks, r.blocks)[1] < TRAIN_Z:
                 surplus[p] = min(surplus[p], -1.0)
-        needless = [p for p in tested if surplus[p] < 0 and not (p in added and runs_need(p))]
-        if not needless:
+        needless = sorted((p for p in tested if surplus[p] < 0), key=lambda p: surplus[p])
+        drop = next((p for p in needless if p not in added or not _need(runs_problem, runs, p)), None)
+        if drop is None:
             break
-        h = rivals[tested.index(min(needless, key=lambda p: surplus[p]))]
+        h = rivals[tested.index(drop)]
+        runs = refit(runs_problem, [without(s, runs, drop)])[0]
     else:
         worth = {}
-    dropped = set(runs.locations) - set(h.locations)
-    for p in dropped:
-        runs = without(s, runs, p)
-    return h, refit(runs_problem, [runs])[0] if dropped else runs, worth
+    return h, runs, worth
 
 
-def _needed_in_free_runs(problem: LikelihoodProblem, runs: Hypothesis, location: EffectLocation) -> bool:
+def _need(problem: LikelihoodProblem, runs: Hypothesis, location: EffectLocation) -> bool:
     """Whether free runs over the training recordings are clearly worse without an effect."""
     less = refit(problem, [without(problem.supermodel, runs, location)], alternations=1)[0]
     gain, z = paired_gain(runs.blocks, less.blocks)

@@ -102,8 +102,10 @@ def error_rows(discovery: SearchResult) -> tuple[ErrorRow, ...]:
 
 def status_sentence(added: Round) -> str:
     """Whether an effect is established, and if not, why, as a sentence."""
+    if not added.doubt and added.prediction is None:
+        return "Established: training data ask for it, and validation runs are better with its trained value."
     if not added.doubt:
-        return "Established: it helps predictions and free runs, and its size is the same in all recordings."
+        return "Established: it helps predictions and free runs, and no recording disagrees about its size."
     return f"Provisional, it may stand in for something else: {added.doubt}."
 
 

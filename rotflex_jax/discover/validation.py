@@ -9,15 +9,13 @@ from jaxtyping import Float
 
 from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
-from rotflex_jax.discover.likelihood import LikelihoodProblem, in_blocks
+from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_blocks
 from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
 
-# What a block says for a model that diverges: finite, so that it can be compared.
-DIVERGED = -1e9
 # Of the fit of first states and calibrations. Most steps are nearly linear, so the damping is small from the
 # start, but not nothing: recordings need not determine every state.
 ADAPTATION_RULES = Rules(enough=0.05, damping=1e-6, least=1e-6, increase=30)
@@ -52,7 +50,7 @@ class ValidatedHypothesis:
     def with_trained_calibrations(self) -> Hypothesis:
         """The hypothesis on the validation recordings with calibrations as trained, not as adapted."""
         if self.folds:
-            trained = [np.delete(h.local_z, k, axis=0).mean(axis=0) for k, h in enumerate(self.folds)]
+            trained = [h.local_z[k] for k, h in enumerate(self.folds)]
             local_z = self.adapted.local_z.copy()
             local_z[:, len(self.hypothesis.free) :] = trained
         else:
@@ -140,7 +138,11 @@ def _cross_validated(
     fits, found = [], []
     for fold in validation.folds:
         start = fold.train.evaluated(h, fold.train.innovations([h])[0])
-        fits.append(refit(fold.train, [start], alternations=1)[0])
+        fitted = refit(fold.train, [start], alternations=1)[0]
+        # What belongs to the run that is left out is not known to this fit.
+        k, own = len(fits), fitted.local_z.copy()
+        own[k] = np.delete(own, k, axis=0).mean(axis=0)
+        fits.append(dataclasses.replace(fitted, local_z=own))
         found.append(validate(fold.validation, fits[-1], near))
     own = np.array([v.adapted.local_z[k] for k, v in enumerate(found)])
     local_z = np.hstack([np.array([f.z[list(h.free)] for f in fits]), own])
@@ -206,7 +208,9 @@ def validate(
     return ValidatedHypothesis(h, blocks, current, validation.short_run_errors(current, h.locations))
 
 
-def adapted_to_recordings(problem: LikelihoodProblem, h: Hypothesis, prior: float = 0.0) -> Hypothesis:
+def adapted_to_recordings(
+    problem: LikelihoodProblem, h: Hypothesis, prior: Float[np.ndarray, " R"] | None = None
+) -> Hypothesis:
     """The hypothesis with what belongs to each recording alone fitted to it.
 
     The recordings are independent problems, which share each run.
@@ -214,17 +218,16 @@ def adapted_to_recordings(problem: LikelihoodProblem, h: Hypothesis, prior: floa
     Args:
         problem: The recordings.
         h: Where the fit starts.
-        prior: Weight of the squared unconstrained values of local parameters, which are in units of their
-            usual size.
+        prior: For each recording the weight of the squared unconstrained values of its local parameters,
+            which are in units of their usual size; zero if None.
     """
     seen, nudge = problem.seen, 1e-6
+    weight = np.zeros(len(h.x0)) if prior is None else prior
     coordinates = FitCoordinates(0, len(h.local), h.x0.shape[-1], problem.windows)
     own = [coordinates.of_recording(r) for r in range(len(h.x0))]
 
-    def penalty(here: Hypothesis, recording: int) -> np.ndarray:
-        values = np.zeros(len(own[recording]))
-        values[: len(h.local)] = here.local_z[recording]
-        return values
+    def cost(w: np.ndarray, here: Hypothesis, r: int) -> float:
+        return 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r] ** 2))
 
     def joined(points: list[_OwnStep]) -> Hypothesis:
         step = np.zeros(coordinates.size)
@@ -239,20 +242,18 @@ def adapted_to_recordings(problem: LikelihoodProblem, h: Hypothesis, prior: floa
         H, g = coordinates.sums(w, slopes)
         equations = []
         for p in points:
-            row, values = own[p.recording], penalty(here, p.recording)
-            cost = 0.5 * float(np.sum(w[p.recording] ** 2)) + 0.5 * prior * float(values @ values)
-            curvature = H[np.ix_(row, row)] + prior * np.diag(np.arange(len(row)) < len(h.local))
-            equations.append(NormalEquations(np.array([cost]), g[row] + prior * values, curvature))
+            r, row = p.recording, own[p.recording]
+            gradient, curvature = g[row], H[np.ix_(row, row)]
+            each = np.arange(len(h.local))
+            gradient[each] += weight[r] * here.local_z[r]
+            curvature[each, each] += weight[r]
+            equations.append(NormalEquations(np.array([cost(w, here, r)]), gradient, curvature))
         return equations
 
     def costs(points: list[_OwnStep]) -> list[float]:
         here = joined(points)
         w = h.whitener(problem.innovations([here])[0], seen)
-        values = [penalty(here, p.recording) for p in points]
-        return [
-            0.5 * float(np.sum(w[p.recording] ** 2)) + 0.5 * prior * float(v @ v)
-            for p, v in zip(points, values, strict=True)
-        ]
+        return [cost(w, here, p.recording) for p in points]
 
     found = minimise_together(
         linearise,

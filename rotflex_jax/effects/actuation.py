@@ -116,7 +116,8 @@ class AmplifierSaturation(Actuation):
     name: ClassVar[str] = "amplifier_saturation"
     title: ClassVar[str] = "amplifier that saturates gradually"
     equation: ClassVar[str] = "v -> limit * tanh(v / limit)"
-    searched: ClassVar[tuple[str, ...]] = ("input",)
+    # A recording hardly distinguishes it from the hard limit, which is searched.
+    searched: ClassVar[tuple[str, ...]] = ()
     stage: ClassVar[int] = 0
 
     limit: float = parameter(10.0, unit="V", lower=1e-3, meaning="voltage that it approaches")

@@ -192,7 +192,8 @@ class LoadFriction(DryFriction):
     ports: ClassVar[tuple[str, ...]] = ("hub",)
     amplitudes: ClassVar[tuple[str, ...]] = ("level", "driving", "driven")
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
-    searched: ClassVar[tuple[str, ...]] = ("hub",)
+    # Beside a constant friction it ties with it where the load hardly varies: tried where a user asks for it.
+    searched: ClassVar[tuple[str, ...]] = ()
     loaded: ClassVar[bool] = True
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque without load")

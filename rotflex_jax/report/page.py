@@ -1,5 +1,6 @@
 """The report of a search as one HTML page."""
 
+import math
 import platform
 from collections.abc import Sequence
 from importlib import metadata
@@ -110,7 +111,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
             for name, e in added.parameters.items()
         ],
         "equivalent": " or ".join(effect_label(*pair) for pair in added.equivalent),
-        "gain": plain_number(added.held_out_gain_nats),
+        "gain": plain_number(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
         "status": added.status,
         "status_sentence": status_sentence(added),
         "score": plain_number(added.score),
