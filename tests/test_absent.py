@@ -79,14 +79,13 @@ class Case:
 
 
 def own_states(mechanism: Mechanism, first: int) -> list[int]:
-    """Places in the state of what belongs to the effects from `first` on, found by taking them away."""
+    """Places in the state of what belongs to the effects from `first` on, counted as they are declared."""
     kept, at = [], 2 * len(mechanism.coordinates)
-    for kind in (fx.Linear, fx.Memory):
+    for part in ("linear", "memory"):
         for i, e in enumerate(mechanism.effects):
-            if isinstance(e, kind):
-                count = e.order if isinstance(e, fx.Linear) else 1
-                kept += [at + k for k in range(count)] if i >= first else []
-                at += count
+            if e.state_part == part:
+                kept += [at + k for k in range(e.order)] if i >= first else []
+                at += e.order
     return kept
 
 

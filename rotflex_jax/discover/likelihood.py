@@ -142,7 +142,10 @@ class LikelihoodProblem:
         keys = [(Ts, known.tobytes()) for Ts, known in rows]
         for key, (Ts, known) in zip(keys, rows, strict=True):
             if key not in found:
-                here = mechanism.with_values(np.where(np.isnan(known), mechanism.values, known))
+                # A learned map has its parameters after those that recordings may know.
+                values = mechanism.values.copy()
+                values[: len(known)] = np.where(np.isnan(known), values[: len(known)], known)
+                here = mechanism.with_values(values)
                 found[key] = kalman_gains(here, intensities, self.noise, Ts)
         K = np.stack([found[key] for key in keys], axis=1)
         full = np.zeros((*K.shape[:2], Layout.of(s.mechanism.structure).size, K.shape[3]))

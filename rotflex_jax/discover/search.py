@@ -20,7 +20,7 @@ from rotflex_jax.discover.evaluation import (
     paired_estimates,
     process_noise_gain,
 )
-from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_prediction, fit_free_runs
+from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_free_run, as_prediction, fit_free_runs
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -31,7 +31,7 @@ from rotflex_jax.discover.hypothesis import (
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.proposal import with_proposal
-from rotflex_jax.discover.refit import choose_process_noise
+from rotflex_jax.discover.refit import choose_process_noise, refit
 from rotflex_jax.discover.result import HorizonGain, Ranked, Round, Stage
 from rotflex_jax.discover.score_test import Score, promising_at_both, scores
 from rotflex_jax.discover.selection import (
@@ -346,7 +346,13 @@ def _refit(
         dataclasses.replace(y, others=(*y.others, h.mean_values(s)[s.parameter_indices(y.location)]))
         for y, h in zip(runs_starts, grown, strict=True)
     ]
-    runs = refit_candidates(horizons.free_run.problem, current.free_run.hypothesis, informed)
+    problem = horizons.free_run.problem
+    runs = refit_candidates(problem, current.free_run.hypothesis, informed)
+    # The cost of free runs is rugged: the parameters of predictions may lie in a better valley.
+    begun = [as_free_run(problem, h) for h in grown]
+    finite = [i for i, h in enumerate(begun) if np.isfinite(h.log_likelihood)]
+    for i, h in zip(finite, refit(problem, [begun[i] for i in finite]) if finite else [], strict=True):
+        runs[i] = max(runs[i], h, key=lambda x: x.log_likelihood)
     validated = [
         dataclasses.replace(
             horizons.validated(h, f, current),
