@@ -10,8 +10,9 @@ import small_problem as sp
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.evaluation import calibrate
-from rotflex_jax.discover.horizon import Horizons, as_free_run, fit_free_runs
+from rotflex_jax.discover.horizon import Horizons, as_free_run
 from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.score_test import scores
 from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
 from rotflex_jax.discover.supermodel import build, scales
@@ -86,7 +87,7 @@ def test_slopes_of_windows_are_those_of_differences(horizons, moved):
 def test_the_score_of_free_runs_foretells_what_a_fit_gains(horizons):
     """To first order: a small step of the amplitude lowers the cost as the score says."""
     problem = horizons.free_run.problem
-    h = fit_free_runs(problem, sp.fitted(horizons.prediction.problem))
+    h = refit(problem, [as_free_run(problem, sp.fitted(horizons.prediction.problem))])[0]
     found = {x.location: x for x in scores(problem, h)}[sp.HUB]
     assert found.nats > 50 and found.start.values[0] == pytest.approx(0.02, rel=0.5)
 
@@ -125,7 +126,7 @@ def test_a_late_channel_is_seen_at_both_horizons():
     problem = LikelihoodProblem.of(s, sp.SOLVER, data, ("hub", "joint"))
     both = Horizons.of(Model(sp.baseline()), problem, None, SECONDS)
     h = fit_baseline(both.prediction.problem)
-    runs = fit_free_runs(both.free_run.problem, h)
+    runs = refit(both.free_run.problem, [as_free_run(both.free_run.problem, h)])[0]
     for at, fitted in ((both.prediction.problem, h), (both.free_run.problem, runs)):
         best, second, *_ = scores(at, fitted)
         assert best.location == ("channel_delay", "alpha") and best.nats > 100 > second.nats
@@ -156,18 +157,18 @@ def test_a_recording_that_is_left_out_has_no_say(horizons):
         predictor=dataclasses.replace(first.train.predictor, data=data),
         dataset=dataclasses.replace(first.train.dataset, data=data),
     )
-    mine, theirs = (fit_free_runs(p, h) for p in (first.train, other))
+    mine, theirs = (refit(p, [as_free_run(p, h)])[0] for p in (first.train, other))
     np.testing.assert_array_equal(mine.z, theirs.z)
 
 
 def test_runs_that_validate_each_other_are_fits_without_each(horizons):
     """The error of each run is that of the model fitted to the other one alone."""
     both = Horizons.of(Model(sp.baseline()), horizons.prediction.problem, None, SECONDS).free_run
-    h = fit_free_runs(both.problem, sp.fitted(horizons.prediction.problem))
+    h = refit(both.problem, [as_free_run(both.problem, sp.fitted(horizons.prediction.problem))])[0]
     found = validate(both.validation, h)
     assert len(found.folds) == 2 and len(found.blocks) == len(h.blocks)
     for k, fold in enumerate(both.validation.folds):
-        alone = fit_free_runs(fold.train, h)
+        alone = refit(fold.train, [as_free_run(fold.train, h)])[0]
         values = found.adapted.values(both.problem.supermodel)[k]
         np.testing.assert_allclose(
             values[list(h.free)], alone.mean_values(both.problem.supermodel)[list(h.free)], rtol=2e-3

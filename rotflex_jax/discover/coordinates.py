@@ -120,8 +120,6 @@ class Projection:
             [_basis(left[shared + local :, r, samples]) for _, samples in self._windows.of(r)]
             for r in range(W.shape[1])
         ]
-        self._local: list[np.ndarray] = []
-        self._shared = np.zeros((0, left[0].size))
         self._remove_states(left)
         self._local = [_basis(left[shared : shared + local, r]) for r in range(W.shape[1])]
         self._remove_local(left)

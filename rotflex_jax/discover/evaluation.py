@@ -8,15 +8,21 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.horizon import Horizons, SearchHorizon
-from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state, with_all_calibrations
+from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
 from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem
 from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.result import RunErrors, Stage
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
-from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, adapted_to_recordings
+from rotflex_jax.discover.validation import (
+    ValidatedHypothesis,
+    ValidationSet,
+    adapted_to_recordings,
+    carried_over,
+)
 from rotflex_jax.discover.windows import Windows
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
@@ -49,15 +55,7 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
         h: Trained.
         seconds: How much of each recording may be used [s].
     """
-    s, R = problem.supermodel, len(problem.seen)
-    start = dataclasses.replace(
-        h,
-        x0=embed_initial_state(s, h.locations, problem.windows.first_states),
-        local_z=np.tile(h.local_z.mean(axis=0), (R, 1)),
-        K=np.zeros((R, *h.K.shape[1:])),
-        densities=np.array(-np.inf),
-    )
-    start = with_all_calibrations(s, start)
+    start = with_all_calibrations(problem.supermodel, carried_over(problem, h))
     early = problem.first_seconds(seconds)
     prior = BLOCK_SECONDS / np.asarray(problem.dataset.data.Ts)
     own = start
@@ -70,16 +68,31 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
     return own
 
 
-def errors_of_runs(validation: ValidationSet, models: Sequence[Model]) -> RunErrors:
-    """Errors of free runs over recordings, each with a model of its own."""
+class FreeRuns(NamedTuple):
+    """Free runs over recordings, each with a model of its own.
+
+    Attributes:
+        whole: One run over each recording.
+        windows: The same, started again every few seconds.
+        errors: Of both.
+    """
+
+    whole: tuple[Float[np.ndarray, "_ C"], ...]
+    windows: tuple[Float[np.ndarray, "_ C"], ...]
+    errors: RunErrors
+
+
+def free_runs(validation: ValidationSet, models: Sequence[Model]) -> FreeRuns:
+    """Free runs of models over the recordings of a set, one model for each."""
     recordings, channels = validation.problem.dataset.recordings, models[0].mechanism.channels
     pairs = list(zip(models, recordings, strict=True))
-    whole = [(m.simulate(r) - m.measured(r))[r.n_init :] for m, r in pairs]
-    windows = validation.window_rmse([m.simulate_windows(r, validation.window_seconds) for m, r in pairs])
-    total = np.sqrt(np.mean(np.concatenate(whole) ** 2, axis=0))
-    return RunErrors(
-        dict(zip(channels, total.tolist(), strict=True)), dict(zip(channels, windows.tolist(), strict=True))
-    )
+    whole = tuple(m.simulate(r) for m, r in pairs)
+    windows = tuple(m.simulate_windows(r, validation.window_seconds) for m, r in pairs)
+    e = [(y_hat - m.measured(r))[r.n_init :] for y_hat, (m, r) in zip(whole, pairs, strict=True)]
+    total = np.sqrt(np.mean(np.concatenate(e) ** 2, axis=0))
+    short = validation.window_rmse(windows)
+    by_channel = (dict(zip(channels, errors.tolist(), strict=True)) for errors in (total, short))
+    return FreeRuns(whole, windows, RunErrors(*by_channel))
 
 
 def errors_with_own_calibration(
@@ -98,9 +111,9 @@ def errors_with_own_calibration(
     parts = [(f.validation.problem, h) for f, h in zip(validation.folds, found.folds, strict=True)]
     if not parts:
         own = calibrate(validation.problem, found.hypothesis, seconds)
-        return errors_of_runs(validation, [validation.model_of(own, on, i) for i in every])
+        return free_runs(validation, [validation.model_of(own, on, i) for i in every]).errors
     own = [calibrate(problem, h, seconds) for problem, h in parts]
-    return errors_of_runs(validation, [validation.model_of(h, on, i) for i, h in enumerate(own)])
+    return free_runs(validation, [validation.model_of(h, on, i) for i, h in enumerate(own)]).errors
 
 
 def errors_as_trained(
@@ -115,7 +128,7 @@ def errors_as_trained(
         densities=np.array(-np.inf),
     )
     model = validation.model_of(trained, locations, 0)
-    return errors_of_runs(validation, [model] * len(validation.problem.dataset.recordings))
+    return free_runs(validation, [model] * len(validation.problem.dataset.recordings)).errors
 
 
 def evaluate(
@@ -135,21 +148,17 @@ def evaluate(
         locations: What the stage's model has; calibrations that belong to the training recordings alone
             are in the hypothesis, but not here.
     """
-    h, s, seconds = validated.hypothesis, problem.supermodel, validation.window_seconds
-    recordings, trained = validation.problem.dataset.recordings, validated.with_trained_calibrations
-    models = [validation.model_of(trained, locations, i) for i in range(len(recordings))]
-    pairs = list(zip(models, recordings, strict=True))
-    simulated = tuple(m.simulate(r) for m, r in pairs)
-    windowed = tuple(m.simulate_windows(r, seconds) for m, r in pairs)
-    errors = errors_of_runs(validation, models)
+    h, s, trained = validated.hypothesis, problem.supermodel, validated.with_trained_calibrations
+    every = range(len(validation.problem.dataset.recordings))
+    runs = free_runs(validation, [validation.model_of(trained, locations, i) for i in every])
     return Stage(
         model=Model(s.clean(h.mean_values(s), locations), solver),
         estimates=estimates(problem, h),
-        held_out_rmse=errors.whole,
-        held_out_rmse_windows=errors.windows,
-        simulated=simulated,
-        windowed=windowed,
-        window_seconds=seconds,
+        held_out_rmse=runs.errors.whole,
+        held_out_rmse_windows=runs.errors.windows,
+        simulated=runs.whole,
+        windowed=runs.windows,
+        window_seconds=validation.window_seconds,
         process_noise=h.process_noise,
         process_noise_nats=0.0 if problem.free_run else process_noise_gain(problem, h),
         log_likelihood=validated.log_likelihood,
@@ -364,23 +373,33 @@ class Evaluation:
         return dataclasses.replace(stage, **found)
 
 
-def paired_estimates(horizon: SearchHorizon, found: ValidatedHypothesis) -> tuple[PairedEstimates, ...]:
+def paired_estimates(
+    horizon: SearchHorizon, found: ValidatedHypothesis, trained: Sequence[Estimate]
+) -> tuple[PairedEstimates, ...]:
     """The parameters of a model fitted to the training and, from there, to the validation recordings.
 
     What agrees is a property of the machine. Where runs validate each other, each is fitted alone and
     compared with the fit to the others. No choice of effects rests on these fits.
+
+    Args:
+        horizon: The recordings.
+        found: The model.
+        trained: Its estimates from all training recordings.
     """
     folds = horizon.validation.folds
     if folds:
-        sets = [(f.train, h, f.validation.problem, h) for f, h in zip(folds, found.folds, strict=True)]
-        names = [f"recording {k + 1}" for k in range(len(sets))]
-    else:
-        sets = [(horizon.problem, found.hypothesis, horizon.validation.problem, found.adapted)]
-        names = ["the validation data"]
-    out = []
-    for (problem, trained, other, start), where in zip(sets, names, strict=True):
-        begun = other.evaluated(start, other.innovations([start])[0])
-        fitted = refit(other, [begun], alternations=1)[0] if np.isfinite(begun.log_likelihood) else None
-        own = estimates(other, fitted) if fitted else ()
-        out.append(PairedEstimates(estimates(problem, trained), own, where))
-    return tuple(out)
+        fits = zip(folds, found.folds, strict=True)
+        return tuple(
+            PairedEstimates(estimates(f.train, h), _fitted_to(f.validation.problem, h), f"recording {k}")
+            for k, (f, h) in enumerate(fits, 1)
+        )
+    other = _fitted_to(horizon.validation.problem, found.adapted)
+    return (PairedEstimates(trained, other, "the validation data"),)
+
+
+def _fitted_to(problem: LikelihoodProblem, start: Hypothesis) -> tuple[Estimate, ...]:
+    """Estimates from the recordings of a problem; none where the start diverges there."""
+    begun = problem.evaluated(start, problem.innovations([start])[0])
+    if not np.isfinite(begun.log_likelihood):
+        return ()
+    return estimates(problem, refit(problem, [begun], alternations=1)[0])

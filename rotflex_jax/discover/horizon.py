@@ -2,13 +2,11 @@
 
 import dataclasses
 
-import numpy as np
-
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.discover.windows import Windows
+from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 
 
@@ -17,12 +15,10 @@ class SearchHorizon:
     """Training and validation recordings at one horizon.
 
     Attributes:
-        name: "prediction" or "free_run", as in the JSON.
         problem: The likelihood of the training recordings.
         validation: The validation recordings.
     """
 
-    name: str
     problem: LikelihoodProblem
     validation: ValidationSet
 
@@ -53,14 +49,15 @@ class Horizons:
             seconds: Length of a free run [s].
         """
         problems = (train, *([validation] if validation else []))
-        number = max(Windows.of_seconds(model, p.dataset, seconds).number for p in problems)
+        recordings = [r for p in problems for r in p.dataset.recordings]
+        number = max(len(window_starts(r, seconds)[0]) for r in recordings)
         whole = [dataclasses.replace(p, windows=Windows.whole(p.dataset, number)) for p in problems]
         cut = [p.of_free_runs(Windows.of_seconds(model, p.dataset, seconds, number)) for p in problems]
         if validation is None:
             sets = [ValidationSet.leave_one_out(p[0], seconds) for p in (whole, cut)]
         else:
             sets = [ValidationSet(p[1], seconds) for p in (whole, cut)]
-        return cls(SearchHorizon("prediction", whole[0], sets[0]), SearchHorizon("free_run", cut[0], sets[1]))
+        return cls(SearchHorizon(whole[0], sets[0]), SearchHorizon(cut[0], sets[1]))
 
     def validated(
         self, prediction: Hypothesis, free_run: Hypothesis, near: ValidatedHypothesis | None = None
@@ -77,38 +74,19 @@ class Horizons:
         return dataclasses.replace(found, free_run=runs)
 
 
-def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
-    """A hypothesis of predictions as one of free runs, which start in measured states; not fitted.
+def at_horizon(problem: LikelihoodProblem, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
+    """The parameters of a hypothesis at another horizon, from measured first states; not fitted.
 
     Args:
-        problem: Of free runs.
+        problem: The same recordings at that horizon.
         h: Its parameters.
-    """
-    x0 = embed_initial_state(problem.supermodel, h.locations, problem.windows.first_states)
-    start = problem.with_process_noise(dataclasses.replace(h, x0=x0), dict.fromkeys(problem.ports, 0.0))
-    return problem.evaluated(start, problem.innovations([start])[0])
-
-
-def as_prediction(problem: LikelihoodProblem, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
-    """The parameters of a hypothesis of free runs in predictions; not fitted.
-
-    Args:
-        problem: Of predictions.
-        h: Its parameters.
-        intensity: Port -> process noise [(N m)^2 s].
+        intensity: Port -> process noise [(N m)^2 s]; a free run has none.
     """
     x0 = embed_initial_state(problem.supermodel, h.locations, problem.windows.first_states)
     start = problem.with_process_noise(dataclasses.replace(h, x0=x0), intensity)
     return problem.evaluated(start, problem.innovations([start])[0])
 
 
-def fit_free_runs(problem: LikelihoodProblem, *starts: Hypothesis) -> Hypothesis:
-    """The best fit of free runs from the parameters of hypotheses of predictions.
-
-    Args:
-        problem: Of free runs.
-        starts: Of one structure.
-    """
-    begun = [as_free_run(problem, h) for h in starts]
-    finite = [h for h in begun if np.isfinite(h.log_likelihood)]
-    return max(refit(problem, finite or begun), key=lambda h: h.log_likelihood)
+def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
+    """A hypothesis of predictions as one of free runs; `problem` is that of free runs."""
+    return at_horizon(problem, h, dict.fromkeys(problem.ports, 0.0))

@@ -58,11 +58,10 @@ class LikelihoodProblem:
         solver: Solver,
         dataset: Dataset,
         ports: tuple[str, ...],
-        number: int = 1,
     ) -> "LikelihoodProblem":
-        """The one-step prediction of a dataset by a super-model; `number` as in `Windows.whole`."""
+        """The one-step prediction of a dataset by a super-model."""
         predictor = BatchedPredictor(supermodel, solver, dataset.data, dataset.constants)
-        return cls(predictor, dataset, ports, Windows.whole(dataset, number))
+        return cls(predictor, dataset, ports, Windows.whole(dataset))
 
     def of_free_runs(self, windows: Windows) -> "LikelihoodProblem":
         """The likelihood of free runs over windows, with the same compiled programs."""

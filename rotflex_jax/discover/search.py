@@ -2,10 +2,9 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from rotflex_jax.discover.bias_correction import correct_discretisation_bias
 from rotflex_jax.discover.discovery import Discovery
@@ -20,7 +19,7 @@ from rotflex_jax.discover.evaluation import (
     paired_estimates,
     process_noise_gain,
 )
-from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_free_run, as_prediction, fit_free_runs
+from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_free_run, at_horizon
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -30,6 +29,7 @@ from rotflex_jax.discover.hypothesis import (
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
+from rotflex_jax.discover.milestone import milestone
 from rotflex_jax.discover.proposal import with_proposal
 from rotflex_jax.discover.refit import choose_process_noise, refit
 from rotflex_jax.discover.result import HorizonGain, Ranked, Round, Stage
@@ -51,6 +51,7 @@ from rotflex_jax.discover.stepwise import (
     merge_effects,
     nested_models,
     refit_candidates,
+    refit_from,
     remaining_rivals,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, build, scales
@@ -65,58 +66,6 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 from rotflex_jax.runtime.xla import one_thread
-from rotflex_jax.text.numbers import as_read
-
-
-class Milestone(str):
-    """A line with the validation error of a model that was reached.
-
-    Attributes:
-        label: What the model is.
-        errors: Channel -> error of short free runs [unit of the channel].
-        floor: Channel -> noise of the sensor [unit of the channel].
-        units: Channel -> unit in which people read it.
-        factors: Channel -> what its own unit is in that one.
-    """
-
-    label: str
-    errors: dict[str, float]
-    floor: dict[str, float]
-    units: dict[str, str]
-    factors: dict[str, float]
-
-
-def milestone(
-    label: str,
-    channels: Sequence[str],
-    units: Mapping[str, str],
-    errors: Float[np.ndarray, " C"],
-    floor: Float[np.ndarray, " C"],
-) -> Milestone:
-    """A line with the errors that it names.
-
-    Args:
-        label: What the model is.
-        channels: Outputs of the model, in order.
-        units: Channel -> its own unit.
-        errors: Validation error of short free runs, by channel. While a search runs, their first states
-            are fitted; its result has the errors from states estimated from the first samples alone.
-        floor: Noise of the sensor, by channel.
-
-    >>> line = milestone("+ coulomb at hub", ["theta"], {"theta": "rad"}, np.array([0.01]), np.array([5e-4]))
-    >>> line, line.errors
-    ('+ coulomb at hub: held-out error theta 0.573 deg', {'theta': 0.01})
-    """
-    read = {c: as_read(1.0, units[c]) for c in channels}
-    by_name = dict(zip(channels, (float(e) for e in errors), strict=True))
-    listed = ", ".join(f"{c} {read[c][0] * e:.3g} {read[c][1]}" for c, e in by_name.items())
-    line = Milestone(f"{label}: held-out error {listed}")
-    line.label, line.errors = label, by_name
-    line.floor = dict(zip(channels, (float(f) for f in floor), strict=True))
-    line.units = {c: unit for c, (_, unit) in read.items()}
-    line.factors = {c: factor for c, (factor, _) in read.items()}
-    return line
-
 
 Progress = Callable[[str], None]
 
@@ -307,7 +256,8 @@ def _prepare(
 def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress) -> SearchState:
     """The user's model, fitted and validated."""
     h = fit_baseline(horizons.prediction.problem)
-    current = horizons.validated(h, fit_free_runs(horizons.free_run.problem, h))
+    problem = horizons.free_run.problem
+    current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
     state = SearchState(model, horizons, say, current, passed=[current])
     state.reached("as it is")
     return state
@@ -349,10 +299,8 @@ def _refit(
     problem = horizons.free_run.problem
     runs = refit_candidates(problem, current.free_run.hypothesis, informed)
     # The cost of free runs is rugged: the parameters of predictions may lie in a better valley.
-    begun = [as_free_run(problem, h) for h in grown]
-    finite = [i for i, h in enumerate(begun) if np.isfinite(h.log_likelihood)]
-    for i, h in zip(finite, refit(problem, [begun[i] for i in finite]) if finite else [], strict=True):
-        runs[i] = max(runs[i], h, key=lambda x: x.log_likelihood)
+    begun = [(i, as_free_run(problem, h)) for i, h in enumerate(grown)]
+    runs = refit_from(problem, runs, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
     validated = [
         dataclasses.replace(
             horizons.validated(h, f, current),
@@ -428,7 +376,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     seconds, noise = validation.window_seconds, problem.noise
     residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
     floor = dict(zip(channels, noise.tolist(), strict=True))
-    pairs = paired_estimates(reported, validated[-1])
+    pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     rounds = _rounds(state, stages, pairs)
     listed = [s for s, _ in state.ranking]
     verdict, sentence = end_state(rounds, stages[-1], floor, listed, held_back)
@@ -460,7 +408,7 @@ def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stag
     problem = state.problem
     if stage.horizon == "prediction":
         return stage
-    h = as_prediction(problem, h, state.current.hypothesis.process_noise)
+    h = at_horizon(problem, h, state.current.hypothesis.process_noise)
     h = choose_process_noise(problem, h, wide=True)
     gain = process_noise_gain(problem, h)
     return dataclasses.replace(stage, process_noise=h.process_noise, process_noise_nats=gain)

@@ -92,7 +92,7 @@ def refit_candidates(
     gains = [h.log_likelihood - current.log_likelihood for h in refitted]
     stuck = {i for i, gain in enumerate(gains) if gain < STUCK_SHARE * max(starts[i].expected_gain, 0.0)}
     again = [(i, row[-1]) for (i, _), row in zip(shapes, grown, strict=True) if i in stuck]
-    refitted = _refit_from(problem, refitted, again)
+    refitted = refit_from(problem, refitted, again)
     # An effect that contains another one is never worse: where a refit is, it starts again from that one.
     below = [
         (i, replacing(s, refitted[j], [b.location], a, AMPLITUDE_SHARES[-1]))
@@ -102,10 +102,10 @@ def refit_candidates(
         and b.location.effect in CATALOG[a.location.effect].contains
         and refitted[i].log_likelihood < refitted[j].log_likelihood
     ]
-    return _refit_from(problem, refitted, below)
+    return refit_from(problem, refitted, below)
 
 
-def _refit_from(
+def refit_from(
     problem: LikelihoodProblem, refitted: list[Hypothesis], starts: list[tuple[int, Hypothesis]]
 ) -> list[Hypothesis]:
     """Refits, some also from other starts (index of the candidate, start); the likelier one is kept."""

@@ -166,6 +166,19 @@ class _OwnStep(NamedTuple):
     step: Float[np.ndarray, " O"]
 
 
+def carried_over(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
+    """A trained hypothesis on other recordings: from measured first states, with the mean calibrations."""
+    first = problem.windows.first_states
+    start = dataclasses.replace(
+        h,
+        x0=embed_initial_state(problem.supermodel, h.locations, first),
+        local_z=np.tile(h.local_z.mean(axis=0), (len(first), 1)),
+        K=np.zeros((len(first), *h.K.shape[1:])),
+        densities=np.array(-np.inf),
+    )
+    return problem.with_process_noise(start, h.process_noise)
+
+
 def validate(
     validation: ValidationSet, h: Hypothesis, near: ValidatedHypothesis | None = None
 ) -> ValidatedHypothesis:
@@ -184,19 +197,12 @@ def validate(
     """
     if validation.folds:
         return _cross_validated(validation, h, near)
-    problem, first = validation.problem, validation.problem.windows.first_states
-    s, R = problem.supermodel, len(first)
-    current = dataclasses.replace(
-        h,
-        x0=embed_initial_state(s, h.locations, first),
-        local_z=np.tile(h.local_z.mean(axis=0), (R, 1)),
-        K=np.zeros((R, *h.K.shape[1:])),
-        densities=np.array(-np.inf),
-    )
-    current = problem.with_process_noise(current, h.process_noise)
+    problem = validation.problem
+    current = carried_over(problem, h)
     starts = [current]
     if near is not None:
-        starts.append(dataclasses.replace(current, x0=near.adapted.initial_state_for(s, h.locations)))
+        x0 = near.adapted.initial_state_for(problem.supermodel, h.locations)
+        starts.append(dataclasses.replace(current, x0=x0))
     tried = problem.innovations(starts)
     best = int(np.argmin(_costs(h, tried, problem.seen)))
     current, e = starts[best], tried[best]

@@ -204,9 +204,13 @@ def motor_limit(
     for i, e in effects_of(mechanism, Force):
         if isinstance(e, Linear) and e.motor and e.at == at:
             k = layout.torque_ports.index(at)
-            given = evaluate_effect(e, lambda e, *signals: e.force(*signals), position[k], speed[k], v)
-            total = total + gates[i] * given
+            total = total + gates[i] * _force(e, position[k], speed[k], v)
     return total
+
+
+def _force(e: Force | Memory, *signals: Float[Array, "*S"]) -> Float[Array, "*S"]:
+    """Torque of a force or a memory; signals as its `force` takes them."""
+    return evaluate_effect(e, lambda e, *given: e.force(*given), *signals)
 
 
 def motor_correction(
@@ -224,8 +228,7 @@ def motor_correction(
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         if e.driven_by == "motor" and e.at == at:
             k, drive = layout.torque_ports.index(at), memory_drive(mechanism, e, x, v, gates)
-            force = lambda e, *signals: e.force(*signals)  # noqa: E731
-            total = total + gates[i] * evaluate_effect(e, force, z[m], position[k], speed[k], drive)
+            total = total + gates[i] * _force(e, z[m], position[k], speed[k], drive)
     return total
 
 
@@ -261,14 +264,13 @@ def torques(
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
-    force = lambda e, *signals: e.force(*signals)  # noqa: E731
     for i, e in effects_of(mechanism, Force):
         k = layout.torque_ports.index(e.at)
-        total[k] = total[k] + gates[i] * evaluate_effect(e, force, position[k], speed[k], v)
+        total[k] = total[k] + gates[i] * _force(e, position[k], speed[k], v)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
         drive = memory_drive(mechanism, e, x, v, gates)
-        total[k] = total[k] + gates[i] * evaluate_effect(e, force, z[m], position[k], speed[k], drive)
+        total[k] = total[k] + gates[i] * _force(e, z[m], position[k], speed[k], drive)
     return jnp.stack(total)
 
 

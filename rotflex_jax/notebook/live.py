@@ -4,7 +4,7 @@ import sys
 import time
 from typing import Any
 
-from rotflex_jax.discover.search import Milestone
+from rotflex_jax.discover.milestone import Milestone
 from rotflex_jax.text.markup import card, paragraph, picture
 from rotflex_jax.text.svg import staircase
 

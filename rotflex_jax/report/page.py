@@ -110,9 +110,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
             (name, *value_and_interval(e), together(e.unit), _later(discovery, e), e.note)
             for name, e in added.parameters.items()
         ],
-        "equivalent": " or ".join(effect_label(*pair) for pair in added.equivalent),
         "gain": plain_number(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
-        "status": added.status,
         "status_sentence": status_sentence(added),
         "score": plain_number(added.score),
         "falls": ", ".join(falls),
