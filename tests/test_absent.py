@@ -155,7 +155,7 @@ def test_slopes_are_those_of_the_whole_run(case):
         expected = np.asarray(jax.jit(jax.vmap(slope), compiler_options=ROUGH)(*ways))
     for name, mine, whole in zip(c.names, found(case), expected, strict=True):
         size = np.abs(whole).max()
-        assert size > 1e-5, name
+        assert size > 1e-6, name  # a drift grows from zero: 2e-6 V in the time of this run
         np.testing.assert_allclose(mine, whole, rtol=0, atol=1e-9 * size, err_msg=name)
 
 
