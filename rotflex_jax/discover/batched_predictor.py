@@ -160,7 +160,8 @@ class BatchedPredictor:
         for model, indices in self._by_structure([p.gates for p in parameter_sets]):
             jobs += [(model, indices[i : i + size]) for i in range(0, len(indices), size)]
         out = np.empty((len(parameter_sets), *self.data.y.shape))
-        for (_, indices), e in zip(jobs, self.run_jobs(run, jobs, _named("innovations")), strict=True):
+        results = self.run_jobs(run, jobs, lambda job: ("innovations", job[0].effects))
+        for (_, indices), e in zip(jobs, results, strict=True):
             out[indices] = e
         return out
 
@@ -170,7 +171,10 @@ class BatchedPredictor:
         directions: list[Directions],
         window: Int[np.ndarray, "R N"],
     ) -> tuple[Float[np.ndarray, "L R N C"], Float[np.ndarray, "L D R N C"]]:
-        """Innovations and their slopes along the directions given for each parameter set."""
+        """Innovations and their slopes along the directions given for each parameter set.
+
+        The number D is that of the parameter set with the most; slopes of the others end in zeros.
+        """
 
         def run(job: tuple[ReducedModel, list[int]]) -> tuple[np.ndarray, np.ndarray]:
             model, (i,) = job
@@ -184,9 +188,13 @@ class BatchedPredictor:
 
         gates = [np.vstack([p.gates, d.gates]) for p, d in zip(parameter_sets, directions, strict=True)]
         jobs = [(model, [i]) for model, indices in self._by_structure(gates) for i in indices]
-        results = self.run_jobs(run, jobs, _named("slopes"))
-        found = dict(zip([i for _, (i,) in jobs], results, strict=True))
-        return tuple(np.stack([found[i][k] for i in range(len(parameter_sets))]) for k in (0, 1))  # type: ignore
+        counts = [len(d.x0) for d in directions]
+        results = self.run_jobs(run, jobs, lambda job: ("slopes", counts[job[1][0]], job[0].effects))
+        e = np.empty((len(parameter_sets), *self.data.y.shape))
+        J = np.zeros((len(parameter_sets), max(counts), *self.data.y.shape))
+        for (_, (i,)), found in zip(jobs, results, strict=True):
+            e[i], J[i, : counts[i]] = found
+        return e, J
 
     def _by_structure(self, gates: list[np.ndarray]) -> list[tuple[ReducedModel, list[int]]]:
         """Which parameter sets run on which reduced model."""
@@ -211,11 +219,6 @@ class BatchedPredictor:
     def on_device(self) -> StackedRecordings:
         """The recordings as arrays of JAX; call it inside the precision that is wanted."""
         return jax.tree.map(jnp.asarray, self.data)
-
-
-def _named(what: str) -> Callable[[tuple[ReducedModel, list[int]]], Any]:
-    """Name of the program that runs a job: what it computes, with which effects."""
-    return lambda job: (what, job[0].effects)
 
 
 def _on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:

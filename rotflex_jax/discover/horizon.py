@@ -69,8 +69,8 @@ class Horizons:
             free_run: Fitted to free runs.
             near: Another structure; see `validate`.
         """
-        found = validate(self.prediction.validation, prediction, near)
         runs = validate(self.free_run.validation, free_run, near.free_run if near else None)
+        found = validate(self.prediction.validation, prediction, near, runs.adapted)
         return dataclasses.replace(found, free_run=runs)
 
 

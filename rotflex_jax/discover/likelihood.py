@@ -111,7 +111,7 @@ class LikelihoodProblem:
         """Directions per pass of slopes: enough for a few effects on top of the baseline."""
         s = self.supermodel
         count = len(s.baseline_free) + len(s.local) + 2 * len(s.baseline.coordinates) + 4
-        return -(-count // 4) * 4
+        return _multiple_of_four(count)
 
     @property
     def process_noise_range(self) -> tuple[float, float]:
@@ -160,11 +160,15 @@ class LikelihoodProblem:
         return self.predictor.innovations(parameter_sets, self.windows.index)
 
     def slopes(
-        self, hypotheses: Sequence[Hypothesis], count: int = 0
+        self, hypotheses: Sequence[Hypothesis]
     ) -> tuple[Float[np.ndarray, "H R N C"], Float[np.ndarray, "H D R N C"]]:
-        """Innovations and their slopes along all that a fit moves, padded to `count` directions at least."""
-        s, count = self.supermodel, max(count, self.direction_count, *(h.moved for h in hypotheses))
-        directions = [h.directions(s, count) for h in hypotheses]
+        """Innovations and their slopes along all that a fit moves.
+
+        Directions are filled up to the same few numbers, whatever else is fitted beside a hypothesis: each
+        number is compiled once.
+        """
+        s, least = self.supermodel, self.direction_count
+        directions = [h.directions(s, max(least, _multiple_of_four(h.moved))) for h in hypotheses]
         parameter_sets = [h.parameter_set(s) for h in hypotheses]
         return self.predictor.slopes(parameter_sets, directions, self.windows.index)
 
@@ -211,6 +215,10 @@ class LikelihoodProblem:
         channels = np.moveaxis(e, -1, 0)
         squares = np.array([in_blocks(c**2 * data.seen, data) / np.maximum(counts, 1) for c in channels])
         return -0.5 * np.mean(np.log(squares + self.noise[:, None] ** 2), axis=0)
+
+
+def _multiple_of_four(count: int) -> int:
+    return -(-count // 4) * 4
 
 
 def in_blocks(values: Float[np.ndarray, "R N"], data: StackedRecordings) -> Float[np.ndarray, " B"]:

@@ -42,14 +42,14 @@ def levenberg_marquardt(
     problem: LikelihoodProblem, hypotheses: list[Hypothesis], max_steps: int = MAX_STEPS
 ) -> list[Hypothesis]:
     """Fit all hypotheses with whiteners and process noise held; returns them with new whiteners."""
-    seen, count = problem.seen, max(h.moved for h in hypotheses)
+    seen = problem.seen
 
     def coordinates(h: Hypothesis) -> FitCoordinates:
         return FitCoordinates.of(h, problem.windows)
 
     def linearise(points: list[_Point]) -> list[NormalEquations]:
         equations = []
-        for p, e, J in zip(points, *problem.slopes([p.hypothesis for p in points], count), strict=True):
+        for p, e, J in zip(points, *problem.slopes([p.hypothesis for p in points]), strict=True):
             h, w = p.hypothesis, p.whitened(e, seen)
             H, g = coordinates(h).sums(w, h.whitener(J[: h.moved], seen))
             equations.append(NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H))

@@ -36,7 +36,7 @@ from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 
-@persistent_jit(static=2)
+@persistent_jit(static=2, runs_rarely=True)
 def _run_slopes(
     structure: Mechanism,
     solver: Solver,
@@ -53,7 +53,7 @@ def _run_slopes(
     return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
 
 
-@persistent_jit(static=2)
+@persistent_jit(static=2, runs_rarely=True)
 def _inactive_slopes(
     structure: Mechanism,
     solver: Solver,

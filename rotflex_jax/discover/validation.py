@@ -1,17 +1,21 @@
 """Hypotheses on validation data: likelihood in blocks, free-run errors, runs that validate each other."""
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.discover.batched_predictor import ParameterSet
 from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
 from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_blocks
 from rotflex_jax.discover.refit import refit
+from rotflex_jax.discover.short_runs import ShortRuns
 from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.windows import Windows
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
@@ -110,11 +114,33 @@ class ValidationSet:
         mechanism = reduced.mechanism.with_values(h.values(s)[recording, reduced.parameters])
         return Model(mechanism, self.problem.predictor.solver, tuple(gates[list(reduced.effects)]))
 
-    def short_run_errors(self, h: Hypothesis, locations: Iterable[EffectLocation]) -> Float[np.ndarray, " C"]:
-        """Root mean square error of short free runs with these effects on."""
-        on, recordings = tuple(locations), self.problem.dataset.recordings
-        models = [(self.model_of(h, on, i), recordings[i]) for i in self.counted]
-        return self.window_rmse([m.simulate_windows(r, self.window_seconds) for m, r in models])
+    @functools.cached_property
+    def short_runs(self) -> ShortRuns:
+        """Free runs over short windows."""
+        p = self.problem
+        windows = p.windows
+        if not p.free_run:
+            model = Model(p.supermodel.baseline, p.predictor.solver)
+            windows = Windows.of_seconds(model, p.dataset, self.window_seconds, p.windows.number)
+        return ShortRuns(p.predictor, p.dataset, windows, self.window_seconds)
+
+    def short_run_errors(
+        self, h: Hypothesis, locations: Iterable[EffectLocation], inner: Hypothesis | None = None
+    ) -> Float[np.ndarray, " C"]:
+        """Root mean square error of short free runs with these effects on.
+
+        Args:
+            h: Gives the parameters.
+            locations: What is on.
+            inner: Fitted to the free runs over these windows, gives first states that no sensor measures; `h`
+                itself if None.
+        """
+        s, on, first = self.problem.supermodel, tuple(locations), self.short_runs.windows.first_states
+        x0 = embed_initial_state(s, on, first)
+        known = (inner or h).initial_state_for(s, on)
+        size, same = first.shape[-1], known.shape[1]
+        x0[:, :same, size:] = known[..., size:]
+        return self.short_runs.rmse(ParameterSet(h.values(s), x0, s.gates(on), h.K))
 
     def window_rmse(self, runs: Sequence[Float[np.ndarray, "_ C"]]) -> Float[np.ndarray, " C"]:
         """Root mean square error of short free runs of the recordings that count, without first samples."""
@@ -132,7 +158,10 @@ class Fold(NamedTuple):
 
 
 def _cross_validated(
-    validation: ValidationSet, h: Hypothesis, near: ValidatedHypothesis | None
+    validation: ValidationSet,
+    h: Hypothesis,
+    near: ValidatedHypothesis | None,
+    inner: Hypothesis | None,
 ) -> ValidatedHypothesis:
     """A hypothesis fitted without each recording in turn, on the one that was left out."""
     fits, found = [], []
@@ -143,7 +172,7 @@ def _cross_validated(
         k, own = len(fits), fitted.local_z.copy()
         own[k] = np.delete(own, k, axis=0).mean(axis=0)
         fits.append(dataclasses.replace(fitted, local_z=own))
-        found.append(validate(fold.validation, fits[-1], near))
+        found.append(validate(fold.validation, fits[-1], near, inner))
     own = np.array([v.adapted.local_z[k] for k, v in enumerate(found)])
     local_z = np.hstack([np.array([f.z[list(h.free)] for f in fits]), own])
     adapted = dataclasses.replace(
@@ -180,7 +209,10 @@ def carried_over(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
 
 
 def validate(
-    validation: ValidationSet, h: Hypothesis, near: ValidatedHypothesis | None = None
+    validation: ValidationSet,
+    h: Hypothesis,
+    near: ValidatedHypothesis | None = None,
+    inner: Hypothesis | None = None,
 ) -> ValidatedHypothesis:
     """Log-likelihood of validation recordings under a trained hypothesis, in blocks.
 
@@ -194,9 +226,10 @@ def validate(
         h: Trained hypothesis.
         near: Another validated hypothesis, whose first states may be better to start from: where the sensors
             do not determine a state, different first guesses end in different minima.
+        inner: Fitted to free runs over the same recordings; see `ValidationSet.short_run_errors`.
     """
     if validation.folds:
-        return _cross_validated(validation, h, near)
+        return _cross_validated(validation, h, near, inner)
     problem = validation.problem
     current = carried_over(problem, h)
     starts = [current]
@@ -211,7 +244,8 @@ def validate(
         return ValidatedHypothesis(h, lost, current, np.full(e.shape[-1], np.inf))
     current = adapted_to_recordings(problem, current)
     blocks = problem.evaluated(current, problem.innovations([current])[0]).blocks
-    return ValidatedHypothesis(h, blocks, current, validation.short_run_errors(current, h.locations))
+    errors = validation.short_run_errors(current, h.locations, inner)
+    return ValidatedHypothesis(h, blocks, current, errors)
 
 
 def adapted_to_recordings(

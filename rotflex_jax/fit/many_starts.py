@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
@@ -119,9 +118,6 @@ class StartResults(NamedTuple):
     cost: Float[Any, " S"]
     steps: Int[Any, " S"]
     z: Float[Any, "S K"]
-
-
-export.register_namedtuple_serialization(StartResults, serialized_name=f"{__name__}.StartResults")
 
 
 @persistent_jit(static=3)

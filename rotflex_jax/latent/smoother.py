@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
 from jaxtyping import Array, Float
 
 
@@ -36,11 +35,6 @@ class LinearTimeVaryingModel(NamedTuple):
     H: Float[Array, "*batch C m"]
     y: Float[Array, "*batch C"]
     seen: Float[Array, "*batch"]
-
-
-export.register_namedtuple_serialization(
-    LinearTimeVaryingModel, serialized_name=f"{__name__}.LinearTimeVaryingModel"
-)
 
 
 class InitialDistribution(NamedTuple):

@@ -28,7 +28,6 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
 from jaxtyping import Real, Shaped
 
 SHORT = 1e-3
@@ -196,9 +195,6 @@ class NormalEquations(NamedTuple):
         xp = _numpy(step)
         bent = xp.einsum("...i,...ij,...j->...", step, self.H, step)
         return -(xp.sum(self.gradient * step, axis=-1) + bent / 2)
-
-
-export.register_namedtuple_serialization(NormalEquations, serialized_name=f"{__name__}.NormalEquations")
 
 
 class Progress(NamedTuple):

@@ -1,31 +1,37 @@
-"""`jax.jit` with a persistent cache of traced programs, and compiler options for fast compilation.
+"""`jax.jit` whose compiled programs are kept on disk, and compiler options for fast compilation.
 
 For a loop of many small operations the newer fusion emitters of XLA take as long as the rest of the compiler,
 and the loop runs no faster; so the older ones are used, where this XLA has the option. Nor is a program split
 for several compiler threads, which is more work in total: a search compiles several programs at once anyway.
 
-The compilation cache of JAX saves compilation, but the program has to be traced first, and for a mechanism
-with thirty effects tracing takes longer than execution. So the traced program is stored as well, under a hash
-of everything that tracing depends on: the function, structure and solver, the shapes and types of the
-arrays, the source of this package, the version and the settings of JAX. Any difference gives another hash.
+Tracing and compiling a mechanism takes seconds, running it milliseconds. So the compiled program is stored
+under a hash of everything that it depends on: the function, structure and solver, the shapes and types of the
+arrays, the source of this package, the versions and settings of JAX, the processor. Any difference gives
+another hash. A file carries the hash of its own content; one that is damaged is replaced. A stored program is
+machine code: its folder must not be shared with people who are not trusted.
 """
 
 import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib.util
 import os
+import pickle
+import platform
 import shutil
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import jax
-from jax import export
+import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
+from jax.experimental import serialize_executable
 
 _PACKAGE, _SOURCES = __name__.partition(".")[0], sorted(Path(__file__).parents[1].rglob("*.py"))
 # The source as loaded by this process; nothing is stored if a file has changed since about then.
@@ -35,29 +41,47 @@ _SOURCE = hashlib.sha256(b"".join(file.read_bytes() for file in _SOURCES)).hexdi
 _VERSIONS = 3
 # Settings that a program is traced with and that a context may change.
 _SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
-# What `jax.export` writes its files with.
-_WRITES = importlib.util.find_spec("flatbuffers") is not None
+# Programs on disk: at most so many bytes of one version of the source, checked after so many are written.
+MOST_BYTES, _CHECK_EVERY = 1_000_000_000, 64
+FOLDER_VARIABLE = "ROTFLEX_PROGRAMS"
+"""Environment variable with the folder of compiled programs; `off` keeps none."""
 # With these settings JAX does more at each call than run a program.
 _WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
 _FOR_COMPILER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+# For programs that run a few times: a third to half of the time to compile, a run up to three times as long.
+_QUICK_TO_COMPILE = {"xla_backend_optimization_level": 0}
 _programs: list["PersistentJit"] = []
 
 
-class PersistentJit:
-    """`jax.jit` of a pure function whose first arguments are static, kept on disk beside JAX's own cache.
+@dataclasses.dataclass
+class _Storage:
+    """Where programs are kept: a folder that was chosen, the usual one, or none."""
 
-    Do not differentiate it or map over it: write the function that is to be traced inside of it. Nothing is
-    kept where no folder is set (`enable_compilation_cache`). On other devices than a CPU, and inside of
-    other programs, it is `jax.jit` and nothing else.
+    chosen: Path | None = None
+    off: bool = False
+    written: int = 0
+    lock: threading.Lock = dataclasses.field(default_factory=threading.Lock)
+
+
+_storage = _Storage()
+
+
+class PersistentJit:
+    """`jax.jit` of a pure function whose first arguments are static; compiled programs are kept on disk.
+
+    Do not differentiate it or map over it: write the function that is to be traced inside of it. On other
+    devices than a CPU, and inside of other programs, it is `jax.jit` and nothing else.
 
     Args:
-        function: Pure; a function of a module of this package that returns an array, a tuple of them, or a
-            named tuple that `jax.export` knows (`register_namedtuple_serialization`).
+        function: Pure; a function of a module of this package that returns arrays, in tuples or named tuples.
         static: How many of the first arguments are static.
+        runs_rarely: Whether a program runs a few times only, so that a quick compilation counts for more than
+            a quick run.
     """
 
-    def __init__(self, function: Callable[..., Any], static: int) -> None:
+    def __init__(self, function: Callable[..., Any], static: int, runs_rarely: bool = False) -> None:
         self.jitted = jax.jit(function, static_argnums=tuple(range(static)))
+        self._runs_rarely = runs_rarely
         self._static = static
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._held: dict[Any, Callable[..., Any]] = {}
@@ -74,7 +98,7 @@ class PersistentJit:
         key = (known, tree, kinds, settings)
         if key not in self._held:
             texts = [static_key(x) for x in known]
-            lasting = _keeps() and all(texts) and _unchanged()
+            lasting = bool(programs_folder()) and all(texts) and _unchanged()
             name = f"{self._name}{texts}{tree}{kinds}{settings}" if lasting else ""
             self._held[key] = self._made(known, tree, leaves, name)
         return self._held[key](*leaves)
@@ -93,20 +117,60 @@ class PersistentJit:
         def flat(*leaves: Any) -> Any:
             return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
 
-        if not name:
-            return jax.jit(flat, compiler_options=_options())
-        file = _folder() / hashlib.sha256(name.encode()).hexdigest()
-        program = _read(file)
-        if program is None:
-            program = export.export(jax.jit(flat))(*leaves)
-            _write(program.serialize(), file)
-        # Also a new program is compiled in this form, so that the compilation cache finds it again.
-        return jax.jit(program.call, compiler_options=_options())
+        options = _options() | (_QUICK_TO_COMPILE if self._runs_rarely else {})
+        program = jax.jit(flat, compiler_options=options)
+        folder = programs_folder()
+        if not name or folder is None:
+            return program
+        file = folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
+        stored = _read(file)
+        if stored is None:
+            stored = program.lower(*leaves).compile()
+            _write(stored, file)
+        return stored
 
 
-def persistent_jit(static: int) -> Callable[[Callable[..., Any]], PersistentJit]:
-    """Decorator: the function as a `PersistentJit`, its first `static` arguments static."""
-    return lambda function: PersistentJit(function, static)
+def persistent_jit(static: int, runs_rarely: bool = False) -> Callable[[Callable[..., Any]], PersistentJit]:
+    """Decorator: the function as a `PersistentJit`; arguments as there."""
+    return lambda function: PersistentJit(function, static, runs_rarely)
+
+
+def keep_programs(folder: str | Path | bool = True) -> None:
+    """Choose where compiled programs are kept, for this process.
+
+    Args:
+        folder: The folder; True for the usual one in the user's cache, False for none.
+    """
+    _storage.off = folder is False
+    _storage.chosen = None if isinstance(folder, bool) else Path(folder)
+
+
+def programs_folder() -> Path | None:
+    """Folder of compiled programs.
+
+    Returns:
+        What `keep_programs` or the environment variable `ROTFLEX_PROGRAMS` chose; else beside the code that
+        JAX stores, where the user has asked it to; else the user's cache folder. None where programs are not
+        kept.
+    """
+    if _storage.off or len(jax.devices()) > 1:
+        return None
+    if _storage.chosen is not None:
+        return _storage.chosen
+    if named := os.environ.get(FOLDER_VARIABLE):
+        return None if named == "off" else Path(named)
+    values = jax.config.values
+    beside = values["jax_compilation_cache_dir"] if values["jax_enable_compilation_cache"] else None
+    if beside and "://" not in beside:
+        return Path(beside) / "programs"
+    return _usual_folder()
+
+
+@functools.cache
+def _usual_folder() -> Path:
+    import pooch
+
+    return Path(pooch.os_cache("rotflex_jax")) / "programs"
 
 
 def release_programs() -> None:
@@ -165,23 +229,20 @@ def _options() -> dict[str, Any]:
     return known
 
 
-def _keeps() -> bool:
-    """Whether programs are stored: where JAX stores compiled code."""
-    known = jax.config.values
-    folder = known["jax_compilation_cache_dir"]
-    return bool(_WRITES and known["jax_enable_compilation_cache"] and folder and "://" not in folder)
-
-
-def _folder() -> Path:
-    """Folder of the programs of this source."""
-    return Path(jax.config.values["jax_compilation_cache_dir"]) / "programs" / _surroundings()
-
-
 @functools.cache
 def _surroundings() -> str:
     """Hash of everything that all programs depend on."""
     values = {n: v for n, v in jax.config.values.items() if "cache" not in n and n not in _SETTINGS}
-    return hashlib.sha256(f"{_SOURCE}{jax.__version__}{sorted(values.items())}".encode()).hexdigest()[:32]
+    parts = (_SOURCE, jax.__version__, metadata.version("jaxlib"), sorted(values.items()), _processor())
+    return hashlib.sha256(repr((*parts, os.environ.get("XLA_FLAGS", ""))).encode()).hexdigest()[:32]
+
+
+def _processor() -> str:
+    """What machine code depends on."""
+    known = Path("/proc/cpuinfo")
+    lines = known.read_text(errors="replace").splitlines() if known.exists() else []
+    told = {line for line in lines if line.startswith(("flags", "Features", "model name", "CPU part"))}
+    return f"{platform.system()} {platform.machine()} {platform.processor()} {sorted(told)}"
 
 
 def _unchanged() -> bool:
@@ -189,26 +250,57 @@ def _unchanged() -> bool:
     return all(file.exists() and file.stat().st_mtime < _LOADED - _ABOUT for file in _SOURCES)
 
 
-def _read(file: Path) -> export.Exported | None:
+@functools.cache
+def _prepare_loading() -> None:
+    """Let JAX find its linear algebra, as it does when it lowers a program that needs it."""
+    jax.jit(jnp.linalg.solve).lower(np.eye(1, dtype=np.float32), np.ones(1, np.float32))
+
+
+def _read(file: Path) -> Any:
     """The program in a file; None where there is none, or none that can be used."""
     try:
-        return export.deserialize(bytearray(file.read_bytes()))
-    except Exception:  # missing or damaged: it is traced again
+        data = file.read_bytes()
+        digest, content = data[:32], data[32:]
+        if hashlib.sha256(content).digest() != digest:
+            return None
+        with _storage.lock:
+            _prepare_loading()
+        program = serialize_executable.deserialize_and_load(*pickle.loads(content))
+        os.utime(file)  # what was used last is deleted last
+        return program
+    except Exception:  # missing, or of another version: it is compiled again
         return None
 
 
-def _write(data: bytearray, file: Path) -> None:
-    """Stores a program; where that fails, the next process traces it again."""
-    try:
+def _write(program: Any, file: Path) -> None:
+    """Stores a program; where that fails, the next process compiles it again."""
+    with contextlib.suppress(Exception):  # the disk is full, or this JAX cannot store this program
+        content = pickle.dumps(serialize_executable.serialize(program))
         if not file.parent.exists():
             _clear(file.parent.parent)
             file.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=file.parent)
-        with os.fdopen(handle, "wb") as out:
-            out.write(data)
-        os.replace(name, file)  # complete or not at all, also with several processes
-    except OSError:
-        return
+        try:
+            with os.fdopen(handle, "wb") as out:
+                out.write(hashlib.sha256(content).digest() + content)
+            os.replace(name, file)  # complete or not at all, also with several processes
+        except OSError:
+            os.unlink(name)
+            raise
+        with _storage.lock:
+            _storage.written += 1
+            if _storage.written % _CHECK_EVERY == 1:
+                _shrink(file.parent, MOST_BYTES)
+
+
+def _shrink(folder: Path, most: int) -> None:
+    """Deletes the programs that were not used for the longest time, down to so many bytes."""
+    found = sorted(((f.stat().st_mtime, f.stat().st_size, f) for f in folder.iterdir()), reverse=True)
+    total = 0
+    for _, size, file in found:
+        total += size
+        if total > most:
+            file.unlink(missing_ok=True)
 
 
 def _clear(folder: Path) -> None:
