@@ -27,11 +27,7 @@ import rotflex_jax as rf
 from rotflex_jax.discover.conditions import missing_acceleration
 from rotflex_jax.report import figures
 
-# Two settings of JAX that make this notebook several times quicker. Models run in double precision
-# by themselves, and nothing depends on chance: every run gives the same numbers.
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
+# Models run in double precision by themselves, and nothing depends on chance: runs repeat exactly.
 plt.rcParams.update(
     {"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True, "grid.alpha": 0.3}
 )

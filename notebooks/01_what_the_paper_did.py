@@ -30,9 +30,6 @@ from rotflex_jax.reproduce.figures import FIGURES
 from rotflex_jax.reproduce.plants import SCENARIOS, plant, response
 
 # Models run in double precision by themselves; seeds are settings.
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 # %matplotlib inline
 
 # %% [markdown]

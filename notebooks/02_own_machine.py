@@ -27,9 +27,6 @@ from rotflex_jax.effects import Force, Inertia, Motor, Rectifier, Spring, Viscou
 from rotflex_jax.parameters import parameter
 from rotflex_jax.report import figures
 
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 plt.rcParams.update(
     {"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True, "grid.alpha": 0.3}
 )

@@ -26,9 +26,6 @@ import rotflex_jax as rf
 from rotflex_jax import adaptive
 from rotflex_jax.reproduce.plants import plant, response
 
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 # %matplotlib inline
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True})
 

@@ -21,8 +21,6 @@ import numpy as np
 import rotflex_jax as rf
 from rotflex_jax import effects as fx
 
-rf.enable_fast_loops()
-
 # %matplotlib inline
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True})
 

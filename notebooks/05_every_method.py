@@ -20,9 +20,6 @@ import numpy as np
 
 import rotflex_jax as rf
 
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 # %matplotlib inline
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True})
 

@@ -35,9 +35,6 @@ from rotflex_jax.report import figures
 
 # %%
 # What is compiled for recordings of 10 s serves the measured ones below as well.
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 made = make_record([("stribeck", "hub")], seed=107, seconds=20.0)
 recording = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"], source="independent simulator")
 train, test = recording.split(seconds=10.0)

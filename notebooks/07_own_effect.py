@@ -31,9 +31,6 @@ from rotflex_jax import effects as fx
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.parameters import parameter
 
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 # %matplotlib inline
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True})
 

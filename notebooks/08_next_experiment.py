@@ -26,9 +26,6 @@ import rotflex_jax as rf
 from arena.records import make_record
 from rotflex_jax import effects as fx
 
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 HIDDEN = {("delay", "input"): {"time": 0.0012}}
 
 

@@ -33,9 +33,6 @@ from rotflex_jax import effects as fx
 # %matplotlib inline
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True})
 
-rf.enable_fast_loops()
-rf.enable_compilation_cache()
-
 HIDDEN = {"healthy": [], "rubbing": [("coulomb", "hub")], "stiffening": [("cubic_spring", "joint")]}
 folder = Path(tempfile.mkdtemp())
 for k in range(8):

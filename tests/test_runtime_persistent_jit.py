@@ -1,4 +1,4 @@
-"""Traced programs on disk: found again by another process, and only where nothing they depend on differs."""
+"""Programs on disk: found again by another process, and only where nothing they depend on differs."""
 
 import dataclasses
 import json
@@ -13,8 +13,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pooch
 import pytest
-from jax import export
 
 import rotflex_jax as rf
 from rotflex_jax.effects import Coulomb, LuGre
@@ -22,7 +22,14 @@ from rotflex_jax.effects.base import Force
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.parameters import parameter
 from rotflex_jax.runtime import persistent_jit
-from rotflex_jax.runtime.persistent_jit import PersistentJit, clear_compilation_caches, static_key
+from rotflex_jax.runtime.persistent_jit import (
+    PersistentJit,
+    clear_compilation_caches,
+    keep_programs,
+    performance,
+    programs_folder,
+    static_key,
+)
 from rotflex_jax.runtime.xla import double_precision
 
 traced = []
@@ -75,13 +82,48 @@ def test_what_differs_is_another_program(folder: Path) -> None:
     assert traced == [2.0, 2.0, 3.0, 2.0] and len(files(folder)) == len(program) == 4
 
 
-def test_a_torn_file_is_traced_anew(folder: Path) -> None:
+@pytest.mark.parametrize("damage", ["cut", "a bit", "empty", "something else"])
+def test_a_damaged_file_is_replaced(folder: Path, damage: str) -> None:
     x = np.arange(3, dtype=np.float32)
     new()(2.0, x)
     (file,) = files(folder)
-    file.write_bytes(file.read_bytes()[:40])
+    whole = file.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    file.write_bytes({"cut": whole[:40], "a bit": bytes(flipped), "empty": b""}.get(damage, b"text" * 100))
     np.testing.assert_array_equal(new()(2.0, x), 2 * x)
-    assert len(traced) == 2
+    assert len(traced) == 2 and files(folder) == [file] and file.read_bytes() != whole[:40]
+    np.testing.assert_array_equal(new()(2.0, x), 2 * x)
+
+
+def test_what_was_not_used_for_long_is_deleted_first(folder: Path) -> None:
+    program, x = new(), np.ones(2, np.float32)
+    for slope in (2.0, 3.0, 4.0):
+        program(slope, x)
+    oldest, newer, newest = sorted(files(folder), key=lambda f: f.stat().st_mtime_ns)
+    for age, file in enumerate((oldest, newest, newer)):
+        os.utime(file, (1e9 + age, 1e9 + age))
+    persistent_jit._shrink(oldest.parent, newer.stat().st_size + newest.stat().st_size)
+    assert set(files(folder)) == {newer, newest}
+
+
+def test_a_program_with_linear_algebra_runs_in_a_process_that_has_compiled_none(tmp_path: Path) -> None:
+    """Such a program calls a library, which JAX prepares only when it compiles a call of it."""
+    code = """
+import sys, json, numpy as np, jax.numpy as jnp
+from rotflex_jax.runtime import persistent_jit
+persistent_jit._LOADED += 3600.0
+persistent_jit.keep_programs(sys.argv[1])
+program = persistent_jit.PersistentJit(lambda A, b: jnp.linalg.solve(A, b), static=0)
+A = np.array([[2.0, 1.0], [1.0, 3.0]], np.float32)
+print(json.dumps(program(A, np.array([3.0, 4.0], np.float32)).tolist()))
+"""
+    for _ in range(2):
+        run = subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True
+        )
+        np.testing.assert_allclose(json.loads(run.stdout), [1.0, 1.0], rtol=1e-6)
+    assert len([f for f in tmp_path.glob("*/*") if f.is_file()]) == 1
 
 
 def test_nothing_is_kept_of_source_that_changed_under_the_process(
@@ -92,10 +134,54 @@ def test_nothing_is_kept_of_source_that_changed_under_the_process(
     assert not files(folder)
 
 
-def test_nothing_is_stored_without_a_folder(folder: Path) -> None:
-    jax.config.update("jax_compilation_cache_dir", None)
+def test_nothing_is_stored_where_none_is_to_be_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keep_programs(False)
+    try:
+        assert new()(2.0, np.ones(1))[0] == 2.0
+    finally:
+        keep_programs(True)
+    monkeypatch.setenv("ROTFLEX_PROGRAMS", "off")
     assert new()(2.0, np.ones(1))[0] == 2.0
     assert not files(folder)
+
+
+def test_a_folder_may_be_chosen_and_the_usual_one_is_the_users(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        usual = programs_folder()
+        assert usual is not None and usual.parent == Path(pooch.os_cache("rotflex_jax"))
+        keep_programs(tmp_path)
+        new()(2.0, np.ones(1))
+        assert len([f for f in tmp_path.glob("*/*") if f.is_file()]) == 1
+        found = performance()
+        assert (found.folder, found.programs) == (tmp_path, 1) and found.size > 0
+        assert str(tmp_path) in str(found)
+    finally:
+        keep_programs(True)
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
+LOOPS = """
+import sys, os
+if "first" in sys.argv:
+    import jax.numpy
+    jax.numpy.ones(3)
+import rotflex_jax as rf
+print(rf.performance().fast_loops, "XLA_FLAGS" in os.environ)
+"""
+
+
+@pytest.mark.parametrize(("when", "expected"), [("last", "True False"), ("first", "False False")])
+def test_loops_are_fast_unless_jax_has_started_before(when: str, expected: str) -> None:
+    clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    run = subprocess.run(
+        [sys.executable, "-c", LOOPS, when], capture_output=True, text=True, check=True, env=clean
+    )
+    assert run.stdout.strip() == expected
 
 
 def test_old_versions_are_deleted(folder: Path) -> None:
@@ -169,9 +255,6 @@ def test_a_simulation_in_a_second_process_is_the_same_and_traces_no_step(tmp_pat
 class Pair(NamedTuple):
     twice: jax.Array
     left: jax.Array | None
-
-
-export.register_namedtuple_serialization(Pair, serialized_name="test_runtime_persistent_jit.Pair")
 
 
 def test_a_named_tuple_comes_back_from_disk_as_one(folder: Path) -> None:

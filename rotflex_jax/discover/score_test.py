@@ -24,8 +24,8 @@ from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ReducedMo
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.fit.problem import each_recording
-from rotflex_jax.mechanism import Mechanism, Solver
-from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism import Exponential, Mechanism, Solver
+from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
     RunParameters,
@@ -104,11 +104,15 @@ def candidate_sensitivities(
         batches: What to probe.
         window: Window of each sample.
     """
-    s = predictor.supermodel
+    s, solver = predictor.supermodel, predictor.solver
     active = s.active(current.gates)
+    if isinstance(solver, Exponential) and solver.passes is not None:
+        # A contact without a level never sticks, so only those of the hypothesis are coupled.
+        contacts = Layout.of(active.mechanism.structure).contacts
+        solver = dataclasses.replace(solver, passes=min(solver.passes, contacts + 1))
     with double_precision():
         structure, inputs = active.mechanism.structure, predictor.restrict(current, active)
-        A = _run_slopes(structure, predictor.solver, inputs, predictor.on_device(), jnp.asarray(window))
+        A = _run_slopes(structure, solver, inputs, predictor.on_device(), jnp.asarray(window))
 
     def run(job: tuple[ReducedModel, InactiveCandidates]) -> np.ndarray:
         model, (_, parameter_set, d) = job
@@ -116,8 +120,7 @@ def candidate_sensitivities(
         with double_precision():
             present = jnp.array([model.states.index(i) for i in active.states])
             structure, inputs = model.mechanism.structure, predictor.restrict(parameter_set, model)
-            solver, data = predictor.solver, predictor.on_device()
-            given = (present, A, along, data, jnp.asarray(window))
+            given = (present, A, along, predictor.on_device(), jnp.asarray(window))
             return np.asarray(_inactive_slopes(structure, solver, inputs, *given))
 
     jobs = [(s.with_family(current.gates, b.family), b) for b in batches]

@@ -23,8 +23,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Shaped
 
-from rotflex_jax.runtime.xla import scan_in_one_kernel
-
 BLOCK_SAMPLES = 32
 """Length of a block: shorter ones make the scan longer, longer ones the products larger."""
 BLOCKED_FROM_SAMPLES = 8 * BLOCK_SAMPLES
@@ -60,7 +58,7 @@ def linear_outputs(
     toeplitz = jnp.moveaxis(toeplitz, 2, 1).reshape(BLOCK_SAMPLES * len(C), BLOCK_SAMPLES * m)
     push = jnp.moveaxis((powers[BLOCK_SAMPLES - 1 :: -1] @ B), 0, 1).reshape(n, BLOCK_SAMPLES * m)
     w = jnp.pad(flat, ((0, -N % BLOCK_SAMPLES), (0, 0))).reshape(-1, BLOCK_SAMPLES * m)
-    starts = scan_in_one_kernel(lambda x, f: (powers[BLOCK_SAMPLES] @ x + f, x), x0, w @ push.T)[1]
+    starts = jax.lax.scan(lambda x, f: (powers[BLOCK_SAMPLES] @ x + f, x), x0, w @ push.T)[1]
     y = w @ toeplitz.T + starts @ seen.reshape(-1, n).T
     return y.reshape(-1, len(C))[:N]
 
@@ -101,7 +99,7 @@ def _stepped(step: StepFunction, x0: jax.Array, inputs: Any, constants: Any) -> 
     def body(x: jax.Array, w: Any) -> tuple[jax.Array, jax.Array]:
         return step(x, w, constants), x
 
-    return scan_in_one_kernel(body, x0, inputs)[1]
+    return jax.lax.scan(body, x0, inputs)[1]
 
 
 CHUNK_SAMPLES = 512
@@ -164,7 +162,7 @@ def tangent_recursion(
         a, force = ab
         return jnp.sum(a * dx[:, None], axis=0) + force, dx
 
-    return scan_in_one_kernel(body, dx0, (A, b))[1]
+    return jax.lax.scan(body, dx0, (A, b))[1]
 
 
 @_stepped.defjvp

@@ -38,7 +38,6 @@ from rotflex_jax.mechanism.simulate import (
     started_again,
 )
 from rotflex_jax.mechanism.step import Exponential
-from rotflex_jax.runtime.xla import scan_in_one_kernel
 
 
 class RunParameters(NamedTuple):
@@ -244,7 +243,7 @@ def accumulate_outputs(
 
     first, measured = samples.started_at(jnp.asarray(x0))
     carry = (first, x0_directions, start)
-    (_, _, sums), stored = scan_in_one_kernel(advance, carry, (drive(values, gates), dv, measured))
+    (_, _, sums), stored = jax.lax.scan(advance, carry, (drive(values, gates), dv, measured))
     return sums, stored
 
 

@@ -18,7 +18,7 @@ from rotflex_jax.mechanism.small_matrices import evaluate_effect, matvec, sparse
 from rotflex_jax.mechanism.smooth_rk4 import SmoothRK4
 from rotflex_jax.mechanism.step import Exponential
 from rotflex_jax.runtime.persistent_jit import persistent_jit
-from rotflex_jax.runtime.xla import scan_in_one_kernel, working_precision
+from rotflex_jax.runtime.xla import working_precision
 
 
 def true_outputs(structure: Mechanism, x: Float[Array, "n *S"]) -> Float[Array, "C *S"]:
@@ -231,7 +231,7 @@ def _free_outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001,
         rows = jnp.pad(rows, ((0, 0), (0, len(x0) - rows.shape[1])))
         return sensor_readings(mechanism, gates, linear_outputs(step, x0, v, c, rows).T, None).T
     body = lambda x, w: (step(x, w, c), read_outputs(mechanism, gates, x))  # noqa: E731
-    return scan_in_one_kernel(body, x0, v)[1]
+    return jax.lax.scan(body, x0, v)[1]
 
 
 def simulate(

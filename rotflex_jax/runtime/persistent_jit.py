@@ -33,6 +33,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
+from rotflex_jax.runtime.xla import cores, loops_are_fast, start_with_fast_loops
+
 _PACKAGE, _SOURCES = __name__.partition(".")[0], sorted(Path(__file__).parents[1].rglob("*.py"))
 # The source as loaded by this process; nothing is stored if a file has changed since about then.
 _LOADED, _ABOUT = time.time(), 10.0
@@ -89,6 +91,7 @@ class PersistentJit:
 
     def __call__(self, *arguments: Any) -> Any:
         """What the function returns."""
+        start_with_fast_loops()
         known, leaves = arguments[: self._static], jax.tree.leaves(arguments[self._static :])
         if _plain() or any(isinstance(leaf, Tracer) for leaf in leaves):
             return self.jitted(*arguments)
@@ -123,7 +126,7 @@ class PersistentJit:
         if not name or folder is None:
             return program
         file = folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
-        stored = _read(file)
+        stored = _read(file, leaves)
         if stored is None:
             stored = program.lower(*leaves).compile()
             _write(stored, file)
@@ -153,6 +156,7 @@ def programs_folder() -> Path | None:
         JAX stores, where the user has asked it to; else the user's cache folder. None where programs are not
         kept.
     """
+    start_with_fast_loops()
     if _storage.off or len(jax.devices()) > 1:
         return None
     if _storage.chosen is not None:
@@ -164,6 +168,52 @@ def programs_folder() -> Path | None:
     if beside and "://" not in beside:
         return Path(beside) / "programs"
     return _usual_folder()
+
+
+@dataclasses.dataclass(frozen=True)
+class Performance:
+    """What makes the programs of this package quick, as it is in this process; its text is one line.
+
+    Attributes:
+        folder: Where compiled programs are kept; None where they are not.
+        programs: How many are there, of this version of the package on this processor.
+        size: Their size [bytes].
+        fast_loops: Whether XLA compiles a loop over samples into one function; not where other JAX code
+            started it before, with other options.
+        cores: How many cores the process may use.
+        platform: Where JAX computes.
+    """
+
+    folder: Path | None
+    programs: int
+    size: int
+    fast_loops: bool
+    cores: int
+    platform: str
+
+    def __str__(self) -> str:
+        """One line for a person."""
+        kept = "compiled programs are not kept"
+        if self.folder:
+            kept = f"{self.programs} compiled programs ({self.size / 1e6:.0f} MB) are kept in {self.folder}"
+        loops = "loops over samples are compiled into one function each"
+        if self.platform == "cpu" and not self.fast_loops:
+            loops = "slow loops: JAX had started before; call rotflex_jax.enable_fast_loops() first of all"
+        return f"{kept}; {loops}; {self.cores} cores, {self.platform}"
+
+
+def performance() -> Performance:
+    """What makes the programs of this package quick; see `Performance`.
+
+    >>> keep_programs(False)
+    >>> str(performance()).partition(";")[0]
+    'compiled programs are not kept'
+    >>> keep_programs(True)
+    """
+    folder = programs_folder()
+    own = folder / _surroundings() if folder else None
+    sizes = [f.stat().st_size for f in own.iterdir()] if own and own.is_dir() else []
+    return Performance(folder, len(sizes), sum(sizes), loops_are_fast(), cores(), jax.default_backend())
 
 
 @functools.cache
@@ -234,7 +284,8 @@ def _surroundings() -> str:
     """Hash of everything that all programs depend on."""
     values = {n: v for n, v in jax.config.values.items() if "cache" not in n and n not in _SETTINGS}
     parts = (_SOURCE, jax.__version__, metadata.version("jaxlib"), sorted(values.items()), _processor())
-    return hashlib.sha256(repr((*parts, os.environ.get("XLA_FLAGS", ""))).encode()).hexdigest()[:32]
+    parts = (*parts, os.environ.get("XLA_FLAGS", ""), loops_are_fast())
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
 def _processor() -> str:
@@ -256,8 +307,8 @@ def _prepare_loading() -> None:
     jax.jit(jnp.linalg.solve).lower(np.eye(1, dtype=np.float32), np.ones(1, np.float32))
 
 
-def _read(file: Path) -> Any:
-    """The program in a file; None where there is none, or none that can be used."""
+def _read(file: Path, leaves: list[Any]) -> Any:
+    """The program in a file; None where there is none, or none that runs with arguments like these."""
     try:
         data = file.read_bytes()
         digest, content = data[:32], data[32:]
@@ -266,6 +317,8 @@ def _read(file: Path) -> Any:
         with _storage.lock:
             _prepare_loading()
         program = serialize_executable.deserialize_and_load(*pickle.loads(content))
+        # What JAX had loaded from its own cache, and not compiled, may be stored without its functions.
+        jax.block_until_ready(program(*leaves))
         os.utime(file)  # what was used last is deleted last
         return program
     except Exception:  # missing, or of another version: it is compiled again

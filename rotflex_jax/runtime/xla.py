@@ -1,9 +1,7 @@
 """Settings of JAX and of this machine: fast loops, compilation cache, precision, threads and devices.
 
-The package's own loops over samples are compiled into one function each (`scan_in_one_kernel`) and its
-programs are kept on disk (`persistent_jit`), without a setting. `enable_fast_loops` and
-`enable_compilation_cache` do the same for all JAX code of a process; they are global, so importing the
-package never calls them.
+Importing the package changes no setting. Its first computation starts XLA, if nothing has started it before,
+with loops over samples compiled into one function each (`start_with_fast_loops`).
 """
 
 import contextlib
@@ -16,7 +14,6 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Num
 from threadpoolctl import ThreadpoolController
@@ -31,8 +28,8 @@ def enable_fast_loops(limit: int = 262144) -> bool:
     whole loop as long as one iteration touches fewer bytes than a limit, 1024 by default.
     Raising the limit makes simulating and fitting a joint five to twelve times faster.
 
-    Do not call it in a library: `XLA_FLAGS` holds for the whole process. XLA reads it at the first
-    use of a device, so a call after the first array is without effect.
+    The package's first computation does it, unless XLA was started before; then neither has an effect, as
+    XLA reads `XLA_FLAGS` when it starts. Call this where other JAX code comes first.
 
     Args:
         limit: Memory that one iteration may touch [bytes]. Far larger values slow down loops with
@@ -103,59 +100,29 @@ def enable_fast_start() -> None:
     enable_compilation_cache()
 
 
-# Operations that only work as calls of their own, so that a loop with one cannot be a single function.
-_CALLS = ("scatter", "sort", "fft", "callback", "ffi_call", "custom_call", "conv_general", "rng", "top_k")
-_FACTORISATIONS = ("cholesky", "lu", "qr", "svd", "eig", "eigh", "schur", "hessenberg", "householder_product")
-_SOLVES = ("triangular_solve", "tridiagonal", "tridiagonal_solve", "geqrf", "geqp3", "cholesky_update")
-_ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
+@functools.cache
+def start_with_fast_loops() -> None:
+    """Start XLA as `enable_fast_loops` would, unless it has been started; the environment stays as it was.
 
-
-def scan_in_one_kernel(body: Callable[[Any, Any], Any], carry: Any, xs: Any, **options: Any) -> Any:
-    """`jax.lax.scan` of a short body, which XLA compiles into one function on a CPU.
-
-    By default XLA calls each operation of a loop by itself unless a turn touches fewer than 1024 bytes. For
-    a body of some hundred operations on a few numbers each, one function is five to twelve times faster. Not
-    for bodies with large matrix products. A body with an operation that only works as a call of its own, such
-    as a sort or a factorisation, runs as usual.
-
-    Args:
-        body: As for `jax.lax.scan`.
-        carry: First carry.
-        xs: Inputs, leading axis over turns.
-        **options: Of `jax.lax.scan`.
-
-    Returns:
-        As `jax.lax.scan`.
+    XLA reads its options once, when it starts.
     """
-
-    @jax.jit
-    def loop(carry: Any, xs: Any) -> Any:
-        # What stands inside the function must not become a function of its own.
-        with set_xla_metadata(**dict.fromkeys(_ONE_KERNEL)):
-            return jax.lax.scan(body, carry, xs, **options)
-
-    if jax.default_backend() != "cpu" or not _fits_one_kernel(loop.trace(carry, xs).jaxpr.jaxpr):
-        return jax.lax.scan(body, carry, xs, **options)
-    with set_xla_metadata(**_ONE_KERNEL):
-        return loop(carry, xs)
+    before = os.environ.get("XLA_FLAGS")
+    if enable_fast_loops():
+        jax.devices()
+    if before is None:
+        os.environ.pop("XLA_FLAGS", None)
+    else:
+        os.environ["XLA_FLAGS"] = before
 
 
-def _fits_one_kernel(jaxpr: Any) -> bool:
-    """Whether no operation in a program needs a call of its own."""
-    for equation in jaxpr.eqns:
-        name = equation.primitive.name
-        if name in _FACTORISATIONS + _SOLVES or any(part in name for part in _CALLS):
-            return False
-        inner = (
-            x for value in equation.params.values() for x in (value if isinstance(value, tuple) else (value,))
-        )
-        if not all(
-            _fits_one_kernel(getattr(x, "jaxpr", x))
-            for x in inner
-            if hasattr(x, "jaxpr") or hasattr(x, "eqns")
-        ):
-            return False
-    return True
+@functools.cache
+def loops_are_fast() -> bool:
+    """Whether XLA compiles a loop over samples into one function, in this process."""
+    start_with_fast_loops()
+    x = np.ones(400, np.float32)  # a turn touches more than the usual limit
+    turn = lambda c, _: (jnp.tanh(c), None)  # noqa: E731
+    program = jax.jit(lambda c: jax.lax.scan(turn, c, None, length=1000)).lower(x).compile()
+    return "xla_cpu_small_call" in (program.as_text() or "")
 
 
 def working_precision(*arrays: Num[np.ndarray, "..."]) -> contextlib.AbstractContextManager:
@@ -163,6 +130,7 @@ def working_precision(*arrays: Num[np.ndarray, "..."]) -> contextlib.AbstractCon
 
     Outside it the user's own JAX configuration is untouched.
     """
+    start_with_fast_loops()
     if any(np.asarray(a).dtype == np.float64 for a in arrays):
         return jax.enable_x64(True)
     return contextlib.nullcontext()
@@ -170,6 +138,7 @@ def working_precision(*arrays: Num[np.ndarray, "..."]) -> contextlib.AbstractCon
 
 def double_precision() -> contextlib.AbstractContextManager:
     """Context in which JAX computes in float64, as fits and discovery need."""
+    start_with_fast_loops()
     return jax.enable_x64(True)
 
 
