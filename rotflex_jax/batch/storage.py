@@ -16,6 +16,7 @@ import numpy as np
 from rotflex_jax import __version__
 from rotflex_jax.batch.result import RecordingRow
 from rotflex_jax.batch.task import Record, Search, SearchTask, record
+from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -113,6 +114,10 @@ def created(folder: str | os.PathLike[str]) -> Path:
     Raises:
         InputError: It cannot be.
     """
+    if not isinstance(folder, str | os.PathLike):
+        raise InputError(
+            f"Argument `folder` must be a path, but is {shown(folder)}; give for instance 'fleet'."
+        )
     try:
         for part in (RESULTS, MODELS):
             (Path(folder) / part).mkdir(parents=True, exist_ok=True)

@@ -21,6 +21,7 @@ from rotflex_jax.cli.reproduce import reproduce
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
+from rotflex_jax.text.plain import printable
 
 if TYPE_CHECKING:
     from rotflex_jax.recording import Recording
@@ -59,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _refuse(sentence: str) -> NoReturn:
-    print("rotflex: " + " ".join(sentence.split()), file=sys.stderr)
+    print("rotflex: " + printable(" ".join(sentence.split())), file=sys.stderr)
     sys.exit(2)
 
 
