@@ -9,6 +9,9 @@ from typing import Any
 from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 
+UNFINISHED: set[Path] = set()
+"""Files that are being written, beside their places; whoever ends the process meanwhile takes them away."""
+
 
 def path_of(given: Any) -> Path:
     """A path of what was given as one.
@@ -43,6 +46,7 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
             place.write_bytes(data)
             return path
         try:
+            UNFINISHED.add(part)
             with part.open("wb") as file:
                 file.write(data)
             if place.exists():
@@ -52,6 +56,7 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
             part.replace(place)
         finally:
             part.unlink(missing_ok=True)
+            UNFINISHED.discard(part)
     except OSError as error:
         raise InputError(
             f"{path} cannot be written ({error.strerror or error}); make room or name another place."
