@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from rotflex_jax import __version__
+from rotflex_jax.batch.code_digest import code_text, of_main
 from rotflex_jax.batch.result import RecordingRow
-from rotflex_jax.batch.task import Record, Search, SearchTask, record
+from rotflex_jax.batch.task import Record, Search, SearchTask, record, subjects
 from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
@@ -36,7 +37,8 @@ def digest_of_search(
         (__version__, physics, model.solver, model.gates, _named(search), share, sorted(reading.items()))
     )
     files = [Path(place).read_bytes() for place in places if place.endswith(".py")]
-    return _digest(text.encode(), *files)
+    written = code_text(s for s in subjects(model, search) if of_main(s))
+    return _digest(text.encode(), written.encode(), *files)
 
 
 def digest_of_recording(source: Path | Recording, common: str) -> str:
