@@ -402,6 +402,8 @@ def test_nonsense_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    if function == "explore":
+        pytest.importorskip("ipywidgets")
     call, good = FUNCTIONS[function]
     refused(lambda: call(**{**good, argument: value}), phrase)
 
