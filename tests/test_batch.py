@@ -352,6 +352,29 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda r: r["result"].pop("baseline"),
+        lambda r: r["result"].update(verdict="perhaps"),
+        lambda r: r["result"].update(rounds=3),
+        lambda r: r["result"]["noise_floor"].update(theta="much"),
+        lambda r: r["result"]["baseline"]["held_out_rmse_windows"].update(theta=True),
+        lambda r: r.update(seconds=None),
+        lambda r: r.update(reason=["none"]),
+    ],
+)
+def test_a_result_that_was_changed_is_no_result(damage, files, tmp_path) -> None:
+    row = functools.partial(fleet, JOINT, files[:1], folder=tmp_path, workers=0, search=batch_search.quick)
+    row()
+    assert row().rows[0].known
+    (file,) = (tmp_path / "recordings").iterdir()
+    found = json.loads(file.read_text())
+    damage(found)
+    file.write_text(json.dumps(found))
+    assert not row().rows[0].known
+
+
 def text_of(script: str) -> str:
     """Of the search and the effect of a main program."""
     names: dict = {"__name__": "__main__"}
