@@ -61,6 +61,8 @@ from arena.wrong_table import publish_worlds, show_worlds
 TUNING, REPORT = tuple(range(100, 120)), tuple(range(1000, 1020))
 Job = dict[str, Any]
 
+from rotflex_jax.text.files import write_file
+
 
 def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job]:
     """Records of a run; the ones with nothing hidden take a seed each and the inputs in turn."""
@@ -187,9 +189,7 @@ def provenance() -> dict[str, Any]:
 def save(path: Path, results: dict[str, Any]) -> None:
     """Write at once or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(results, indent=1) + "\n")
-    part.replace(path)
+    write_file(path, json.dumps(results, indent=1) + "\n")
 
 
 def arguments() -> argparse.Namespace:

@@ -51,6 +51,8 @@ from servo.recordings import Split, splits
 RESULTS = HERE / "results"
 PARTS = ("models", "fits", "search", "direction", "so101")
 
+from rotflex_jax.text.files import write_file
+
 
 def machine() -> dict[str, Any]:
     """Where the numbers come from."""
@@ -96,8 +98,8 @@ def main() -> None:
     def keep() -> None:
         found["machine"], found["summary"] = machine(), summary(found["splits"])
         given.out.parent.mkdir(exist_ok=True)
-        given.out.write_text(json.dumps(found, indent=1) + "\n")
-        given.out.with_suffix(".md").write_text(page(found))
+        write_file(given.out, json.dumps(found, indent=1) + "\n")
+        write_file(given.out.with_suffix(".md"), page(found))
 
     known = splits(rf.data.load_dataset("bam_xl330"))
     for name in given.only or known:

@@ -26,6 +26,8 @@ from measured_joint import arm_alone, drawing, fine_run, with_play
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE / "results" / "B1.json"
 
+from rotflex_jax.text.files import write_file
+
 
 def degrees(errors) -> str:
     return " / ".join(f"{np.degrees(errors[c]):.2f}" for c in ("theta", "alpha"))
@@ -147,7 +149,7 @@ def main(parts: list[str]) -> None:
         if part == "fits":
             kept["differences"] = differences(A, B)
         RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps(kept, indent=1) + "\n")
+        write_file(RESULTS, json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":

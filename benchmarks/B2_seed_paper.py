@@ -35,6 +35,8 @@ TABLES = {
 }
 """Section of the worked paper -> module of `seed_paper`."""
 
+from rotflex_jax.text.files import write_file
+
 
 def table(section: str, quick: bool) -> dict[str, Any]:
     """One table, with its references beside it."""
@@ -105,7 +107,7 @@ def main() -> int:
             f"{summary(known[section])}"
         )
     markdown = a.markdown or path.with_suffix(".md")
-    markdown.write_text(page(results))
+    write_file(markdown, page(results))
     codes = {known[s]["code"] for s in wanted}
     if len(codes) > 1:
         print(f"These tables come from {len(codes)} versions of the package.")

@@ -28,6 +28,8 @@ from public_machines.page import page
 
 RESULTS = HERE / "results"
 
+from rotflex_jax.text.files import write_file
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -49,8 +51,8 @@ def main() -> None:
         found[name] = CASES[name](say) | {"seconds": round(time.perf_counter() - began, 1)}
         found = {name: found[name] for name in CASES if name in found}
         given.out.parent.mkdir(exist_ok=True)
-        given.out.write_text(json.dumps(found, indent=1) + "\n")
-        given.out.with_suffix(".md").write_text(page(found))
+        write_file(given.out, json.dumps(found, indent=1) + "\n")
+        write_file(given.out.with_suffix(".md"), page(found))
     print(page(found))
 
 

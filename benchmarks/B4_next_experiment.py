@@ -32,6 +32,7 @@ from rotflex_jax.experiment.discrimination import starts_with_other_shapes
 from rotflex_jax.experiment.rival_fit import best_rival_fit
 from rotflex_jax.experiment.rival_model import RivalModel, rival_model
 from rotflex_jax.experiment.standard_inputs import standard_inputs
+from rotflex_jax.text.files import write_file
 
 TS, SECONDS = 0.002, 20.0
 LIMITS = Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
@@ -179,8 +180,8 @@ def main() -> None:
         for seed in given.seeds:
             rows.append(trial(name, seed, given.starts, lambda s: print(s, flush=True)))
             given.out.mkdir(exist_ok=True, parents=True)
-            (given.out / "B4.json").write_text(json.dumps({"schema": 1, "rows": rows}, indent=1) + "\n")
-            (given.out / "B4.md").write_text(summary(rows))
+            write_file(given.out / "B4.json", json.dumps({"schema": 1, "rows": rows}, indent=1) + "\n")
+            write_file(given.out / "B4.md", summary(rows))
     print(summary(rows))
 
 

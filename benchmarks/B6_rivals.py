@@ -51,6 +51,8 @@ COLUMNS = (
 )
 Job = dict[str, Any]
 
+from rotflex_jax.text.files import write_file
+
 
 def one(job: Job) -> dict[str, Any]:
     """A rival on a record; imports late, after the settings of the process."""
@@ -208,7 +210,7 @@ def main() -> int:
     summary |= {name: marks(rows, records) for name, rows in asked.items() if rows}
     results["summary"] = summary
     B0.save(path, results)
-    path.with_suffix(".md").write_text(page(summary))
+    write_file(path.with_suffix(".md"), page(summary))
     console.print(table(summary))
     return 0
 

@@ -24,6 +24,8 @@ import rotflex_jax
 
 HERE = Path(__file__).resolve().parent / "results"
 
+from rotflex_jax.text.files import write_file
+
 
 def main() -> None:
     """The command line."""
@@ -53,9 +55,9 @@ def run(chosen: argparse.Namespace) -> None:
     with Progress() as progress:
         for name in chosen.only:
             results[name] = SUBSET[name](chosen, progress)
-            path.write_text(json.dumps(results, indent=1) + "\n")
+            write_file(path, json.dumps(results, indent=1) + "\n")
     if not chosen.plain:
-        path.with_suffix(".md").write_text(table.page(results))
+        write_file(path.with_suffix(".md"), table.page(results))
 
 
 def machine() -> dict[str, Any]:

@@ -35,6 +35,7 @@ from rotflex_jax.fit import least_squares
 from rotflex_jax.kernels import average_kernels, effect_kernels, identified_kernels
 from rotflex_jax.kernels.result import root_mean_square
 from rotflex_jax.reproduce.plants import plant
+from rotflex_jax.text.files import write_file
 
 RESULT = Path(__file__).resolve().parent / "results" / "B8.json"
 TS = 0.05
@@ -195,7 +196,7 @@ def main() -> None:
             print(f"{name}: {reason}")
             continue
         kept = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-        RESULT.write_text(json.dumps(kept | {name: found}, indent=1) + "\n", encoding="utf-8")
+        write_file(RESULT, json.dumps(kept | {name: found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from B0_discovery import provenance, save
 from measured_machines.machines import MACHINES
 from measured_machines.page import page
 from rotflex_jax.compare import QUICK
+from rotflex_jax.text.files import write_file
 from speed.processes import process
 
 CHILD = "from measured_machines.child import main; main()"
@@ -122,10 +123,10 @@ def main() -> int:
         rows[key] = head | row | {k: made[k] for k in ("commit", "clean", "code")}
         results["left_out"].pop(machine, None)
         save(a.out, results)
-        a.out.with_suffix(".md").write_text(page(results))
+        write_file(a.out.with_suffix(".md"), page(results))
         print(f"{count}/{len(wanted)} {key}: {row.get('error') or row['sentence']}", flush=True)
     save(a.out, results)
-    a.out.with_suffix(".md").write_text(page(results))
+    write_file(a.out.with_suffix(".md"), page(results))
     print(page(results))
     print(f"saved: {a.out}")
     return int(any("error" in r for r in rows.values()))

@@ -236,22 +236,15 @@ def _last_effect(machine: str) -> dict[str, Any]:
 
 for _part in ("multisine", "arrow"):
     NAMED[f"silverbox_{_part}"] = lambda part=_part: f"{_last_effect('silverbox')['free run'][part]:.2f}"
-    NAMED[f"silverbox_{_part}_published"] = lambda part=_part: (
-        f"{min(p[part] for p in results('B3.json')['silverbox']['published'].values()):.2f}"
+    NAMED[f"silverbox_{_part}_narx"] = lambda part=_part: (
+        f"{results('B3.json')['silverbox']['published']['Gaussian-process NARX'][part]:.2f}"
     )
 
 
 @named
-def emps_found() -> str:
-    """Official error with the effects that were found [mm]."""
-    return f"{_last_effect('emps')['free run']['pulses']:.1f}"
-
-
-@named
-def emps_published() -> str:
-    """The published errors that the text names [mm]."""
-    p = results("B3.json")["emps"]["published"]
-    return f"{p['polynomial NARX']['pulses']:g} and {p['dynoNet']['pulses']:g}"
+def emps_narx() -> str:
+    """The published error that the text names [mm]."""
+    return f"{results('B3.json')['emps']['published']['polynomial NARX']['pulses']:.2f}"
 
 
 def _millimetres(pair: list[float]) -> str:

@@ -1,4 +1,6 @@
-"""Damaged files of every format that is read: each must end as a recording, a model or `InputError`.
+"""Damaged files of every format that is read, results of a fleet and lines of the command line.
+
+Each must end as a recording, a model, a page or `InputError`, a line with status 0 or 2 and one sentence.
 
     python benchmarks/fuzz_input.py                        # 2,000 of each format
     python benchmarks/fuzz_input.py --count 200 --formats mat hdf5
@@ -11,10 +13,12 @@ of memory and of time. The table counts how they end; the exit status is 1 where
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import io
 import json
 import os
+import pickle
 import random
 import resource
 import signal
@@ -147,6 +151,100 @@ def model_seeds() -> list[bytes]:
     return [json.dumps(to_dict(saved), indent=2).encode() for saved in (Saved(joint), rich)]
 
 
+def fleet_seeds() -> list[bytes]:
+    """The file of a recording that a fleet has finished, and of one that it has refused."""
+    from rotflex_jax.batch import storage
+
+    parts = []
+    for state, reason in (("done", ""), ("refused", "Nothing moves in it.")):
+        found = {"name": "run", "source": "run.csv", "digest": DIGEST, "state": state, "reason": reason}
+        found |= {"schema": storage.RESULT_SCHEMA, "seconds": 1.5, "result": None}
+        if state == "done":
+            errors = {"theta": 0.01, "alpha": 0.001}
+            stage = {"held_out_rmse": errors, "held_out_rmse_windows": {"seconds": 2.0, **errors}}
+            effect = {"effect": "coulomb", "port": "hub", "equivalent": [{"effect": "lugre", "port": "hub"}]}
+            found["result"] = {"verdict": "found", "baseline": stage, "rounds": [effect | stage]}
+            found["result"]["noise_floor"] = errors
+        parts.append(json.dumps(found, indent=1).encode())
+    return parts
+
+
+DIGEST = "0" * 64
+"""Digest of the one recording of the fleet."""
+
+LINES = (
+    "check run.csv --Ts 0.002 --degrees --accept short",
+    "discover run.csv --split 0.7 --joint paper:stiffness=1.2 --json out.json --report page",
+    "discover run.csv run.csv --held-out run.csv --test run.csv --calibrate 1.5 --save-model m.json",
+    "discover run.csv --each --workers 2 --output theta --output alpha=alpha",
+    "compare run.csv --methods arx,grey_box --quick --input voltage --time t",
+    "simulate run.csv --add coulomb@hub:level=0.03 --fit run.csv --save sim.csv",
+    "experiment --fit run.csv --between delay@input lag@input --voltage 5 --slew 3 --save next.csv",
+    "export paper --to c --out model.h --Ts 0.002 --prefix joint",
+    "reproduce --set Ts=0.05 --seed 3 --scenario S1",
+    "effects --json",
+    "data list",
+    "--version",
+)
+TOKENS = (
+    "-",
+    "--",
+    "",
+    "=",
+    "@",
+    ":",
+    "nan",
+    "inf",
+    "-1",
+    "1e999",
+    "9" * 400,
+    "\x1b[2J",
+    "\n",
+    "[x]",
+    "é\ud800",
+)
+TOKENS += (
+    "--json",
+    "--report",
+    "/dev/null",
+    ".",
+    "/",
+    "no/such",
+    "x" * 5000,
+    "--help",
+    "coulomb@",
+    "@hub",
+    "paper:",
+)
+
+
+def command_seeds() -> list[bytes]:
+    """Lines of the command line, as lists of words."""
+    return [json.dumps(line.split()).encode() for line in LINES]
+
+
+def mutated_command(data: bytes, pick: random.Random, text: bool) -> bytes:
+    """Words left out, doubled, exchanged with those of other lines, changed, or put in."""
+    words = json.loads(data)
+    others = [word for line in LINES for word in line.split()]
+    for _ in range(pick.choice((1, 1, 2, 4))):
+        at, kind = pick.randrange(len(words) + 1), pick.randrange(5)
+        if kind == 0:
+            del words[at : at + 1]
+        elif kind == 1:
+            words[at:at] = words[at : at + pick.choice((1, 2))]
+        elif kind == 2:
+            words[at : at + 1] = [pick.choice(others)]
+        elif kind == 3:
+            words[at:at] = [pick.choice(TOKENS)]
+        elif words:
+            at %= len(words)
+            cut = pick.randrange(len(words[at]) + 1)
+            words[at] = words[at][:cut] + pick.choice(TOKENS) + words[at][cut + pick.randrange(3) :]
+    # Nothing is fetched here.
+    return json.dumps([word for word in words if not word.startswith("fetch")]).encode()
+
+
 SIZES = (0, 1, 7, 0x7F, 0x80, 0xFF, 0xFFFF, 10**6, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**63 - 1, 2**64 - 1)
 WORDS = (b"1e999", b"-1", b"nan", b"Infinity", b"9" * 400, b"null", b"true", b'"', b"[" * 3000, b"1_0", b"{}")
 WORDS += (b"\0", b"\xff\xfe", b",", b";", b"\n", b"x" * 140_000)
@@ -237,6 +335,8 @@ FORMATS = {
     "hdf5": Format(".mat", hdf5_seeds),
     "parquet": Format(".parquet", parquet_seeds),
     "model": Format(".json", model_seeds, text=True),
+    "fleet": Format(".row", fleet_seeds, text=True),
+    "command": Format(".line", command_seeds, mutated_command),
 }
 
 
@@ -251,6 +351,10 @@ def inputs(name: str, start: int, count: int) -> Iterator[tuple[int, bytes]]:
 
 def read(path: Path) -> Any:
     """What a user would call."""
+    if path.suffix == ".row":
+        return read_fleet(path)
+    if path.suffix == ".line":
+        return run_command(path)
     if path.suffix == ".json":
         from rotflex_jax.models.model_json import read as read_model
 
@@ -258,6 +362,74 @@ def read(path: Path) -> Any:
     from rotflex_jax.data.files import load
 
     return load(path, accept=ALL_FAULTS, max_bytes=MAX_BYTES)
+
+
+def read_fleet(path: Path) -> Any:
+    """A fleet that finds this file of an earlier call, up to its pages."""
+    from types import SimpleNamespace
+    from unittest import mock
+
+    import rotflex_jax as rf
+    from rotflex_jax.batch import storage
+
+    def search(model: Any, train: Any, test: Any) -> Any:
+        return SimpleNamespace(to_dict=lambda: json.loads(fleet_seeds()[0])["result"])
+
+    folder = storage.created(path.with_name("fleet"))
+    (folder / "recordings" / "run.json").write_bytes(path.read_bytes())
+    run = made_once(path.with_name("run.csv"))
+    with (
+        mock.patch.object(storage, "digest_of_recording", lambda *_: DIGEST),
+        mock.patch("rotflex_jax.batch.run._pickled", lambda *given: pickle.dumps((given[0], None))),
+        mock.patch("rotflex_jax.batch.run.carry_out", lambda task: {**storage.record("broken")}),
+    ):
+        return rf.fleet(rf.joints.paper(), [run], folder=folder, workers=0, search=search)
+
+
+def made_once(path: Path) -> Path:
+    """A recording in a file."""
+    if not path.exists():
+        path.write_bytes(csv_seeds()[0])
+    return path
+
+
+def run_command(path: Path) -> Any:
+    """A line of the command line, in a folder with one recording; what takes long is not run."""
+    from unittest import mock
+
+    import rotflex_jax as rf
+    from rotflex_jax.cli import main
+    from rotflex_jax.errors import InputError
+    from rotflex_jax.models.model import Model
+
+    def not_run(*given: Any, **options: Any) -> Any:
+        raise InputError("That takes too long here.")
+
+    made_once(path.with_name("run.csv"))
+    words = json.loads(path.read_bytes())
+    long = ("discover", "compare", "fit", "fleet")
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.ExitStack() as patched:
+        for name in long:
+            patched.enter_context(mock.patch.object(rf, name, not_run))
+        for name in ("rotflex_jax.batch.fleet", "rotflex_jax.reproduce.reproduce"):
+            patched.enter_context(mock.patch(name, not_run))
+        patched.enter_context(mock.patch.object(Model, "simulate", not_run))
+        patched.enter_context(contextlib.chdir(path.parent))
+        patched.enter_context(contextlib.redirect_stdout(out))
+        patched.enter_context(contextlib.redirect_stderr(err))
+        try:
+            main(words)
+        except SystemExit as left:
+            status = left.code
+    if status not in (0, 2) or "Traceback" in err.getvalue():
+        raise RuntimeError(f"status {status}: {err.getvalue()[-60:]}")
+    last = (err.getvalue().splitlines() or [""])[-1]
+    if status == 2 and not (last.startswith("rotflex: ") and last[-1] in ".?"):
+        raise RuntimeError(f"no sentence: {last[-60:]}")
+    if "\x1b" in err.getvalue() + out.getvalue():
+        raise RuntimeError("a code of the terminal")
+    return status
 
 
 def outcome(path: Path) -> str:

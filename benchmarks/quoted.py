@@ -28,6 +28,8 @@ MARK = re.compile(r"<!--= *(?P<source>[^>]*?) *-->(?P<text>.*?)<!--=-->", re.DOT
 DIRECT = re.compile(r"(?P<file>\S+\.json) (?P<way>.+?)(?: \[(?P<unit>[^\]]+)\])? (?P<form>[.,+]?\S*[dfg])")
 UNITS = {"deg": 180 / math.pi, "mm": 1e3, "%": 100.0, "ms": 1e3}
 
+from rotflex_jax.text.files import write_file
+
 
 def at(file: str, way: str) -> Any:
     """What lies at the end of a way, for instance "rows/-1/free run"."""
@@ -82,7 +84,7 @@ def main() -> None:
                 stale = True
                 print(f"{name}: {before['source']} is {after['text']}, not {before['text']}")
         if new != text and not arguments.check:
-            document.write_text(new, encoding="utf-8")
+            write_file(document, new)
     if stale and arguments.check:
         sys.exit("Run python benchmarks/quoted.py.")
 

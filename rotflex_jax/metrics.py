@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Int, Real
 
+from rotflex_jax.checks import positive, shown, whole
 from rotflex_jax.errors import InputError
 
 
@@ -56,7 +57,12 @@ def _score(
     channels = getattr(y, "channels", None)
     measured = np.asarray(y if channels is None else getattr(y, "y"))  # noqa: B009
     modelled = np.asarray(y_hat)
-    start = int(getattr(y, "n_init", 0) if n_init is None else n_init)
+    start = getattr(y, "n_init", 0) if n_init is None else whole(n_init, "n_init", 0)
+    if not (measured.ndim and all(a.dtype.kind in "iufc" for a in (measured, modelled))):
+        raise InputError(
+            "The measured and the modelled output must be arrays of numbers, time first, but are "
+            f"{shown(y)} and {shown(y_hat)}; give what was recorded and simulated."
+        )
     if measured.shape != modelled.shape:
         raise InputError(
             f"The measured and the modelled output must have the same shape, but have "
@@ -190,7 +196,7 @@ def window_starts(recording: Sampled, seconds: float) -> tuple[Int[np.ndarray, "
         seconds: Length of a window [s], twice `n_init` at least; a rest no longer than that joins the
             last.
     """
-    N, m = recording.N, recording.n_init
+    N, m, seconds = recording.N, recording.n_init, positive(seconds, "seconds")
     width = min(N, max(round(seconds / recording.Ts), 2 * m))
     starts = np.arange(0, max(N - 2 * m, 1), width)
     return starts, max(width, N - int(starts[-1]))

@@ -20,6 +20,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.batch import Fleet, fleet, page, workers
+from rotflex_jax.batch.code_digest import code_text
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime import xla
 
@@ -210,8 +211,8 @@ def test_stopping_leaves_a_page_of_what_is_finished(files, tmp_path) -> None:
     ("change", "words"),
     [
         ({"recordings": []}, "No recording"),
-        ({"split": 1.0}, "between 0 and 1"),
-        ({"workers": -1}, "0 or more"),
+        ({"split": 1.0}, "above 0 and below 1"),
+        ({"workers": -1}, "whole number from 0"),
         ({"workers": 2, "scheduler": "tcp://127.0.0.1:1"}, "one of the two"),
         ({"folder": __file__}, "name another"),
         ({"degree": True}, "did you mean degrees"),
@@ -279,6 +280,144 @@ def test_a_cluster_finishes_though_a_worker_is_killed(scheduler, tmp_path) -> No
     killer.join()
     assert answers(found) == answers(serial)
     assert len(running()) == len(files) + 1
+
+
+@pytest.mark.parametrize("moment", ["while recordings are searched", "between recordings"])
+def test_a_scheduler_that_dies_is_said_in_one_sentence(moment, scheduler, tmp_path, capfd) -> None:
+    from distributed import Client
+
+    files = [write(tmp_path / f"run_{k}.csv", k, 0.3) for k in range(12)]
+    with Client(scheduler, set_as_default=False) as client:
+        number = client.run_on_scheduler(os.getpid)
+    room = tmp_path / "room"
+    room.mkdir()
+    capfd.readouterr()
+
+    def kill() -> None:
+        until((room / "running").exists)
+        os.kill(number, signal.SIGKILL)
+
+    if moment == "between recordings":
+        (room / "go").touch()
+        said = lambda line: os.kill(number, signal.SIGKILL) if line.startswith("1 of") else None  # noqa: E731
+    else:
+        said = lambda line: None  # noqa: E731
+        threading.Thread(target=kill, daemon=True).start()
+    search = functools.partial(batch_search.waiting, folder=str(room))
+    with pytest.raises(InputError, match="went away; start it again and repeat the call"):
+        fleet(JOINT, files, folder=tmp_path / "out", scheduler=scheduler, search=search, progress=said)
+    assert "Traceback" not in "".join(capfd.readouterr())
+    kept = len(list((tmp_path / "out" / "recordings").iterdir()))
+    assert (kept > 0) == (moment == "between recordings")
+
+
+SCRIPT = """
+import dataclasses, functools, sys
+from typing import ClassVar
+import rotflex_jax as rf
+from batch_search import quick
+from rotflex_jax.effects import Force, register
+from rotflex_jax.parameters import parameter
+LEVEL = 1.0
+
+def helper(x):
+    return x + LEVEL
+
+class Settings:
+    share = 0.5
+    def of(self, x):
+        return x * self.share
+
+@register
+@dataclasses.dataclass(frozen=True)
+class Drag(Force):
+    name: ClassVar[str] = "own_drag"
+    title: ClassVar[str] = "drag"
+    equation: ClassVar[str] = "tau = -c speed"
+    amplitudes: ClassVar[tuple[str, ...]] = ("c",)
+    c: float = parameter(1.0, unit="N m s/rad", lower=0.0)
+
+    def force(self, position, speed, voltage):
+        return -self.c * speed
+
+def search(model, train, test):
+    # a remark
+    found = quick(model, train, test)
+    found.number = [helper(k) for k in range(3)], Settings().of(2.0), {"a", "b", "c"}
+    return found
+
+if __name__ == "__main__":
+    rows = rf.fleet(rf.joints.paper(), sys.argv[2:], folder=sys.argv[1], workers=0, search=search).rows
+    print("known" if all(row.known for row in rows) else "searched", rows[0].reason)
+"""
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda r: r["result"].pop("baseline"),
+        lambda r: r["result"].update(verdict="perhaps"),
+        lambda r: r["result"].update(rounds=3),
+        lambda r: r["result"]["noise_floor"].update(theta="much"),
+        lambda r: r["result"]["baseline"]["held_out_rmse_windows"].update(theta=True),
+        lambda r: r.update(seconds=None),
+        lambda r: r.update(reason=["none"]),
+    ],
+)
+def test_a_result_that_was_changed_is_no_result(damage, files, tmp_path) -> None:
+    row = functools.partial(fleet, JOINT, files[:1], folder=tmp_path, workers=0, search=batch_search.quick)
+    row()
+    assert row().rows[0].known
+    (file,) = (tmp_path / "recordings").iterdir()
+    found = json.loads(file.read_text())
+    damage(found)
+    file.write_text(json.dumps(found))
+    assert not row().rows[0].known
+
+
+def text_of(script: str) -> str:
+    """Of the search and the effect of a main program."""
+    names: dict = {"__name__": "__main__"}
+    exec(compile(script.replace("@register\n", ""), "main.py", "exec"), names)
+    return code_text([names["search"], names["Drag"]])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        ("# a remark", "# another remark", True),
+        ("LEVEL = 1.0", "FURTHER = 3\n\nLEVEL = 1.0", True),
+        ("LEVEL = 1.0", "LEVEL = 2.0", False),
+        ("return x + LEVEL", "return x - LEVEL", False),
+        ("range(3)", "range(4)", False),
+        ("share = 0.5", "share = 0.6", False),
+        ("x * self.share", "x / self.share", False),
+        ("-self.c * speed", "-self.c * speed**3", False),
+        ("lower=0.0", "lower=1e-3", False),
+    ],
+)
+def test_the_digest_has_what_the_main_program_does(old: str, new: str, same: bool) -> None:
+    script = SCRIPT.partition("if __name__")[0]
+    assert text_of(script) == text_of(script)
+    assert (text_of(script) == text_of(script.replace(old, new))) == same
+
+
+def test_what_changes_in_the_main_program_is_searched_again(files, tmp_path) -> None:
+    script = tmp_path / "main.py"
+    path = HERE["PYTHONPATH"] + os.pathsep + str(Path(batch_search.__file__).parent)
+
+    def run(text: str) -> str:
+        script.write_text(text)
+        line = [sys.executable, str(script), str(tmp_path / "out"), str(files[0])]
+        done = subprocess.run(
+            line, env=HERE | {"PYTHONPATH": path}, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    assert run(SCRIPT) == "searched"
+    assert run(SCRIPT.replace("# a remark", "# another remark")) == "known"
+    assert run(SCRIPT.replace("LEVEL = 1.0", "LEVEL = 2.0")) == "searched"
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system places processes itself")

@@ -73,7 +73,7 @@ REFUSED = {
     "discover run_0.csv --workers 2": "--each",
     "discover run_0.csv --each --held-out run_1.csv": "--held-out",
     "discover run_0.csv --each --save-model m.json": "--save-model",
-    "discover run_0.csv --each --workers -1": "0 or more",
+    "discover run_0.csv --each --workers -1": "whole number from 0",
     "discover run_0.csv --each --workers many": "--workers",
     "discover run_0.csv --each --workers 2 --scheduler tcp://127.0.0.1:1": "one of the two",
     "discover run_0.csv missing.csv --each": "missing.csv",

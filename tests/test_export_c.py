@@ -189,7 +189,7 @@ def test_says_which_effect_it_cannot_write():
 
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan"), float("inf")])
 def test_refuses_a_sampling_period_that_is_none(period):
-    with pytest.raises(InputError, match="needs a sampling period in seconds"):
+    with pytest.raises(InputError, match="`Ts` must be a finite number above 0"):
         to_c(Model(paper()), period)
 
 

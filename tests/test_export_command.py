@@ -106,7 +106,7 @@ def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
     for arguments, words in (
         ((saved, "--to", "fortran"), ("'fortran'", "c, latex, text, statespace")),
         (("paper", "--to", "c"), ("needs a sampling period", "--Ts")),
-        ((saved, "--to", "c", "--Ts", "-1"), ("needs a sampling period",)),
+        ((saved, "--to", "c", "--Ts", "-1"), ("`Ts` must be a finite number above 0", "-1")),
         ((tmp_path / "no.json", "--to", "text"), ("does not exist",)),
         ((saved, "--to", "text", "--out", tmp_path / "no" / "where.txt"), ("does not", "exist")),
     ):

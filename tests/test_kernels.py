@@ -443,7 +443,7 @@ def refused(phrase: str, call) -> None:
 def test_bad_input_is_refused_in_one_sentence() -> None:
     u, joint = white(18), paper()
     refused("has the outputs theta, alpha", lambda: local_kernels(joint, Ts, "tip", 4))
-    refused("whole number of lags", lambda: local_kernels(joint, Ts, "alpha", 0))
+    refused("`memory` must be a whole number from 1", lambda: local_kernels(joint, Ts, "alpha", 0))
     refused("must be positive", lambda: local_kernels(joint, -1.0, "alpha", 4))
     refused("positive sampling period", lambda: average_kernels(joint, u, "alpha", 4))
     refused("longer recording", lambda: average_kernels(joint, u[:50], "alpha", 4, Ts=Ts))

@@ -232,10 +232,10 @@ def test_the_table_has_a_line_per_weight() -> None:
     ("arguments", "sentence"),
     [
         ({"basis": Delays(2)}, "is needed, but Delays was given; wrap a bank in a Volterra series"),
-        ({"recordings": []}, "Argument `recordings` is empty"),
+        ({"recordings": []}, "No recording was given as `recordings`"),
         ({"ridge": -1.0}, "Argument `ridge` must be 0 or more, or 'cv', but is -1.0"),
         ({"ridge": "best"}, "or 'cv', but is 'best'"),
-        ({"ridge": "cv", "blocks": 1}, "at least 2 blocks, but 1"),
+        ({"ridge": "cv", "blocks": 1}, "`blocks` must be a whole number from 2, but is 1"),
         ({"channel": "tip"}, "no channel 'tip'"),
         ({"skip": 600}, "The first 600 samples are left out, but recording 0 has 600"),
         (

@@ -92,7 +92,7 @@ def test_channel_at_rest_has_no_fit_but_an_error() -> None:
         ((Y, Y[:3]), "same shape"),
         ((Y, Y[:, 0]), "same shape"),
         ((Y, Y, 4), "4 of 4 samples"),
-        ((Y, Y, -1), "-1 of 4 samples"),
+        ((Y, Y, -1), "whole number from 0, but is -1"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(arguments: tuple, phrase: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from arena.marks import Kept, Row, confusion, good, grouped, intervals, mean_set, sets
 from arena.table import answer, label
 from rotflex_jax.text.colours import BASELINE, FINAL, INK
+from rotflex_jax.text.files import write_file
 from rotflex_jax.text.plotting import blank, styled
 
 
@@ -31,7 +32,7 @@ def publish(records: list[Row], results: Path) -> list[Path]:
             figures.append(results.with_name(f"{results.stem}_{draw.__name__.removeprefix('draw_')}.png"))
             draw(records, figures[-1])
     page = results.with_suffix(".md")
-    page.write_text(written(records, figures))
+    write_file(page, written(records, figures))
     return [page, *figures]
 
 

@@ -15,6 +15,8 @@ from arena.table import answer, mark
 
 Row = dict[str, Any]
 
+from rotflex_jax.text.files import write_file
+
 
 def hidden_in(row: Row) -> str:
     """What a world hides, in short."""
@@ -135,7 +137,7 @@ def publish_worlds(records: list[Row], results: Path) -> list[Path]:
     if not good(records):
         return []
     page = results.with_suffix(".md")
-    page.write_text(written(records))
+    write_file(page, written(records))
     return [page]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Inexact, Real, Shaped
 
-from rotflex_jax.basis.bank import all_finite
+from rotflex_jax.checks import all_finite
 from rotflex_jax.errors import InputError
 
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Inexact, Int
 from rotflex_jax.adaptive.fast_forms import RegressorsInLoop, fastest_form
 from rotflex_jax.adaptive.filter import AdaptiveFilter, as_samples, finite, regressor_size, scan, stretch
 from rotflex_jax.basis import Basis, Volterra
-from rotflex_jax.basis.bank import require_basis, signal
+from rotflex_jax.basis.bank import require_basis
+from rotflex_jax.checks import signal
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime.xla import working_precision
 

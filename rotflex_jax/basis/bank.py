@@ -12,8 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Float, Int
 
+from rotflex_jax.checks import signal, whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime.xla import working_precision
 
@@ -126,50 +127,6 @@ def impulse(length: int) -> Float[np.ndarray, " L"]:
             f"Argument `length` must be a number of samples from 1, but is {length!r}; give for instance 100."
         )
     return np.eye(1, int(length))[0]
-
-
-def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
-    """A signal as an array, float32 where that was given, else float64.
-
-    Raises:
-        InputError: More than one column, complex, empty, or not finite.
-    """
-    u = np.asarray(u)
-    if u.dtype.kind not in "iuf" or u.ndim != 1 or not u.size:
-        raise InputError(
-            f"Argument `{name}` must be real numbers of shape (N,), one per sample, but is "
-            f"{u.dtype.name} of shape {u.shape}; give one signal."
-        )
-    if not all_finite(u):
-        k = int(np.argmin(np.isfinite(u)))
-        raise InputError(
-            f"Argument `{name}` must be finite, but is {u[k]} at sample {k}; cut the signal there."
-        )
-    return u.astype(np.float32 if u.dtype in (np.float16, np.float32) else np.float64, copy=False)
-
-
-def all_finite(x: Num[np.ndarray, "..."]) -> bool:
-    """Whether all numbers are finite, mostly without an array of results."""
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(np.sum(x)) or np.isfinite(x).all())
-
-
-def whole(value: Any, name: str, least: int) -> int:
-    """A whole number that is not too small.
-
-    >>> whole(2.5, "memory", 1)
-    Traceback (most recent call last):
-        ...
-    rotflex_jax.errors.InputError: Argument `memory` must be a whole number from 1, but is 2.5; \
-give for instance 1.
-    """
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not number or not np.isfinite(value) or value != int(value) or value < least:
-        raise InputError(
-            f"Argument `{name}` must be a whole number from {least}, but is {value!r}; "
-            f"give for instance {least}."
-        )
-    return int(value)
 
 
 class Delays(Bank):

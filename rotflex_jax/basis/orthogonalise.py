@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rotflex_jax.basis.bank import evaluate, signal
+from rotflex_jax.basis.bank import evaluate
 from rotflex_jax.basis.volterra import Index, Volterra, from_tensor, indices, spread
+from rotflex_jax.checks import signal
 from rotflex_jax.errors import InputError
 
 # Relative norm of the residual below which a column depends linearly on those before it.

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rotflex_jax.basis.bank import Bank, whole
+from rotflex_jax.basis.bank import Bank
+from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.samples import sampling_period
 

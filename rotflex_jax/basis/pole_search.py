@@ -10,9 +10,9 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from rotflex_jax.basis.bank import signal, whole
 from rotflex_jax.basis.orthonormal import Orthonormal, SectionKinds, coordinates, numbers_of, poles_of
 from rotflex_jax.basis.volterra import Volterra
+from rotflex_jax.checks import signal, whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime.xla import double_precision
 

@@ -9,8 +9,9 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from rotflex_jax.basis.bank import Bank, signal, whole
+from rotflex_jax.basis.bank import Bank
 from rotflex_jax.basis.orthonormal import Orthonormal
+from rotflex_jax.checks import signal, whole
 from rotflex_jax.errors import InputError
 
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rotflex_jax.basis.bank import Bank, evaluate, whole
+from rotflex_jax.basis.bank import Bank, evaluate
+from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 
 Index = tuple[int, ...]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax.batch.task import Record
+from rotflex_jax.text.plain import printable, spreadsheet_cell
 
 Errors = dict[str, float | None]
 
@@ -155,11 +156,13 @@ class Fleet:
         }
 
     def to_csv(self) -> str:
-        """One row per recording."""
+        """One row per recording; no text in it is a formula of a spreadsheet."""
         text = io.StringIO()
         table = csv.DictWriter(text, list(RecordingRow("", "").flat(tuple(self.units))), lineterminator="\n")
-        table.writeheader()
-        table.writerows(r.flat(tuple(self.units)) for r in self.rows)
+        safe = lambda x: spreadsheet_cell(printable(x)) if isinstance(x, str) else x  # noqa: E731
+        table.writerow({name: safe(name) for name in table.fieldnames})
+        rows = (r.flat(tuple(self.units)) for r in self.rows)
+        table.writerows({name: safe(value) for name, value in row.items()} for row in rows)
         return text.getvalue()
 
     def write(self) -> Path:

@@ -8,11 +8,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from rotflex_jax import checks
 from rotflex_jax.batch import storage
 from rotflex_jax.batch.result import Fleet
 from rotflex_jax.batch.storage import BatchProgress, Source
 from rotflex_jax.batch.task import Record, Search, SearchTask, carry_out, places_of
 from rotflex_jax.batch.workers import in_processes, on_cluster, workers_here
+from rotflex_jax.checks import shown
 from rotflex_jax.data import load
 from rotflex_jax.discover import discover
 from rotflex_jax.errors import InputError
@@ -67,8 +69,13 @@ def fleet(
         InputError: No recording, one that is given twice, a share outside 0 to 1, an unknown argument, a
             folder that cannot be written, a scheduler that does not answer.
     """
-    model = joint if isinstance(joint, Model) else Model(joint)
-    sources = [r if isinstance(r, Recording) else Path(r) for r in recordings]
+    model, progress = Model.of(joint), checks.progress(progress)
+    sources = _sources(recordings)
+    if not callable(search):
+        raise InputError(
+            f"Argument `search` must be a function of a model and two recordings, but is {shown(search)}; "
+            "leave it out for rotflex_jax.discover."
+        )
     _check(sources, split, scheduler, workers)
     for name in reading:
         choose(name, inspect.signature(load).parameters, "argument of load")
@@ -77,7 +84,6 @@ def fleet(
     reading = {"outputs": {c: c for c in units}, "units": units, **reading}
     task = SearchTask(Path(), reading, split, _pickled(model, search), places)
     common = storage.digest_of_search(model, search, split, reading, places)
-    progress = progress or (lambda _: None)
     batch = BatchProgress(sources, task, common, storage.created(folder), progress)
     try:
         with closing(_carried_out(batch.unfinished(), scheduler, workers)) as results:
@@ -113,14 +119,30 @@ def _pickled(model: Model, search: Search) -> bytes:
         ) from None
 
 
+def _sources(recordings: Any) -> list[Source]:
+    """Recordings and paths of files."""
+    wrong = [recordings]
+    if isinstance(recordings, Iterable) and not isinstance(recordings, str | bytes):
+        found = list(recordings)
+        wrong = [r for r in found if not isinstance(r, Recording | str | os.PathLike)]
+        if not wrong:
+            return [r if isinstance(r, Recording) else Path(r) for r in found]
+    raise InputError(
+        f"Argument `recordings` must be a list of files or Recordings, but {shown(wrong[0])} was given; "
+        "give for instance ['run1.csv', 'run2.csv']."
+    )
+
+
 def _check(sources: Sequence[Source], split: float, scheduler: str | None, workers: int | None) -> None:
     """Checks the arguments before any work."""
     if not sources:
         raise InputError("No recording was given, but a fleet needs one or more; give files or recordings.")
-    if not 0 < split < 1:
+    checks.number(split, "split", above=0, below=1, example="0.7")
+    if workers is not None:
+        checks.whole(workers, "workers", 0)
+    if not (scheduler is None or isinstance(scheduler, str)):
         raise InputError(
-            f"Argument `split` is the share of each recording to learn from and must lie between 0 and 1, "
-            f"but is {split:g}; give for instance 0.7."
+            f"Argument `scheduler` must be an address, but is {shown(scheduler)}; write tcp://HOST:8786."
         )
     if workers is not None and (workers < 0 or scheduler is not None):
         given = f"{workers} workers were given" + (" and a scheduler" if scheduler is not None else "")

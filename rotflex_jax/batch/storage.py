@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 import os
 import time
 from collections import Counter
@@ -14,8 +15,11 @@ from typing import Any
 import numpy as np
 
 from rotflex_jax import __version__
+from rotflex_jax.batch.code_digest import code_text, of_main
 from rotflex_jax.batch.result import RecordingRow
-from rotflex_jax.batch.task import Record, Search, SearchTask, record
+from rotflex_jax.batch.task import Record, Search, SearchTask, record, subjects
+from rotflex_jax.checks import real, shown
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -35,7 +39,8 @@ def digest_of_search(
         (__version__, physics, model.solver, model.gates, _named(search), share, sorted(reading.items()))
     )
     files = [Path(place).read_bytes() for place in places if place.endswith(".py")]
-    return _digest(text.encode(), *files)
+    written = code_text(s for s in subjects(model, search) if of_main(s))
+    return _digest(text.encode(), written.encode(), *files)
 
 
 def digest_of_recording(source: Path | Recording, common: str) -> str:
@@ -101,10 +106,26 @@ def read(folder: Path, name: str, digest: str) -> Record | None:
     """The result of the same search of the same recording; None where there is no valid one."""
     try:
         known = json.loads((folder / RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     same = isinstance(known, dict) and known.get("schema") == RESULT_SCHEMA and known.get("digest") == digest
-    return known if same and known.get("state") in ("done", "refused") else None
+    return known if same and known.get("state") in ("done", "refused") and _is_whole(known) else None
+
+
+def _is_whole(known: Record) -> bool:
+    """Whether a file has all that a row of the summary shows, each of its kind."""
+    try:
+        row = RecordingRow.of(known)
+        errors = (row.before, row.after, row.whole_before, row.whole_after, row.noise)
+        words = [row.name, row.source, row.reason, *(e for each in errors for e in each)]
+        words += [w for effect, port, others in row.effects for w in (effect, port, *sum(others, ()))]
+        numbers = [row.seconds, *(v for each in errors for v in each.values() if v is not None)]
+        numbers += [] if row.window_seconds is None else [row.window_seconds]
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        return False
+    verdicts = {v.value for v in Verdict} if known["state"] == "done" else {""}
+    right = all(isinstance(w, str) for w in words) and all(math.isfinite(real(x)) for x in numbers)
+    return right and row.verdict in verdicts
 
 
 def created(folder: str | os.PathLike[str]) -> Path:
@@ -113,6 +134,10 @@ def created(folder: str | os.PathLike[str]) -> Path:
     Raises:
         InputError: It cannot be.
     """
+    if not isinstance(folder, str | os.PathLike):
+        raise InputError(
+            f"Argument `folder` must be a path, but is {shown(folder)}; give for instance 'fleet'."
+        )
     try:
         for part in (RESULTS, MODELS):
             (Path(folder) / part).mkdir(parents=True, exist_ok=True)

@@ -8,10 +8,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from rotflex_jax.batch.code_digest import MAIN
 from rotflex_jax.data import load
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
@@ -91,6 +92,14 @@ def _model(found: Any) -> str | None:
     return None
 
 
+def subjects(model: Model, search: Search) -> tuple[Any, ...]:
+    """The function that searches, without its bound arguments, and all effects that it may meet."""
+    function: Any = search
+    while isinstance(function, functools.partial):
+        function = function.func
+    return (function, *CATALOG.values(), *map(type, model.mechanism.effects))
+
+
 def places_of(model: Model, search: Search, *, far: bool) -> tuple[str, ...]:
     """Files and modules of the user that a worker needs, for effects that are searched or in the model.
 
@@ -102,12 +111,9 @@ def places_of(model: Model, search: Search, *, far: bool) -> tuple[str, ...]:
     Raises:
         InputError: The main program is among them, and the workers are far.
     """
-    subject: Any = search
-    while isinstance(subject, functools.partial):
-        subject = subject.func
-    subjects: Iterable[Any] = (subject, *CATALOG.values(), *map(type, model.mechanism.effects))
-    names = {s.__module__: s.__qualname__ for s in subjects if s.__module__.split(".")[0] != "rotflex_jax"}
-    own = [names.pop(main) for main in ("__main__", "__mp_main__") if main in names]
+    parts = (s for s in subjects(model, search) if s.__module__.split(".")[0] != "rotflex_jax")
+    names = {s.__module__: s.__qualname__ for s in parts}
+    own = [names.pop(main) for main in MAIN if main in names]
     if own and far:
         raise InputError(
             f"{own[0]} was written in the main program, where the workers of a cluster cannot find it; move "

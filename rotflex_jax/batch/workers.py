@@ -6,10 +6,12 @@ another package.
 """
 
 import contextlib
+import logging
 import os
 import signal
 import uuid
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import CancelledError
 from itertools import islice
 from multiprocessing import connection, get_context
 from pathlib import Path
@@ -171,31 +173,61 @@ def on_cluster(jobs: Iterable[tuple[int, SearchTask]], scheduler: str) -> Genera
             f"No Dask scheduler answers at {scheduler} ({' '.join(str(error).split())}); start one with "
             "`dask scheduler`, or give none to use the processes of this machine."
         ) from None
+    gone = InputError(
+        f"The scheduler at {scheduler} went away; start it again and repeat the call, which goes on where it "
+        "stopped."
+    )
+    # Of a scheduler that is gone every call fails in its own way.
+    lost = (OSError, TimeoutError, CancelledError, RuntimeError)
     jobs, running = iter(jobs), {}
-    with client:
+    with _without_its_log(), client:
         done = distributed.as_completed(loop=client.loop)
 
         def fill() -> None:
-            while len(running) < QUEUED_RECORDINGS + sum(client.nthreads().values()):
+            while len(running) < QUEUED_RECORDINGS + threads():
                 job = next(jobs, None)
                 if job is None:
                     return
-                future = client.submit(prepared, job[1], key=f"rotflex-{uuid.uuid4().hex}", pure=False)
+                try:
+                    future = client.submit(prepared, job[1], key=f"rotflex-{uuid.uuid4().hex}", pure=False)
+                except lost:
+                    raise gone from None
                 running[future] = job[0]
                 done.add(future)
+
+        def threads() -> int:
+            try:
+                return sum(client.nthreads().values())
+            except lost:
+                raise gone from None
 
         fill()
         for future in done:
             number = running.pop(future)
-            if future.status == "finished":
-                found = future.result()
-            elif future.status == "error":
+            if future.status == "error":
                 fault = future.exception()
                 found = record("broken", f"{type(fault).__name__}: {fault}")
+            elif future.status == "finished":
+                try:
+                    found = future.result()
+                except lost:
+                    raise gone from None
             else:
-                raise InputError(
-                    f"The scheduler at {scheduler} went away; start it again and repeat the call, which "
-                    "goes on where it stopped."
-                )
+                raise gone
             yield number, found
             fill()
+
+
+@contextlib.contextmanager
+def _without_its_log() -> Iterator[None]:
+    """Dask logs the loss of a scheduler with its tracebacks, and again while it tries to connect."""
+    # Each of its parts has a level of its own.
+    parts = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+    levels = {log: log.level for log in map(logging.getLogger, ("distributed", *parts))}
+    for log in levels:
+        log.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for log, level in levels.items():
+            log.setLevel(level)

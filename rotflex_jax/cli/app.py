@@ -6,7 +6,8 @@ imported inside the commands, so that `rotflex --help` answers at once.
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -18,9 +19,12 @@ from rotflex_jax.cli.data import check, data_app
 from rotflex_jax.cli.experiment import experiment
 from rotflex_jax.cli.models import export, simulate
 from rotflex_jax.cli.reproduce import reproduce
+from rotflex_jax.cli.rounds_so_far import RoundsSoFar
+from rotflex_jax.cli.stopping import STOPPED
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
+from rotflex_jax.text.plain import printable
 
 if TYPE_CHECKING:
     from rotflex_jax.recording import Recording
@@ -52,14 +56,15 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _refuse(f"{fault}; {command} --help lists what can be given.")
     except OSError as error:
         _refuse(f"{error.filename or 'A file'} cannot be used: {error.strerror or error}.")
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
+        status = STOPPED
+    if status == STOPPED:  # typer makes that of Ctrl-C, where the process is another program's
         print("rotflex: stopped", file=sys.stderr)
-        sys.exit(130)
     sys.exit(status if isinstance(status, int) else 0)
 
 
 def _refuse(sentence: str) -> NoReturn:
-    print("rotflex: " + " ".join(sentence.split()), file=sys.stderr)
+    print("rotflex: " + printable(" ".join(sentence.split())), file=sys.stderr)
     sys.exit(2)
 
 
@@ -171,8 +176,9 @@ def compare(
 
     with terminal.progress("Comparing") as step:
         result = rf.compare(train, wanted, mechanism=mechanism, test=test, progress=step)
-    _give(result, terminal.print_comparison, json_file)
-    _report(result, report, json_file)
+    with _each_by_itself() as attempt:
+        attempt(lambda: _give(result, terminal.print_comparison, json_file))
+        attempt(lambda: _report(result, report, json_file))
 
 
 def effects(
@@ -205,12 +211,35 @@ def _discover(
     enable_fast_start()
     import rotflex_jax as rf
 
+    kept = RoundsSoFar(json_file)
     with terminal.progress("Searching for missing effects") as step:
-        result = rf.discover(mechanism, train, validation, test=test, progress=step, **options)
-    _give(result, terminal.print_discovery, json_file)
-    if save_model is not None:
-        result.save(save_model)
-    _report(result, report, json_file)
+        result = rf.discover(
+            mechanism, train, validation, test=test, progress=kept.following(step), **options
+        )
+    with _each_by_itself() as attempt:
+        attempt(lambda: _give(result, terminal.print_discovery, json_file))
+        attempt(kept.remove)
+        if save_model is not None:
+            attempt(lambda: result.save(save_model))
+        attempt(lambda: _report(result, report, json_file))
+
+
+@contextmanager
+def _each_by_itself() -> Iterator[Callable[[Callable[[], Any]], None]]:
+    """Writes one thing after the other: what fails costs none of the others, and is said at the end."""
+    failed: list[Exception] = []
+
+    def attempt(write: Callable[[], Any]) -> None:
+        try:
+            write()
+        except (InputError, OSError) as error:
+            failed.append(error)
+
+    yield attempt
+    for error in failed[:-1]:
+        terminal.message(f"rotflex: {error}", error=True)
+    if failed:
+        raise failed[-1]
 
 
 def _give(result: Any, show: Callable[[Any], None], json_file: Path | None) -> None:

@@ -45,7 +45,7 @@ def data_fetch(
         with terminal.progress(f"Fetching {name}"):
             paths = fetch(name)
         for path in paths:
-            print(path)
+            terminal.message(str(path))
 
 
 def check(

@@ -1,7 +1,9 @@
 """`rotflex experiment`: the input that distinguishes two effects."""
 
+import io
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 from rotflex_jax.cli import arguments as given, terminal
@@ -9,6 +11,8 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import digits
+
+FIGURE_ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 
 
 def experiment(
@@ -36,6 +40,11 @@ def experiment(
     given.check_distinct(fit, [])
     for file in (save, plot, json_file):
         given.check_writable(json_file=file)
+    if plot is not None and plot.suffix not in FIGURE_ENDINGS:
+        raise InputError(
+            f"{plot} has the ending {plot.suffix or '(none)'}, but a figure is written as "
+            f"{', '.join(FIGURE_ENDINGS)}; choose one of these."
+        )
     if given.STDOUT in (save, plot):
         raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
     model = by_name.model(joint, add or ())
@@ -68,13 +77,10 @@ def experiment(
             improve=not rank_only,
             progress=step,
         )
-        if save is not None:
-            found.save_csv(save)
-        if plot is not None:
-            found.plot().savefig(plot, dpi=150)
     result = found.to_dict(None if save is None else str(save))
     if json_file == given.STDOUT:
-        print(json.dumps(result, indent=2))
+        print(json.dumps(result, indent=2), flush=True)
+        _write_files(found, save, plot)
         return
     terminal.output().print(str(found), markup=False)
     names = found.channels
@@ -93,9 +99,19 @@ def experiment(
     terminal.print_rows(heads, rows)
     if json_file is not None:
         write_file(json_file, json.dumps(result, indent=2) + "\n")
+    _write_files(found, save, plot)
     for path in (save, plot):
         if path is not None:
             terminal.message(f"Written: {path}")
+
+
+def _write_files(found: Any, save: Path | None, plot: Path | None) -> None:
+    """The input, then its figure in the format that the name of the file ends in."""
+    if save is not None:
+        found.save_csv(save)
+    if plot is not None:
+        found.plot().savefig(picture := io.BytesIO(), dpi=150, format=plot.suffix[1:])
+        write_file(plot, picture.getvalue())
 
 
 def _limits(voltage: float, slew: float, travel: float, deflection: float) -> Any:

@@ -53,12 +53,10 @@ def reproduce(
 
     with terminal.progress("Reproducing") as step:
         result = run(settings, *parts, joint=mechanism if parts else None, progress=step)
-        step("figures and page")
-        page = write(result, out)
     terminal.print_findings([recording for part in parts for recording in part])
     quiet = json_file == given.STDOUT
     if quiet:
-        print(json.dumps(result.to_dict(), indent=2))
+        print(json.dumps(result.to_dict(), indent=2), flush=True)
     else:
         console = terminal.output()
         console.print(headline(result), style="bold", markup=False)
@@ -68,6 +66,8 @@ def reproduce(
         console.print(online, markup=False)
         if json_file is not None:
             write_file(json_file, json.dumps(result.to_dict(), indent=2) + "\n")
+    with terminal.progress("Writing figures and page"):
+        page = write(result, out)
     terminal.message(f"Page: {page}", error=quiet)
 
 

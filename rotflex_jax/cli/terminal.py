@@ -1,8 +1,10 @@
 """What the command line shows to a person: progress on stderr, results on stdout."""
 
+import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +14,32 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import digits, readable
+from rotflex_jax.text.plain import one_line, printable, spreadsheet_cell
 
 # Rows of a long table that are shown.
 LISTED_RECORDINGS = 60
 
 
+class SafeConsole(Console):
+    """A console on which names from files cannot steer the terminal."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print texts without their control codes, and tables, whose cells `cell` has made safe."""
+        super().print(*(printable(x) if isinstance(x, str) else x for x in objects), **options)
+
+
+def cell(text: str) -> str:
+    """A text for a table: no markup, no control codes."""
+    return escape(one_line(text))
+
+
 def output() -> Console:
     """The console for results. Made on use, so that it follows a redirected stdout."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = SafeConsole(highlight=False, soft_wrap=True)
     # A file or a pipe has no width of its own; 80 columns would break the tables.
-    return console if console.is_terminal else Console(highlight=False, soft_wrap=True, width=160)
+    return console if console.is_terminal else SafeConsole(highlight=False, soft_wrap=True, width=160)
 
 
 @contextmanager
@@ -35,12 +52,12 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
     Yields:
         The function to call with one short phrase per step.
     """
-    console = Console(stderr=True, highlight=False)
+    console = SafeConsole(stderr=True, highlight=False)
     if not console.is_terminal:
         yield lambda step: console.print(step, markup=False, soft_wrap=True)
         return
     with console.status(title) as status:
-        yield lambda step: status.update(escape(step))
+        yield lambda step: status.update(cell(step))
 
 
 def _errors(errors: Mapping[str, float], units: Mapping[str, str]) -> list[str]:
@@ -56,9 +73,9 @@ def error_table(rows: Sequence[tuple[str, Mapping[str, float]]], units: Mapping[
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("")
     for channel, unit in units.items():
-        table.add_column(escape(f"{channel} [{readable(1.0, unit)[1]}]"), justify="right")
+        table.add_column(cell(f"{channel} [{readable(1.0, unit)[1]}]"), justify="right")
     for label, errors in rows:
-        table.add_row(escape(label), *_errors(errors, units))
+        table.add_row(cell(label), *_errors(errors, units))
     return table
 
 
@@ -167,7 +184,7 @@ def print_recording(recording: Any) -> None:
 
 def message(text: str, *, error: bool = False) -> None:
     """One line for a person."""
-    Console(stderr=error, highlight=False).print(text, markup=False, soft_wrap=True)
+    SafeConsole(stderr=error, highlight=False).print(text, markup=False, soft_wrap=True)
 
 
 def unit_of(recording: Any, channel: str) -> str:
@@ -176,19 +193,26 @@ def unit_of(recording: Any, channel: str) -> str:
 
 
 def save_simulation(file: Path, recording: Any, simulated: Mapping[str, Real[np.ndarray, " N"]]) -> None:
-    """Write time, input, measured and simulated outputs as CSV, in the units of the recording."""
+    """Write time, input, measured and simulated outputs as CSV, in the units of the recording.
+
+    Raises:
+        InputError: The file cannot be written; an old one stays.
+    """
     names = ["t", recording.input_name, *recording.channels, *(f"{c}_simulated" for c in simulated)]
     columns = np.column_stack([recording.t, recording.u, recording.y, *simulated.values()])
-    np.savetxt(file, columns, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    csv.writer(head := StringIO(), lineterminator="").writerow(spreadsheet_cell(one_line(n)) for n in names)
+    header = head.getvalue()
+    np.savetxt(text := StringIO(), columns, delimiter=",", header=header, comments="", fmt="%.9g")
+    write_file(file, text.getvalue())
 
 
 def print_rows(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A plain table of texts."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for heading in headings:
-        table.add_column(heading)
+        table.add_column(cell(heading))
     for row in rows:
-        table.add_row(*map(escape, row))
+        table.add_row(*map(cell, row))
     output().print(table)
 
 

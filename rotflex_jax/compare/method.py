@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -104,6 +105,11 @@ def selected_methods(methods: Iterable[str | Method] | None) -> tuple[Method, ..
     """Methods given by name or as objects; all registered ones for None."""
     if methods is None:
         return tuple(METHODS.values())
+    if not isinstance(methods, str | Method | Iterable):
+        raise InputError(
+            f"Argument `methods` must be a list of methods, but is {shown(methods)}; write for instance "
+            "['arx', 'grey_box']."
+        )
     listed = [methods] if isinstance(methods, (str, Method)) else list(methods)
     found: dict[str, Method] = {}
     for item in listed:

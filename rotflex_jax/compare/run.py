@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from rotflex_jax import joints
+from rotflex_jax import checks, joints
 from rotflex_jax.compare.evaluation import (
     divergence_reason,
     error_metrics,
@@ -23,6 +23,7 @@ from rotflex_jax.fit.dataset import sensor_noise
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.runtime.xla import one_thread
 
@@ -63,16 +64,16 @@ def compare(
         InputError: An unknown method, no recording, `test` together with `fraction`, or a recording
             without the channels of the mechanism.
     """
-    start, say = time.perf_counter(), progress or (lambda _: None)
-    listed = selected_methods(methods)
-    mechanism = joints.paper() if mechanism is None else mechanism
-    model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
+    start, say = time.perf_counter(), checks.progress(progress)
+    chosen = selected_methods(methods)
+    model = Model.of(joints.paper() if mechanism is None else mechanism)
+    checks.positive(window_seconds, "window_seconds")
     train, tested = (
         tuple(_with_model_channels(r, model) for r in part)
-        for part in _training_and_test(_as_tuple(recordings), test, fraction)
+        for part in _training_and_test(listed(recordings, shortest=SHORTEST_TO_FIT), test, fraction)
     )
     rows = []
-    for method in listed:
+    for method in chosen:
         say(f"{method.name}: learning")
         rows.append(_row(method, model, train, tested, window_seconds, say))
     noise = sensor_noise((*train, *tested), model)
@@ -131,13 +132,6 @@ def _row(
         return dataclasses.replace(row, status="failed", reason=named)
 
 
-def _as_tuple(recordings: Recording | Sequence[Recording]) -> tuple[Recording, ...]:
-    listed = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
-    if not listed:
-        raise InputError("No recording was given, but at least one is needed; pass a Recording.")
-    return listed
-
-
 def _training_and_test(
     recordings: tuple[Recording, ...],
     test: Recording | Sequence[Recording] | None,
@@ -152,7 +146,7 @@ def _training_and_test(
             "Arguments `test` and `fraction` were both given, but the test data are either "
             "recordings of their own or the end of each; give one of the two."
         )
-    tested = _as_tuple(test)
+    tested = listed(test, "test", SHORTEST_TO_FIT)
     if any(r is s for r in recordings for s in tested):
         raise InputError(
             "The same recording was given to learn from and as test data, but an error on "

@@ -8,11 +8,12 @@ Every input is an array of N voltages [V] at the sampling period Ts [s], the sam
 which is an integer or a NumPy generator. An argument out of range raises `InputError`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.checks import number, positive, real, seed as checked_seed, shown
 from rotflex_jax.errors import InputError
 
 Voltage = Float[np.ndarray, " N"]
@@ -39,7 +40,7 @@ def noise(N: int, Ts: float, *, rms: float = 1.0, bandwidth: float = 5.0, seed: 
     _check_grid(N, Ts)
     _check_positive(rms=rms, bandwidth=bandwidth)
     a = np.exp(-2 * np.pi * bandwidth * Ts)
-    w = rms * np.random.default_rng(seed).standard_normal(N)
+    w = rms * np.random.default_rng(checked_seed(seed)).standard_normal(N)
     w[1:] *= np.sqrt(1 - a**2)
     return np.asarray(lfilter([1.0], [1.0, -a], w))
 
@@ -94,7 +95,7 @@ def multisine(
             f"but is {band[0]:g} to {band[1]:g} Hz; widen it or lengthen the period."
         )
     amplitude = rms * np.sqrt(2 / len(harmonics))
-    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(harmonics))
+    phases = np.random.default_rng(checked_seed(seed)).uniform(0, 2 * np.pi, len(harmonics))
 
     def signal(phases: Float[np.ndarray, " H"]) -> Float[np.ndarray, " P"]:
         spectrum = np.zeros(P // 2 + 1, dtype=complex)
@@ -131,7 +132,7 @@ def prbs(N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed:
     samples = max(1, round(hold / Ts))
     order = max(6, int(np.ceil(np.log2(-(-N // samples) + 1))))
     bits, _ = max_len_seq(order)
-    bits = np.roll(bits, np.random.default_rng(seed).integers(len(bits)))
+    bits = np.roll(bits, np.random.default_rng(checked_seed(seed)).integers(len(bits)))
     return amplitude * (2.0 * np.repeat(bits, samples)[:N] - 1.0)
 
 
@@ -158,9 +159,10 @@ def steps(
     5
     """
     _check_grid(N, Ts)
-    shortest, longest = sorted(hold)
-    _check_positive(amplitude=amplitude, hold=shortest)
-    rng = np.random.default_rng(seed)
+    times = tuple(hold) if isinstance(hold, Sequence) and not isinstance(hold, str) else (hold,)
+    shortest, longest = sorted(positive(time, "hold", "s", "(0.15, 0.8)") for time in (times * 2)[:2])
+    _check_positive(amplitude=amplitude)
+    rng = np.random.default_rng(checked_seed(seed))
     most = -(-N // max(1, round(shortest / Ts)))
     times = np.maximum(1, np.round(rng.uniform(shortest, longest, most) / Ts)).astype(int)
     return np.repeat(rng.uniform(-amplitude, amplitude, most), times)[:N]
@@ -181,8 +183,9 @@ def sweep(N: int, Ts: float, *, band: tuple[float, float] = (0.1, 12.0), amplitu
     3.0
     """
     _check_grid(N, Ts)
-    _check_positive(amplitude=amplitude, band=band[0])
+    _check_positive(amplitude=amplitude)
     _check_band(band, Ts)
+    _check_positive(band=band[0])
     rise = np.log(band[1] / band[0])
     cycles = band[0] * N * Ts / rise * np.expm1(rise * np.arange(N) / N)
     return amplitude * np.sin(2 * np.pi * cycles)
@@ -203,6 +206,8 @@ def pulse(N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, dela
     """
     _check_grid(N, Ts)
     _check_positive(width=width)
+    number(amplitude, "amplitude", unit="V", example="3.0")
+    number(delay, "delay", least=0, unit="s", example="0.1")
     start, stop = round(delay / Ts), round((delay + width) / Ts)
     if not 0 <= start < stop <= N:
         raise InputError(
@@ -221,22 +226,24 @@ INPUTS: dict[str, Callable[..., Voltage]] = {
 
 
 def _check_grid(N: int, Ts: float) -> None:
-    if int(N) != N or N < 1 or not 0 < Ts < np.inf:
+    count, period = real(N), real(Ts)
+    if not (1 <= count < np.inf and count == int(count) and 0 < period < np.inf):
         raise InputError(
             "Arguments `N` and `Ts` must be a number of samples and a sampling period in seconds, "
-            f"but are {N} and {Ts}; give for instance 5000 and 0.002."
+            f"but are {shown(N)} and {shown(Ts)}; give for instance 5000 and 0.002."
         )
 
 
 def _check_positive(**values: float) -> None:
     for name, value in values.items():
-        if not 0 < value < np.inf:
-            raise InputError(f"Argument `{name}` must be positive, but is {value:g}; correct it.")
+        positive(value, name, "", "1.0")
 
 
 def _check_band(band: tuple[float, float], Ts: float) -> None:
-    if not 0 <= band[0] < band[1] <= 0.5 / Ts:
+    ends = [real(end) for end in band] if isinstance(band, Sequence) and not isinstance(band, str) else []
+    if len(ends) != 2 or not 0 <= ends[0] < ends[1] <= 0.5 / Ts:
+        given = f"{shown(band[0])} to {shown(band[1])} Hz" if len(ends) == 2 else shown(band)
         raise InputError(
             f"Argument `band` must rise within 0 and {0.5 / Ts:g} Hz, half the sampling rate, but "
-            f"is {band[0]:g} to {band[1]:g} Hz; correct it."
+            f"is {given}; correct it."
         )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
+from rotflex_jax import checks
 from rotflex_jax.discover.evaluation import evaluate
 from rotflex_jax.discover.formula import Formula, Term, read_formula
 from rotflex_jax.discover.likelihood import LikelihoodProblem
@@ -22,6 +23,7 @@ from rotflex_jax.fit.dataset import prepare, process_noise_ports
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 
 if TYPE_CHECKING:
@@ -191,9 +193,9 @@ def learn_torque(
         InputError: A port that does not exist or that the outputs do not determine, or a map already there.
     """
     clear_compilation_caches()
-    model, say = model if isinstance(model, Model) else Model(model), progress or (lambda _: None)
-    trained = (train,) if isinstance(train, Recording) else tuple(train)
-    held_back = (test,) if isinstance(test, Recording) else tuple(test)
+    model, say = Model.of(model), checks.progress(progress)
+    trained, held_back = listed(train, "train", SHORTEST_TO_FIT), listed(test, "test", SHORTEST_TO_FIT)
+    checks.positive(window_seconds, "window_seconds")
     if any(a is b for a in trained for b in held_back):
         raise InputError(
             "The same recording was given to fit and to validate, but a map is kept only where data that no "

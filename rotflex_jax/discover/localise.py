@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Real
 
+from rotflex_jax.checks import positive
 from rotflex_jax.discover.conditions import ConditionSet, condition_sets, missing_acceleration
 from rotflex_jax.discover.result import Where
 from rotflex_jax.errors import InputError
@@ -13,6 +14,7 @@ from rotflex_jax.fit.inference import correlation_length
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import listed
 from rotflex_jax.text.numbers import as_read
 
 TIME_SEGMENTS = 20
@@ -230,6 +232,9 @@ def locate(
     Source: Westfall and Young 1993 (largest statistic over several); Lo 1991 (time); Benjamini and
         Hochberg 1995.
     """
+    (recording,) = listed(recording, "recording")
+    if window_seconds is not None:
+        positive(window_seconds, "window_seconds")
     e = np.asarray(residual, dtype=float)
     e = e[:, None] if e.ndim == 1 else e
     if e.shape != (recording.N, len(channels)) or not np.isfinite(e).all():

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from rotflex_jax import checks
 from rotflex_jax.discover.bias_correction import correct_discretisation_bias
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.end_state import end_state
@@ -54,7 +55,7 @@ from rotflex_jax.discover.stepwise import (
     refit_from,
     remaining_rivals,
 )
-from rotflex_jax.discover.supermodel import EffectLocation, build, scales
+from rotflex_jax.discover.supermodel import EffectLocation, build, checked_candidates, scales
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
@@ -64,6 +65,7 @@ from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 from rotflex_jax.runtime.xla import one_thread
 
@@ -190,11 +192,16 @@ def discover(
     Raises:
         InputError: No recording, channels that the model lacks, or one that moves against the model.
     """
-    started, say = time.perf_counter(), progress or (lambda _: None)
+    started, say = time.perf_counter(), checks.progress(progress)
     clear_compilation_caches()
-    model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
-    horizons = _prepare(model, _several(train), _several(validation), candidates, window_seconds)
-    evaluation = Evaluation.of(model, horizons, _several(test), calibrate_seconds)
+    model, rounds = Model.of(mechanism), checks.whole(rounds, "rounds", 0)
+    checks.positive(window_seconds, "window_seconds")
+    checks.number(calibrate_seconds, "calibrate_seconds", least=0, unit="s", example="2.0")
+    if candidates is not None:
+        candidates = checked_candidates(model.mechanism, candidates)
+    trained = listed(train, "train", SHORTEST_TO_FIT)
+    horizons = _prepare(model, trained, _several(validation, "validation"), candidates, window_seconds)
+    evaluation = Evaluation.of(model, horizons, _several(test, "test"), calibrate_seconds)
     say("fitting the model as it is")
     state = _fit_as_it_is(model, horizons, say)
     for number in range(rounds):
@@ -213,10 +220,10 @@ def discover(
     return with_proposal(_report(state, evaluation, started))
 
 
-def _several(recordings: Recording | Sequence[Recording] | None) -> tuple[Recording, ...]:
-    if recordings is None:
+def _several(recordings: Recording | Sequence[Recording] | None, name: str) -> tuple[Recording, ...]:
+    if recordings is None or (isinstance(recordings, Sequence) and not len(recordings)):
         return ()
-    return (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+    return listed(recordings, name, SHORTEST_TO_FIT)
 
 
 def _prepare(

@@ -8,12 +8,13 @@ and a structure of few effects compiles quickly.
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from jaxtyping import Float, Shaped
 
+from rotflex_jax.checks import shown
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect, Scale
 from rotflex_jax.errors import InputError
@@ -254,6 +255,29 @@ class SuperModel:
         for location in locations:
             mechanism = mechanism + self.mechanism.effects[self.effect_index(location)]
         return mechanism.with_values({n: named[n] for n in mechanism.parameter_names})
+
+
+def checked_candidates(mechanism: Mechanism, candidates: Any) -> list[tuple[type[Effect], str]]:
+    """Pairs of an effect's class and a place that the mechanism has for it.
+
+    Raises:
+        InputError: Anything else.
+    """
+    found = list(candidates) if isinstance(candidates, Iterable) else [candidates]
+    for pair in found:
+        given = pair if isinstance(pair, tuple | list) and len(pair) == 2 else (pair, None)
+        if not (isinstance(given[0], type) and issubclass(given[0], Effect) and isinstance(given[1], str)):
+            raise InputError(
+                f"Argument `candidates` must hold pairs of an effect's class and a port, but has "
+                f"{shown(pair)}; write for instance [(rotflex_jax.effects.Coulomb, 'hub')]."
+            )
+        places = mechanism.locations(given[0])
+        if given[1] not in places:
+            raise InputError(
+                f"{given[0].__name__} is to be tried at {given[1]!r}, but this mechanism has "
+                f"{', '.join(map(repr, places))} for it; name one of these."
+            )
+    return found
 
 
 def build(

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax import checks
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.discrimination import (
@@ -21,6 +22,7 @@ from rotflex_jax.experiment.rival_model import RivalModel, effect_location, riva
 from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.validation import process_noise_of
 from rotflex_jax.models.model import Model
 
 Progress = Callable[[str], None]
@@ -85,20 +87,20 @@ def next_experiment(
 
     Source: Atkinson and Fedorov 1975 (T-optimality, Biometrika 62); Pasch-Hausdorff envelopes for the slew.
     """
-    say = progress or (lambda _: None)
-    fitted = (
-        Model(model) if isinstance(model, Mechanism) else model.model if isinstance(model, Fit) else model
-    )
+    say = checks.progress(progress)
+    fitted = model.model if isinstance(model, Fit) else Model.of(model)
+    if not isinstance(limits, Limits):
+        raise InputError(
+            f"Argument `limits` must be Limits(voltage=...), but is {checks.shown(limits)}; give what the "
+            "machine bears."
+        )
+    starts, looks = checks.whole(starts, "starts", 0), checks.whole(looks, "looks", 1)
+    reference = None if reference is None else checks.signal(reference, "reference")
     N, P = sample_counts(seconds, Ts)
     sd = _noise_std(fitted, model, noise)
-    for port in process_noise or {}:
-        if port not in fitted.mechanism.port_vectors:
-            raise InputError(
-                f"Process noise was given at {port!r}, but the model has the ports "
-                f"{', '.join(fitted.mechanism.port_vectors)}; name one of these."
-            )
+    process_noise = process_noise_of(fitted.mechanism, process_noise)
     say("fitting each effect to the other")
-    pair = _rival_pair(fitted, a, b, dict(process_noise or {}), sd, Ts, reference, limits)
+    pair = _rival_pair(fitted, a, b, process_noise, sd, Ts, reference, limits)
     problem = DiscriminationProblem(pair, Ts, limits, _parameter_variations(model, pair[0]))
     ranked = []
     offered = standard_inputs(N, Ts, limits)
@@ -229,10 +231,11 @@ def _rival_pair(
 
 def sample_counts(seconds: float, Ts: float) -> tuple[int, int]:
     """Samples of the experiment and of one period."""
-    if not (0 < Ts < 0.5 and seconds / Ts >= 200):
+    length, period = checks.real(seconds), checks.real(Ts)
+    if not (0 < period < 0.5 and 200 <= length / period < np.inf):
         raise InputError(
-            f"An experiment of {seconds:g} s at a sampling period of {Ts:g} s was asked for, but it needs at "
-            "least 200 samples; give for instance seconds=20, Ts=0.002."
+            f"An experiment of {checks.shown(seconds)} s at a sampling period of {checks.shown(Ts)} s was "
+            "asked for, but it needs at least 200 samples; give for instance seconds=20, Ts=0.002."
         )
     N = round(seconds / Ts)
     return N, min(N, round(DESIGN_PERIOD / Ts))
@@ -242,12 +245,15 @@ def _noise_std(model: Model, given: Any, noise: Mapping[str, float] | None) -> n
     """Standard deviation of the sensor noise per channel (C,)."""
     channels = model.mechanism.channels
     known = given.noise if noise is None and isinstance(given, Fit) else noise
-    if known is None or set(known) != set(channels) or not all(v > 0 for v in known.values()):
+    given_all = isinstance(known, Mapping) and set(known) == set(channels)
+    values = [checks.real(known[c]) for c in channels] if isinstance(known, Mapping) and given_all else []
+    if not (values and all(0 < v < np.inf for v in values)):
         raise InputError(
-            f"The sensor noise was given as {known}, but every channel ({', '.join(channels)}) needs a "
-            "positive standard deviation; give noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
+            f"The sensor noise was given as {known if given_all else checks.shown(known)}, but every channel "
+            f"({', '.join(channels)}) needs a positive standard deviation; give "
+            "noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
         )
-    return np.array([float(known[c]) for c in channels])
+    return np.array(values)
 
 
 def _parameter_variations(model: Fit | Model | Mechanism, rival: RivalModel) -> list[np.ndarray]:

@@ -1,6 +1,7 @@
 """The next experiment: the input to play, the evidence it is expected to give, and the predicted motion."""
 
 import dataclasses
+import io
 import math
 import os
 from pathlib import Path
@@ -11,6 +12,8 @@ from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.text.files import write_file
+from rotflex_jax.text.plain import one_line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +106,7 @@ class Experiment:
         Add the measured columns `theta` and `alpha` and `rotflex_jax.load` reads the file.
 
         Raises:
-            InputError: The folder does not exist.
+            InputError: The folder does not exist, or the file cannot be written; an old one stays.
         """
         path = Path(path)
         if path.is_dir() or not path.absolute().parent.is_dir():
@@ -112,12 +115,14 @@ class Experiment:
                 "in a folder that is there."
             )
         head = (
-            f"# t in s, voltage in V, each held for {self.Ts:g} s; tells {' from '.join(self.separates)}\n"
+            f"# t in s, voltage in V, each held for {self.Ts:g} s; "
+            f"tells {one_line(' from '.join(self.separates))}\n"
             "t,voltage"
         )
         rows = np.column_stack([self.t, self.u])
-        np.savetxt(path, rows, fmt=["%.15g", "%.17g"], delimiter=",", header=head, comments="")
-        return path
+        form = ["%.15g", "%.17g"]
+        np.savetxt(text := io.StringIO(), rows, fmt=form, delimiter=",", header=head, comments="")
+        return write_file(path, text.getvalue())
 
     def plot(self) -> Any:
         """Figure: input in time, its spectrum, predicted difference of the two against sensor noise."""

@@ -6,6 +6,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
+from rotflex_jax.checks import number, real, shown
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
 
@@ -36,17 +37,13 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name, unit in (("voltage", "V"), ("slew", "V/s"), ("travel", "rad"), ("deflection", "rad")):
-            value = getattr(self, name)
+            value = real(getattr(self, name))
             if not value > 0 or (name == "voltage" and not math.isfinite(value)):
                 raise InputError(
-                    f"The limit `{name}` was given as {value:g}, but needs a positive number in {unit}; "
-                    "give what the machine bears."
+                    f"The limit `{name}` was given as {shown(getattr(self, name))}, but needs a positive "
+                    f"number in {unit}; give what the machine bears."
                 )
-        if not 0 <= self.margin < 1:
-            raise InputError(
-                f"The margin was given as {self.margin:g}, but is a share from 0 up to, but without, 1; "
-                "give for instance 0.1."
-            )
+        number(self.margin, "margin", least=0, below=1, example="0.1")
 
     def outputs(self, channels: int) -> Float[np.ndarray, " C"]:
         """Largest |output| of each channel, less the margin."""

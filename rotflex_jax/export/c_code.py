@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from rotflex_jax.effects.base import Effect
+from rotflex_jax.checks import positive, shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.export.expression import OPERATIONS, Expression, Operand, ordered
 from rotflex_jax.export.program import SampleProgram, sample_program
@@ -18,12 +18,13 @@ from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.linear import state_names
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
+from rotflex_jax.text.plain import one_line
 
 # Characters: a longer expression gets a variable of its own even if it is used once.
 _LONGEST_EXPRESSION = 90
 
 
-def to_c(model: Model, Ts: float, prefix: str = "rotflex") -> str:
+def to_c(model: Mechanism | Model, Ts: float, prefix: str = "rotflex") -> str:
     """C code (C99) of a model's free run, one sample a call.
 
         rotflex_state s;  double y[ROTFLEX_OUTPUTS];
@@ -44,11 +45,12 @@ def to_c(model: Model, Ts: float, prefix: str = "rotflex") -> str:
     Raises:
         InputError: An effect that C code cannot express, by name; an invalid sampling period or prefix.
     """
-    if not (np.isfinite(Ts) and Ts > 0):
-        raise InputError(f"Ts was given as {Ts!r}, but C code needs a sampling period in seconds; give one.")
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix):
-        raise InputError(f"The prefix {prefix!r} begins no name in C; give letters, digits and underscores.")
-    return "\n".join(_lines(model, float(Ts), prefix, sample_program(model, float(Ts)))) + "\n"
+    model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
+    if not (isinstance(prefix, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix)):
+        raise InputError(
+            f"The prefix {shown(prefix)} begins no name in C; give letters, digits and underscores."
+        )
+    return "\n".join(_lines(model, Ts, prefix, sample_program(model, Ts))) + "\n"
 
 
 def _number(value: Operand) -> str:
@@ -120,7 +122,7 @@ def _lines(model: Model, Ts: float, prefix: str, code: SampleProgram) -> Iterato
     yield f"#define {name}_OUTPUTS {len(mechanism.channels)}"
     yield f"#define {name}_TS {_number(Ts)} /* sampling period [s] */\n"
     yield "typedef struct {"
-    yield f"    double x[{len(names)}]; /* {', '.join(names)} */"
+    yield f"    double x[{len(names)}]; /* {_comment(', '.join(names))} */"
     yield "    int started; /* whether there has been a command */"
     if counted:
         yield "    double count; /* samples so far */"
@@ -137,7 +139,7 @@ def _lines(model: Model, Ts: float, prefix: str, code: SampleProgram) -> Iterato
     x = ", ".join(map(_number, start))
     yield f"    static const {prefix}_state rest = {{.x = {{{x}}}, .started = 0}};"
     yield "    *s = rest;\n}\n"
-    unit = mechanism.units.input
+    unit = _comment(mechanism.units.input)
     yield f"/* y: what the sensors read now. u: command that is held from now over one sample [{unit}]. */"
     yield f"static void {prefix}_step({prefix}_state *s, double u, double y[{len(mechanism.channels)}])\n{{"
     yield from _reading(code)
@@ -155,16 +157,17 @@ def _heading(mechanism: Mechanism, model: Model, Ts: float) -> Iterator[str]:
     gates = model.gates or (1.0,) * len(mechanism.effects)
     for effect, gate in zip(mechanism.effects, gates, strict=True):
         off = "" if gate else " (switched off)"
-        yield f" * {effect.title} at {effect.at}{off}: {_comment(effect)}"
+        yield " * " + _comment(f"{effect.title} at {effect.at}{off}: {effect.equation}")
         declared = specifications(effect)
         for n, v in effect.values.items():
             unit = mechanism.units.unit(declared[n].unit, effect.volts_of_input)
-            yield f" *     {n} = {v:.10g} {unit}".rstrip()
+            yield " *     " + _comment(f"{n} = {v:.10g} {unit}".rstrip())
     yield " */"
 
 
-def _comment(effect: Effect) -> str:
-    return effect.equation.replace("*/", "* /")
+def _comment(text: str) -> str:
+    """A text in which no comment of C ends, on one line: names may come from a file."""
+    return one_line(text).replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
 
 
 def _sequence_states(code: SampleProgram) -> tuple[list[Expression], list[Expression], bool]:

@@ -10,6 +10,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import effects_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
+from rotflex_jax.text.plain import one_line
 
 _FUNCTIONS = {"sin", "cos", "tan", "exp", "log", "tanh", "min", "max", "sinh", "cosh", "arctan"}
 _SYMBOLS = {
@@ -111,7 +112,7 @@ def _joined(pieces: list[tuple[str, str]]) -> str:
 _DIGITS = 4
 
 
-def text(model: Model) -> str:
+def text(model: Mechanism | Model) -> str:
     """The equations of motion in plain text.
 
         M q'' + D q' + K q = b v + sum over ports of p tau
@@ -119,7 +120,7 @@ def text(model: Model) -> str:
     with the matrices assembled from all linear effects, then the equation of every other effect at its port,
     and the values of all parameters with their units.
     """
-    mechanism = _active(model)
+    mechanism = _active(Model.of(model))
     lines = [f"q = ({', '.join(mechanism.coordinates)})", "M q'' + D q' + K q = b v + sum of p tau", ""]
     for name, matrix in _matrices(mechanism).items():
         rows = [" ".join(f"{_plain(c):>11}" for c in np.atleast_1d(row)) for row in matrix]
@@ -138,15 +139,15 @@ def text(model: Model) -> str:
         if effect.is_linear and not effect.order:
             found = _parameters(mechanism, effect)
             lines += [f"    {effect.at}.{effect.name}.{n} = {_plain(v)} {u}".rstrip() for n, v, u, _ in found]
-    return "\n".join(lines) + "\n"
+    return "\n".join(map(one_line, lines)) + "\n"
 
 
-def latex(model: Model) -> str:
+def latex(model: Mechanism | Model) -> str:
     r"""The equations of motion in LaTeX: the matrices, one line per effect, and a table of parameters.
 
     The text needs the package amsmath and can be included in a document unchanged.
     """
-    mechanism = _active(model)
+    mechanism = _active(Model.of(model))
     lines = [r"\[", r"M \ddot{q} + D \dot{q} + K q = b \, v + \sum_{p} p \, \tau_{p}, \qquad"]
     lines += [rf"q = {_matrix([[_upright(c)] for c in mechanism.coordinates], str)}", r"\]", r"\["]
     found = _matrices(mechanism)
@@ -158,7 +159,10 @@ def latex(model: Model) -> str:
     lines += [r"\]", ""]
     for effect in _with_equations(mechanism):
         place = effect.location
-        lines += [rf"% {effect.title} {place}", rf"\[ {law(effect)} \quad \text{{({place})}} \]"]
+        lines += [
+            rf"% {one_line(f'{effect.title} {place}')}",
+            rf"\[ {law(effect)} \quad \text{{({_words(place)})}} \]",
+        ]
     lines += ["", r"\begin{tabular}{llll}", r"place & parameter & value & meaning \\ \hline"]
     for effect in mechanism.effects:
         for name, value, unit, meaning in _parameters(mechanism, effect):
@@ -226,18 +230,29 @@ def _matrix(rows: object, number: Callable[..., str]) -> str:
 
 
 def _upright(name: str) -> str:
-    return rf"\mathrm{{{name.replace('_', chr(92) + '_')}}}"
+    return rf"\mathrm{{{_words(name)}}}"
+
+
+_SPECIAL = {c: "\\" + c for c in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+}
 
 
 def _words(name: str) -> str:
-    for sign in "&%$#_":
-        name = name.replace(sign, "\\" + sign)
-    return name
+    r"""Text in which no sign is a command of LaTeX: names may come from a file.
+
+    >>> print(_words("100 %} \\input{x}"))
+    100 \%\} \textbackslash{}input\{x\}
+    """
+    return "".join(_SPECIAL.get(c, c) for c in one_line(name))
 
 
 def _unit(unit: str) -> str:
     """`N m s^2/rad` in upright letters."""
-    body = unit.replace("^", "^@").replace(" ", r"\,")
-    for digit in "0123456789":
-        body = body.replace(f"^@{digit}", f"^{{{digit}}}")
+    pieces = re.split(r"(\^\d| )", unit)
+    body = "".join(
+        r"\," if p == " " else f"^{{{p[1]}}}" if re.fullmatch(r"\^\d", p) else _words(p) for p in pieces
+    )
     return rf"$\mathrm{{{body}}}$" if unit else ""

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rotflex_jax.checks import number, positive
 from rotflex_jax.effects.base import Force, Memory
 from rotflex_jax.errors import InputError, optional
+from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout, effects_of, equations, rest_state
 from rotflex_jax.mechanism.linear import state_names, zero_order_hold
 from rotflex_jax.mechanism.simulate import read_outputs
@@ -77,7 +79,7 @@ class LinearModel:
 
 
 def state_space(
-    model: Model,
+    model: Mechanism | Model,
     Ts: float | None = None,
     positions: Sequence[float] | None = None,
     speeds: Sequence[float] | None = None,
@@ -102,6 +104,10 @@ def state_space(
     Source: Any text on control, for instance K. J. Åström and R. M. Murray, Feedback Systems, 2nd ed.,
     2021, section 6.4.
     """
+    model = Model.of(model)
+    if Ts is not None:
+        positive(Ts, "Ts", example="0.002")
+    number(voltage, "voltage", unit="V", example="0.0")
     mechanism, layout = model.mechanism, Layout.of(model.mechanism.structure)
     point = [_point(x, layout.n, what) for x, what in ((positions, "positions"), (speeds, "speeds"))]
     start = layout.linear

@@ -70,9 +70,11 @@ def prepare(
         like: Data set whose sensor noise and torque scale are taken over.
 
     Raises:
-        InputError: No recording, or one without a channel of the model.
+        InputError: No recording, one without a channel of the model, or a channel that never moves.
     """
     data = stack(recordings, model, length)
+    if like is None:
+        check_moving(model, recordings)
     return Dataset(
         recordings=tuple(recordings),
         data=data,
@@ -81,6 +83,21 @@ def prepare(
         first_states=first_states(model, recordings),
         constants=known_values(model, recordings),
     )
+
+
+def check_moving(model: Model, recordings: Sequence[Recording]) -> None:
+    """Refuses recordings in which a channel of the model has one value: its noise would be zero.
+
+    Raises:
+        InputError: With the channel.
+    """
+    whole = np.concatenate([model.measured(r) for r in recordings])
+    still = [c for c, y in zip(model.mechanism.channels, whole.T, strict=True) if np.ptp(y) == 0]
+    if still:
+        raise InputError(
+            f"Channel {still[0]!r} has one value throughout all recordings, from which nothing can be "
+            "learned; give a recording in which it moves."
+        )
 
 
 def known_values(model: Model, recordings: Sequence[Recording]) -> Float[np.ndarray, "R P"]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.basis import Basis
-from rotflex_jax.basis.bank import whole
+from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.linear import RegressionRows, checked_recordings, factor, solve, squared_error
 from rotflex_jax.fit.series import SeriesFit, series_fit

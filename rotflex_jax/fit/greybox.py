@@ -2,13 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import StackedRecordings, prepare, process_noise_ports
 from rotflex_jax.fit.inference import (
@@ -29,6 +30,7 @@ from rotflex_jax.fit.problem import (
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Mechanism, kalman_gains
+from rotflex_jax.mechanism.validation import process_noise_of
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import (
@@ -41,12 +43,14 @@ from rotflex_jax.optimise.damped_least_squares import (
 )
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread
 
 if TYPE_CHECKING:
     from rotflex_jax.fit.optimistix_adapter import Minimiser
 
 
+FirstState = Literal["fitted", "measured"]
 ProcessNoise = Mapping[str, float] | None
 """Port -> intensity of the process torque [(N m)^2 s]; None for a free run."""
 
@@ -301,7 +305,7 @@ def fit(
     *,
     process_noise: Mapping[str, float] | None = None,
     local: Sequence[str] = (),
-    first: Literal["fitted", "measured"] = "fitted",
+    first: FirstState = "fitted",
     window_seconds: float | None = None,
     max_steps: int = 60,
     minimiser: "Minimiser | None" = None,
@@ -349,11 +353,20 @@ def fit(
             against the model.
         RuntimeError: The fit failed and `throw` is set.
     """
-    model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
-    listed = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    m = model.mechanism
+    model = Model.of(mechanism)
+    given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
+    m, say = model.mechanism, checks.progress(progress)
     names = m.parameter_names
-    for name in local:
+    if process_noise is not None:
+        process_noise = process_noise_of(m, process_noise)
+    checks.one_of(first, "first", get_args(FirstState))
+    max_steps = checks.whole(max_steps, "max_steps", 1)
+    if minimiser is not None and not hasattr(minimiser, "init"):
+        raise InputError(
+            f"Argument `minimiser` must be a solver of optimistix, but is {checks.shown(minimiser)}; leave "
+            "it out for the toolkit's own."
+        )
+    for name in (local := checks.names(local, "local")):
         if name not in m.free_names:
             raise InputError(
                 f"Parameter {name!r} was to be local to each recording, but the free parameters are "
@@ -361,21 +374,20 @@ def fit(
             )
     if not m.free_names:
         raise InputError("All parameters are trusted, but a fit needs a free one; release one.")
-    check_signs(model, listed)
+    check_signs(model, given)
     indices = tuple(names.index(n) for n in local)
-    listed, windows_of = _windows(listed, window_seconds)
-    dataset = prepare(model, listed)
+    windows, windows_of = _windows(given, window_seconds)
+    dataset = prepare(model, windows)
     known = np.flatnonzero(np.any(~np.isnan(dataset.constants), axis=0)).tolist()
-    coordinates = Coordinates(m.structure, (*indices, *known), len(listed), windows_of)
-    say = progress or (lambda _: None)
+    coordinates = Coordinates(m.structure, (*indices, *known), len(windows), windows_of)
     flat = coordinates.flatten(m.values, dataset.first_states)
     flat = coordinates.with_constants(flat, dataset.constants)
     parameters = tuple(names.index(n) for n in m.free_names)
-    mesh = mesh_of(devices) if len(listed) > 1 else None
+    mesh = mesh_of(devices) if len(windows) > 1 else None
     measured = first == "measured"
     free = FreeCoordinates(coordinates, model.solver, parameters, not measured, mesh)
     problem = GreyBoxProblem(
-        model, listed, free, dataset.data, dataset.noise, measured, max_steps, minimiser, say
+        model, windows, free, dataset.data, dataset.noise, measured, max_steps, minimiser, say
     )
     with double_precision():
         end = problem.attempt(flat, [process_noise])
@@ -394,11 +406,7 @@ def _windows(recordings: list[Recording], seconds: float | None) -> tuple[list[R
     """The recordings cut into windows, and of which recording each is; whole where no length is given."""
     if seconds is None:
         return recordings, ()
-    if not seconds > 0:
-        raise InputError(
-            f"Argument `window_seconds` is {seconds}, but windows need a positive length; give for "
-            "instance 2.0, or None for whole recordings."
-        )
+    checks.positive(seconds, "window_seconds", "s", "2.0, or None for whole recordings")
     cut = []
     for number, r in enumerate(recordings):
         starts = window_starts(r, seconds)[0].tolist()

@@ -8,8 +8,10 @@ from jaxtyping import Float, Int
 
 from rotflex_jax.basis import Basis
 from rotflex_jax.basis.bank import require_basis
+from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import listed
 
 # Singular values below this share of the largest one are rounding: the columns depend on each other.
 DEPENDENT_COLUMN_SHARE = 1e-12
@@ -129,7 +131,7 @@ class RegressionRows:
         require_basis(basis)
         parts = []
         for number, recording in enumerate(recordings):
-            start = recording.n_init if skip is None else skip
+            start = recording.n_init if skip is None else whole(skip, "skip", 0)
             if not 0 <= start < recording.N:
                 raise InputError(
                     f"The first {start} samples are left out, but recording {number} has {recording.N}; "
@@ -162,22 +164,20 @@ def checked_recordings(
     Raises:
         InputError: None, different periods, or several channels and no choice.
     """
-    listed = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    if not listed:
-        raise InputError("Argument `recordings` is empty, but a fit needs at least one; give a recording.")
-    periods = sorted({r.Ts for r in listed})
+    found = list(listed(recordings))
+    periods = sorted({r.Ts for r in found})
     if periods[-1] / periods[0] - 1 > 1e-6:
         raise InputError(
             f"The recordings have the sampling periods {', '.join(f'{p:g} s' for p in periods)}, but a "
             "series has one; decimate them to the same."
         )
     if channel is None:
-        if len(listed[0].channels) > 1:
+        if len(found[0].channels) > 1:
             raise InputError(
-                f"The recording has the channels {', '.join(listed[0].channels)}, but a series has one "
+                f"The recording has the channels {', '.join(found[0].channels)}, but a series has one "
                 "output; say which with `channel`."
             )
-        channel = next(iter(listed[0].channels))
-    for recording in listed:
+        channel = next(iter(found[0].channels))
+    for recording in found:
         recording.channel(channel)
-    return listed, channel
+    return found, channel

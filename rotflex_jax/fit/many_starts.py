@@ -11,9 +11,11 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
+from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import (
     StackedRecordings,
+    check_moving,
     first_states,
     sensor_noise,
     stack,
@@ -38,6 +40,7 @@ from rotflex_jax.optimise.damped_least_squares import (
 )
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread, spread
 
@@ -280,41 +283,36 @@ def many_starts(
         InputError: Nothing to fit, arguments out of their range, a channel that moves against the model, or
             no start with a finite error.
     """
-    model = mechanism if isinstance(mechanism, Model) else Model(mechanism)
-    listed = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    m = model.mechanism
+    model, say = Model.of(mechanism), checks.progress(progress)
+    given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
+    m, seed = model.mechanism, checks.whole(seed, "seed", 0)
     if not m.free_names:
         raise InputError("All parameters are trusted, but a fit needs a free one; release one.")
-    for name, value in (("starts", starts), ("keep", keep), ("max_steps", max_steps)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise InputError(f"Argument `{name}` must be a whole number from 1, but is {value!r}; give one.")
-    if not 0 < spread < 1:
-        raise InputError(
-            f"Argument `spread` must lie between 0 and 1, but is {spread!r}; give for instance 0.7."
-        )
-    if short_seconds is not None and not short_seconds > 0:
-        raise InputError(
-            f"Argument `short_seconds` must be positive, but is {short_seconds!r}; give for instance 1.5, or "
-            "None."
-        )
-    check_signs(model, listed)
-    model = with_common_constants(model, listed)
+    starts, keep, max_steps = (
+        checks.whole(value, name, 1)
+        for name, value in (("starts", starts), ("keep", keep), ("max_steps", max_steps))
+    )
+    checks.number(spread, "spread", above=0, below=1, example="0.7")
+    if short_seconds is not None:
+        checks.positive(short_seconds, "short_seconds", "s", "1.5, or None")
+    check_signs(model, given)
+    check_moving(model, given)
+    model = with_common_constants(model, given)
     m = model.mechanism
     free = np.array([m.parameter_names.index(n) for n in m.free_names])
     transform = Transform.of(m.parameter_specifications)
     z = transform.unconstrain(_box(m, free, starts, spread, seed))[:, free]
-    x0 = np.broadcast_to(first_states(model, listed), (starts, len(listed), 2 * len(m.coordinates)))
-    noise = sensor_noise(listed, model)
-    say = progress or (lambda _: None)
+    x0 = np.broadcast_to(first_states(model, given), (starts, len(given), 2 * len(m.coordinates)))
+    noise = sensor_noise(given, model)
     stage = functools.partial(
         _stage, model=model, free=free, noise=noise, max_steps=max_steps, mesh=mesh_of(devices), say=say
     )
-    short = _first_parts(listed, short_seconds)
+    short = _first_parts(given, short_seconds)
     if short is not None:
         found = stage(z, x0, short, RANKING_SHARE, f"{starts} starts, first seconds")
         best = np.argsort(found.cost)[:keep]
         z, x0 = np.asarray(found.z[best]), np.asarray(found.x0[best])
-    found = stage(z, x0, listed, CONVERGED_SHARE, f"{len(z)} starts, whole recordings")
+    found = stage(z, x0, given, CONVERGED_SHARE, f"{len(z)} starts, whole recordings")
     order = np.argsort(found.cost)
     if not np.isfinite(found.cost[order[0]]):
         raise InputError(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rotflex_jax.basis import Basis
+from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.inference import Combination, by_recording, curvature, estimates, sandwich
 from rotflex_jax.fit.linear import (
@@ -218,7 +219,7 @@ def least_squares(
     rows = RegressionRows.of(basis, listed, channel, skip)
     joined = np.concatenate([rows.phi, rows.y[:, None]], axis=1)
     if ridge == "cv":
-        block = rows.blocks(blocks)
+        block = rows.blocks(whole(blocks, "blocks", 2))
         if block[-1] < 1:
             raise InputError(
                 f"A ridge by cross-validation needs at least 2 blocks, but {blocks} were asked for; give for "

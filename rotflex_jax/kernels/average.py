@@ -7,6 +7,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Real
 
+from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels
 from rotflex_jax.kernels.sensitivities import Modelled, OutputModel, lags_of, output_derivatives, output_model
@@ -59,7 +60,7 @@ class AveragingRun(NamedTuple):
         mirrored: bool,
     ) -> "AveragingRun":
         """The run of checked arguments, with the first state estimated from a recording."""
-        reach = 2 * memory if reach is None else reach
+        reach, blocks = 2 * memory if reach is None else whole(reach, "reach", 1), whole(blocks, "blocks", 2)
         x0 = rest_state(s.mechanism.structure, np.float64)
         channel = s.mechanism.channels[s.output]
         unit, skip = (s.mechanism.units.input, s.unit), reach

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
+from rotflex_jax.checks import whole
 from rotflex_jax.effects.base import Actuation
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
-from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.mechanism import Mechanism, check_mechanism
 from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
 from rotflex_jax.mechanism.simulate import FreeStep, Solver, read_outputs
 from rotflex_jax.mechanism.step import Exponential
@@ -73,6 +74,7 @@ def output_model(model: Mechanism | Modelled, channel: str) -> OutputModel:
     if isinstance(model, Mechanism):
         mechanism, solver, given = model, Exponential(), None
     else:
+        check_mechanism(getattr(model, "mechanism", model))
         mechanism, solver, given = model.mechanism, model.solver, model.gates
     if channel not in mechanism.channels:
         raise InputError(
@@ -94,11 +96,7 @@ def lags_of(memory: int) -> int:
     Raises:
         InputError: Not a whole number of at least one lag.
     """
-    if memory != int(memory) or memory < 1:
-        raise InputError(
-            f"Argument `memory` was given {memory!r}, but it needs a whole number of lags; give 1 or more."
-        )
-    return int(memory)
+    return whole(memory, "memory", 1)
 
 
 @persistent_jit(static=4)

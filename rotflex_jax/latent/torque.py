@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports, with_common_constants
 from rotflex_jax.latent.augmented_model import AugmentedStep, UnknownTorque, linearise_along, predicted_states
@@ -15,6 +16,7 @@ from rotflex_jax.mechanism import Mechanism, kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.xla import double_precision
 
 Progress = Callable[[str], None]
@@ -62,14 +64,13 @@ def latent_torque(
     Source: B. Bell, SIAM J. Optim. 4, 1994 (the iterated smoother); T. Rogers and T. Friis, arXiv
     2109.10681, 2021 (unknown forces as states).
     """
-    model = model if isinstance(model, Model) else Model(model)
-    listed = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    model = with_common_constants(model, listed) if listed else model
-    m, say = model.mechanism, progress or (lambda _: None)
+    given, say = list(listed(recordings, shortest=SHORTEST_TO_FIT)), checks.progress(progress)
+    model = with_common_constants(Model.of(model), given)
+    m = model.mechanism
     chosen = tuple(process_noise_ports(m, 1.0)) if ports is None else _checked_ports(m, ports)
-    dataset = prepare(model, listed)
+    dataset = prepare(model, given)
     data, noise, scale = dataset.data, dataset.noise, dataset.torque_scale
-    time_constant = float(max(r.duration for r in listed))
+    time_constant = float(max(r.duration for r in given))
     decay = np.exp(-data.Ts / time_constant)
     augmented = m
     for port in chosen:
@@ -102,23 +103,23 @@ def latent_torque(
             say(f"latent torque: {said}")
             S, std = estimator.smooth(linear, start, intensity)
             nats = estimator.gains(linear, start, intensity)
-    return latent_torque_result(model, listed, chosen, (S, std), intensity, nats, scale)
+    return latent_torque_result(model, given, chosen, (S, std), intensity, nats, scale)
 
 
 def _checked_ports(m: Mechanism, ports: Sequence[str]) -> tuple[str, ...]:
     """Ports that exist and have linearly independent directions."""
-    known, listed = m.port_vectors, (ports,) if isinstance(ports, str) else tuple(ports)
-    for port in listed:
+    known, wanted = m.port_vectors, (ports,) if isinstance(ports, str) else checks.names(ports, "ports")
+    for port in wanted:
         if port not in known:
             raise InputError(
                 f"Port {port!r} was asked for, but the mechanism has {', '.join(known)}; name one of these."
             )
-    if not listed or np.linalg.matrix_rank([known[p] for p in listed]) < len(listed):
+    if not wanted or np.linalg.matrix_rank([known[p] for p in wanted]) < len(wanted):
         raise InputError(
-            f"The ports {', '.join(listed) or 'none'} were given, but their torques cannot be "
+            f"The ports {', '.join(wanted) or 'none'} were given, but their torques cannot be "
             f"distinguished; give up to {len(m.coordinates)} ports of different directions."
         )
-    return listed
+    return wanted
 
 
 def _predicted_trajectory(model: Model, augmented: Mechanism, dataset: Dataset) -> np.ndarray:

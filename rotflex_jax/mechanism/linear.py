@@ -12,7 +12,7 @@ from jaxtyping import Float
 from rotflex_jax.effects.base import Linear
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import EquationsOfMotion, Layout, effects_of, equations, own_states
-from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.mechanism import Mechanism, check_mechanism
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
@@ -109,6 +109,8 @@ def linearise(mechanism: Mechanism) -> StateSpace:
 
     Dry friction and a dead zone have no slope at rest, so the linear model of a joint has none of them.
     """
+    check_mechanism(mechanism)
+    check_movable(mechanism)
     layout = Layout.of(mechanism.structure)
     A, B, _ = _linear_part(mechanism)
     C = np.zeros((len(mechanism.channels), layout.linear))

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Real
 
+from rotflex_jax.checks import shown
 from rotflex_jax.effects.base import Effect, Linear
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
@@ -223,6 +224,11 @@ class Mechanism:
                 self._must_exist(name)
             old = dict(zip(self.parameter_names, self.values, strict=True))
             values = list((old | dict(values)).values())
+        if not hasattr(values, "__len__") or len(values) != len(self.parameter_names):
+            raise InputError(
+                f"Argument `values` must have one number for each of the {len(self.parameter_names)} "
+                f"parameters, but is {shown(values)}; give them by name, {{'port.effect.parameter': value}}."
+            )
         listed: Any = values.tolist() if isinstance(values, np.ndarray) else values
         effects, start = [], 0
         for e in self.effects:
@@ -234,6 +240,7 @@ class Mechanism:
 
     def trust(self, *names: str) -> "Mechanism":
         """The mechanism with these parameters held constant in fits."""
+        validation.names(names, "trusted parameters")
         return dataclasses.replace(self, trusted=self.trusted | set(names))
 
     def release(self, *names: str) -> "Mechanism":
@@ -295,3 +302,12 @@ class Mechanism:
                 unit = self.units.unit(specifications(e)[name].unit, e.volts_of_input)
                 lines.append(f"  {full} = {number} {unit}{held}")
         return "\n".join(lines)
+
+
+def check_mechanism(given: Any) -> None:
+    """Raise `InputError` where something else was given as a mechanism."""
+    if not isinstance(given, Mechanism):
+        raise InputError(
+            f"A mechanism or a model is needed, but {shown(given)} was given; give for instance "
+            "rotflex_jax.joints.paper()."
+        )

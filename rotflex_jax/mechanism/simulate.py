@@ -10,9 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer, Real
 
+from rotflex_jax.checks import positive, shown, signal
 from rotflex_jax.effects.base import Sensing
+from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_voltage, own_states, rest_state
-from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.linear import check_movable
+from rotflex_jax.mechanism.mechanism import Mechanism, check_mechanism
 from rotflex_jax.mechanism.scan import BLOCKED_FROM_SAMPLES, linear_outputs, states
 from rotflex_jax.mechanism.small_matrices import evaluate_effect, matvec, sparse_matvec
 from rotflex_jax.mechanism.smooth_rk4 import SmoothRK4
@@ -234,6 +237,27 @@ def _free_outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001,
     return jax.lax.scan(body, x0, v)[1]
 
 
+def first_state(
+    rest: Float[np.ndarray, " n"], x0: Real[ArrayLike, " m"] | Sequence[float] | None
+) -> Float[np.ndarray, " n"]:
+    """The state at rest with the first entries that are known.
+
+    Raises:
+        InputError: More entries than states, or what is no list of finite numbers.
+    """
+    start = rest.copy()
+    if x0 is None:
+        return start
+    known = signal(x0, "x0")
+    if len(known) > len(start):
+        raise InputError(
+            f"Argument `x0` has {len(known)} entries, but the model has {len(start)} states; give its "
+            "positions, then its speeds."
+        )
+    start[: len(known)] = known
+    return start
+
+
 def simulate(
     mechanism: Mechanism,
     u: Real[ArrayLike, " N"] | Sequence[float],
@@ -249,6 +273,9 @@ def simulate(
         Ts: Sampling period [s].
         x0: First state, or only its positions and speeds.
         solver: Integration rule; `Exponential()` if None.
+
+    Raises:
+        InputError: A coordinate without inertia, no signal of finite numbers, a period that is not positive.
     """
     return _simulated(_free_outputs, mechanism, u, Ts, x0, solver)
 
@@ -265,11 +292,15 @@ def simulate_states(
 
 
 def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typed in the two callers
-    u = np.asarray(u)
-    u = u if u.dtype in (np.float32, np.float64) else u.astype(np.float64)
-    start = rest_state(mechanism.structure, u.dtype)
-    if x0 is not None:
-        start[: len(x0)] = x0
+    check_mechanism(mechanism)
+    check_movable(mechanism)
+    u, Ts = signal(u), positive(Ts, "Ts", example="0.002")
+    if not (solver is None or isinstance(solver, Solver)):
+        raise InputError(
+            f"Argument `solver` must be Exponential(...) or SmoothRK4(...), but is {shown(solver)}; "
+            "leave it out for the default."
+        )
+    start = first_state(rest_state(mechanism.structure, u.dtype), x0)
     with working_precision(u):
         gates = np.ones(len(mechanism.effects), u.dtype)
         values, period = mechanism.values.astype(u.dtype), np.asarray(Ts, u.dtype)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 
+from rotflex_jax.checks import positive, whole
 from rotflex_jax.effects.base import DryFriction, Gear
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import EquationsOfMotion, Layout, effects_of, equations
@@ -58,6 +59,10 @@ class SmoothRK4:
 
     width: float = 0.02
     substeps: int = 20
+
+    def __post_init__(self) -> None:
+        positive(self.width, "width", "rad/s", "0.02")
+        whole(self.substeps, "substeps", 1)
 
     def inputs(self, v: Float[Array, " N"]) -> Float[Array, " N"]:
         """Input of `advance` at each sample, for a sequence of voltages."""

@@ -7,13 +7,15 @@ no smoothing width.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 
+from rotflex_jax.checks import one_of, shown, whole
 from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar
+from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of, equations, own_states
 from rotflex_jax.mechanism.elastic_teeth import elastic_step
 from rotflex_jax.mechanism.friction import coupled_contacts, limited, solve_masked
@@ -329,6 +331,16 @@ class Exponential:
     substeps: int = 1
     passes: int | None = None
     between: Intersample = "held"
+
+    def __post_init__(self) -> None:
+        if self.order not in (2, 4):
+            raise InputError(
+                f"Argument `order` must be 2 or 4, but is {shown(self.order)}; give one of these."
+            )
+        whole(self.substeps, "substeps", 1)
+        if self.passes is not None:
+            whole(self.passes, "passes", 1)
+        one_of(self.between, "between", get_args(Intersample))
 
     def inputs(self, v: Float[Array, " N"]) -> Float[Array, "N *h"]:
         """Input of `advance` at each sample, for a sequence of voltages."""

@@ -1,8 +1,10 @@
 """Checks of a mechanism, and the forms in which its parts can be given."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from rotflex_jax.checks import number, shown as describe
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.quantity import Quantity
@@ -15,13 +17,21 @@ def names(given: Any, what: str) -> tuple[str, ...]:
     """A list of names."""
     if isinstance(given, str):
         raise InputError(f"The {what} were given as {given!r}, but a list is needed; write [{given!r}].")
-    return tuple(given)
+    listed: tuple[Any, ...] = tuple(given) if isinstance(given, Iterable) else (None,)
+    if not all(isinstance(name, str) for name in listed):
+        raise InputError(
+            f"The {what} were given as {describe(given)}, but a list of names is needed; give one."
+        )
+    return listed
 
 
 def ports(given: Any) -> tuple[tuple[str, tuple[float, ...]], ...]:
     """Name and vector of each port."""
     try:
-        return tuple((str(name), tuple(float(c) for c in vector)) for name, vector in dict(given).items())
+        found = tuple((str(name), tuple(float(c) for c in vector)) for name, vector in dict(given).items())
+        if not all(math.isfinite(c) for _, vector in found for c in vector):
+            raise ValueError("a direction has finite entries")
+        return found
     except (TypeError, ValueError):
         raise InputError(
             f"The ports were given as {given!r}, but they are names with one number per coordinate; write "
@@ -50,7 +60,9 @@ def outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
 
 def effects(given: Any) -> tuple[Effect, ...]:
     """Effects in order."""
-    listed: tuple[Any, ...] = (given,) if isinstance(given, (Effect, type)) else tuple(given)
+    if not isinstance(given, Iterable | Effect | type):
+        raise InputError(f"The effects were given as {describe(given)}, but a list is needed; give one.")
+    listed: tuple[Any, ...] = (given,) if isinstance(given, Effect | type) else tuple(given)
     for e in listed:
         if not isinstance(e, Effect):
             name = e.__name__ if isinstance(e, type) else repr(e)
@@ -64,8 +76,30 @@ def effects(given: Any) -> tuple[Effect, ...]:
     return listed
 
 
+def process_noise_of(mechanism: "Mechanism", given: Any) -> dict[str, float]:
+    """Port -> intensity of a process torque, nothing for None; checked."""
+    if not (given is None or isinstance(given, Mapping)):
+        raise InputError(
+            f"Argument `process_noise` must give an intensity for each port, but is {describe(given)}; write "
+            "for instance {'hub': 1e-6}."
+        )
+    found = {}
+    for port, intensity in (given or {}).items():
+        if port not in dict(mechanism.ports):
+            raise InputError(
+                f"Process noise was given at {port!r}, but the mechanism has the ports "
+                f"{', '.join(dict(mechanism.ports))}; name one of these."
+            )
+        found[port] = number(intensity, f"process_noise[{port!r}]", least=0, example="1e-6")
+    return found
+
+
 def check(mechanism: "Mechanism") -> None:
     """Raise `InputError` where ports, outputs and effects do not fit together."""
+    if not mechanism.coordinates:
+        raise InputError(
+            "A mechanism was given no coordinates, but it needs one; name for instance ('angle',)."
+        )
     ports = dict(mechanism.ports)
     for name, vector in ports.items():
         if len(vector) != len(mechanism.coordinates):

@@ -10,14 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
+from rotflex_jax.checks import number, shown
 from rotflex_jax.effects.base import Actuation, Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver, free_run, kalman_gains, predictor_run
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, rest_state
 from rotflex_jax.mechanism.initial_state import initial_states
 from rotflex_jax.mechanism.linear import check_movable
+from rotflex_jax.mechanism.mechanism import check_mechanism
+from rotflex_jax.mechanism.simulate import first_state
+from rotflex_jax.mechanism.validation import process_noise_of
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import listed
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -53,7 +58,30 @@ class Model:
     gates: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        check_mechanism(self.mechanism)
+        if not isinstance(self.solver, Solver):
+            raise InputError(
+                f"Argument `solver` must be Exponential(...) or SmoothRK4(...), but is {shown(self.solver)}; "
+                "leave it out for the default."
+            )
+        gates = self.gates
+        if gates is not None and not (
+            len(gates) == len(self.mechanism.effects) and np.all(np.isfinite(np.array(gates, float)))
+        ):
+            raise InputError(
+                f"Argument `gates` must have a finite number for each of the {len(self.mechanism.effects)} "
+                f"effects, but is {tuple(gates)}; give 1 for each that is on, or None."
+            )
         check_movable(self.mechanism)
+
+    @classmethod
+    def of(cls, given: "Mechanism | Model") -> "Model":
+        """A model as it is, and a mechanism as a model with the default rule.
+
+        Raises:
+            InputError: Neither was given.
+        """
+        return given if isinstance(given, Model) else cls(given)
 
     def __add__(self, effect: Effect) -> "Model":
         """The model with one more effect."""
@@ -93,6 +121,7 @@ class Model:
 
     def measured(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """The channels of a recording that the mechanism has as outputs, in its order."""
+        (recording,) = listed(recording, "recording")
         missing = [c for c in self.mechanism.channels if c not in recording.channels]
         if missing:
             raise InputError(
@@ -173,10 +202,10 @@ class Model:
             recording: Its voltage drives the model.
             x0: First positions and speeds, where they are known.
         """
+        (recording,) = listed(recording, "recording")
         if x0 is None:
             return self._run(recording, self._start(recording))[1]
-        start = rest_state(self.mechanism.structure, np.float64)
-        start[: len(x0)] = x0
+        start = first_state(rest_state(self.mechanism.structure, np.float64), x0)
         return self._run(recording, start)[1]
 
     def simulate_states(self, recording: Recording) -> Float[np.ndarray, "N n"]:
@@ -235,8 +264,18 @@ class Model:
             process_noise: Port -> intensity of a white process torque [(N m)^2 s].
             noise: Standard deviation of the sensor noise per channel.
         """
-        u, y = recording.u.astype(float), self.measured(recording).astype(float)
-        here = self.at(recording)
+        y, m = self.measured(recording).astype(float), self.mechanism
+        u, here, process_noise = (
+            recording.u.astype(float),
+            self.at(recording),
+            process_noise_of(m, process_noise),
+        )
+        if np.shape(noise) != (len(m.channels),):
+            raise InputError(
+                f"Argument `noise` must have one number for each of {', '.join(m.channels)}, but is "
+                f"{shown(noise)} of shape {np.shape(noise)}; give their standard deviations."
+            )
+        noise = [number(x, "noise", above=0, example="[5e-4, 5e-4]") for x in noise]
         K = kalman_gains(here.mechanism, [process_noise], noise, recording.Ts)[0]
         x0 = self._start(recording)
         with double_precision():

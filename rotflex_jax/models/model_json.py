@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import effects
+from rotflex_jax.checks import shown
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
@@ -19,7 +20,7 @@ from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
 from rotflex_jax.mechanism.units import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, specifications
-from rotflex_jax.text.files import write_file
+from rotflex_jax.text.files import path_of, write_file
 
 SCHEMA = 1
 KIND = "rotflex_jax model"
@@ -67,6 +68,10 @@ def save(saved: Saved, path: str | os.PathLike[str]) -> Path:
         InputError: An effect that is not in the catalogue, so that nobody could read it back, or a file
             that cannot be written; an old one stays.
     """
+    if not isinstance(saved, Saved):
+        raise InputError(
+            f"A fitted model is needed to write it, but {shown(saved)} was given; call `save` of the model."
+        )
     return write_file(path, json.dumps(to_dict(saved), indent=2, allow_nan=False) + "\n")
 
 
@@ -76,6 +81,7 @@ def read(path: str | os.PathLike[str]) -> Saved:
     Raises:
         InputError: No model file, one of a later version, or one with an effect that is not known here.
     """
+    path = path_of(path)
     try:
         if os.path.getsize(path) > LARGEST_FILE:
             raise InputError(

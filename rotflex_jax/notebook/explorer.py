@@ -19,6 +19,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import listed
 from rotflex_jax.text.colours import BASELINE, FINAL, MEASURED, NO_DATA
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import plain_number, readable, unit_text
@@ -150,8 +151,8 @@ class Explorer:
         off = {(e.name, e.at) for e in offered}
         gates = tuple(0.0 if (e.name, e.at) in off else 1.0 for e in bare.effects)
         self._given_model = Model(bare, gates=gates, **solver)
-        self._drawn = _listed(recordings)[0]
-        self._test = _listed(recordings if test is None else test)
+        self._drawn = listed(recordings)[0]
+        self._test = listed(recordings if test is None else test)
         self._seconds = window_seconds
         self._units = {c: self._drawn.units[self._drawn.channels.index(c)] for c in bare.channels}
         self.switches = {
@@ -268,13 +269,6 @@ def _model(given: Any) -> Model:
         f"A model was expected, but a {type(given).__name__} was given; give a Fit, Model, Mechanism or "
         "Discovery."
     )
-
-
-def _listed(recordings: Recording | Sequence[Recording]) -> tuple[Recording, ...]:
-    found = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
-    if not found:
-        raise InputError("No recording was given, but there must be one to compare with; give one.")
-    return found
 
 
 def _can_be_off(effect: Effect) -> bool:

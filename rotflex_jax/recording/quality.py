@@ -268,7 +268,7 @@ def acceptable(accept: str | Sequence[str]) -> tuple[str, ...]:
     >>> acceptable("saturated")
     ('saturated',)
     """
-    kinds = (accept,) if isinstance(accept, str) else tuple(accept)
+    kinds = tuple(accept) if isinstance(accept, Sequence) and not isinstance(accept, str) else (accept,)
     unknown = [kind for kind in kinds if kind not in ACCEPTABLE]
     if unknown:
         raise InputError(

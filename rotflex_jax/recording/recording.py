@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.checks import number, real, shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import quality
 from rotflex_jax.recording.quality import Finding, quantisation_step
@@ -16,6 +17,7 @@ from rotflex_jax.recording.samples import (
     finite,
     initial_samples,
     known_constants,
+    known_resolution,
     labels,
     real_numbers,
     sampling_period,
@@ -105,7 +107,15 @@ class Recording:
         finite(u, f"Input {input_name!r}")
         for x, name in zip(y.T, names, strict=True):
             finite(x, f"Channel {name!r}")
-        known = resolution or {}
+        known = known_resolution(resolution, names)
+        for what, word in (("input_name", input_name), ("input_unit", input_unit), ("source", source)):
+            if not isinstance(word, str):
+                raise InputError(f"Argument `{what}` must be text, but is {shown(word)}; give a word.")
+        if not (continues is None or isinstance(continues, Recording)):
+            raise InputError(
+                f"Argument `continues` must be the recording before this one, but is {shown(continues)}; "
+                "leave it out."
+            )
         values = {
             "u": u,
             "y": y,
@@ -116,7 +126,7 @@ class Recording:
             "input_unit": input_unit,
             "n_init": initial_samples(n_init, len(u), Ts),
             "source": source,
-            "start": float(start),
+            "start": number(start, "start", unit="s", example="0.0"),
             "accept": quality.acceptable(accept),
             "resolution": {
                 name: known[name] if name in known else quantisation_step(x)
@@ -163,11 +173,13 @@ class Recording:
 
         A part that is short, or at rest, is no error: the whole has passed the checks.
         """
-        if not 0 <= i < j <= self.N:
+        ends = [real(end) for end in (i, j)]
+        if not all(0 <= end <= self.N and end == int(end) for end in ends) or i >= j:
             raise InputError(
                 f"A part of the recording must lie within its {self.N} samples, "
-                f"but was asked from {i} to {j}; choose 0 <= i < j <= {self.N}."
+                f"but was asked from {shown(i)} to {shown(j)}; choose 0 <= i < j <= {self.N}."
             )
+        i, j = int(i), int(j)
         return replace(
             self,
             u=self.u[i:j],
@@ -193,13 +205,13 @@ class Recording:
         """
         if share is not None and seconds is not None:
             raise InputError(
-                f"Arguments `share` ({share:g}) and `seconds` ({seconds:g}) were both given, "
+                f"Arguments `share` ({shown(share)}) and `seconds` ({shown(seconds)}) were both given, "
                 "but say the same thing; give one of them."
             )
         if seconds is not None:
-            wanted = seconds / self.Ts
+            wanted = number(seconds, "seconds", unit="s", example="10.0") / self.Ts
         else:
-            wanted = self.N * (0.7 if share is None else share)
+            wanted = self.N * (0.7 if share is None else number(share, "share", example="0.7"))
         if not 1 <= round(wanted) < self.N:
             raise InputError(
                 f"Both parts of a split must have samples, but the first would have {wanted:.6g} "
@@ -217,12 +229,14 @@ class Recording:
         Args:
             k: factor; samples at the end that do not fill a group are left out.
         """
-        if k != int(k) or not 1 <= k <= self.N:
+        factor = real(k)
+        if not (1 <= factor <= self.N and factor == int(factor)):
             raise InputError(
-                f"Argument `k` must be a whole number from 1 to the {self.N} samples, but is {k}; "
+                f"Argument `k` must be a whole number from 1 to the {self.N} samples, but is {shown(k)}; "
                 "give for instance 2."
             )
-        groups = self.N // int(k)
+        k = int(factor)
+        groups = self.N // k
         return replace(
             self,
             u=self.u[: groups * k].reshape(groups, k).mean(axis=1),

@@ -2,12 +2,13 @@
 
 import math
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Real
 
+from rotflex_jax.checks import positive, real, shown
 from rotflex_jax.errors import InputError
 
 
@@ -118,9 +119,12 @@ def sampling_period(Ts: Any, label: str = "Argument `Ts`") -> float:
     rotflex_jax.errors.InputError: Argument `Ts` must be a positive number of seconds, \
 but is 'fast'; give for instance 0.002.
     """
-    value = np.asarray(Ts)
+    try:
+        value = np.asarray(Ts)
+    except ValueError:  # rows of different lengths
+        value = np.zeros(0)
     if value.size != 1 or value.dtype.kind not in "iuf" or not 1e-300 < value.item() < np.inf:
-        what = f"{value.item()!r}" if value.size == 1 else f"{value.size} values"
+        what = shown(value.item()) if value.size == 1 else f"{value.size} values" if value.size else shown(Ts)
         raise InputError(
             f"{label} must be a positive number of seconds, but is {what}; give for instance 0.002."
         )
@@ -188,12 +192,13 @@ def initial_samples(n_init: int | None, N: int, Ts: float) -> int:
     """How many samples a model may see: 0.2 s, at least ten, at most a quarter, if not given."""
     if n_init is None:
         return max(1, min(max(10, round(0.2 / Ts)), N // 4))
-    if n_init != int(n_init) or not 1 <= n_init < N:
+    given = real(n_init)
+    if not (1 <= given < N and given == int(given)):
         raise InputError(
             f"Argument `n_init` must be a whole number from 1 and smaller than the recording, "
-            f"but is {n_init} of {N} samples; 0.2 s are {round(0.2 / Ts)} samples."
+            f"but is {shown(n_init)} of {N} samples; 0.2 s are {round(0.2 / Ts)} samples."
         )
-    return int(n_init)
+    return int(given)
 
 
 def labels(
@@ -203,6 +208,11 @@ def labels(
     default = ("theta", "alpha")[:width] if width <= 2 else ()
     names = _tuple(default if channels is None else channels)
     each = _tuple(("rad",) * width if units is None else units)
+    if not all(isinstance(word, str) for word in (*names, *each)):
+        raise InputError(
+            "Arguments `channels` and `units` must be words, but one of them is not; write for instance "
+            "channels=('theta', 'alpha'), units=('rad', 'rad')."
+        )
     if not len(set(names)) == len(names) == len(each) == width:
         raise InputError(
             f"Arguments `channels` and `units` must have a name of its own and a unit for each of "
@@ -211,13 +221,38 @@ def labels(
     return names, each
 
 
-def _tuple(words: str | Sequence[str]) -> tuple[str, ...]:
-    return (words,) if isinstance(words, str) else tuple(words)
+def _tuple(words: Any) -> tuple[Any, ...]:
+    return tuple(words) if isinstance(words, Iterable) and not isinstance(words, str) else (words,)
+
+
+def known_resolution(
+    given: Mapping[str, float | None] | None, channels: Sequence[str]
+) -> Mapping[str, float | None]:
+    """Channel -> quantisation step, each a positive number, or None for a channel without one."""
+    if not (given is None or isinstance(given, Mapping)):
+        raise InputError(
+            f"Argument `resolution` must give the step of each channel, but is {shown(given)}; write for "
+            "instance {'theta': 0.0015}."
+        )
+    for name, step in (given or {}).items():
+        if name not in channels:
+            raise InputError(
+                f"Argument `resolution` names {shown(name)}, but the recording has the channels "
+                f"{', '.join(channels)}; name one of these."
+            )
+        if step is not None:
+            positive(step, f"resolution[{name!r}]", "", "0.0015")
+    return given or {}
 
 
 def known_constants(given: Mapping[str, float] | None) -> Mapping[str, float]:
     """Parameter name -> known value, each a finite number."""
     found = {}
+    if not (given is None or isinstance(given, Mapping)):
+        raise InputError(
+            f"Argument `constants` must give a value for each name, but is {shown(given)}; write for "
+            "instance constants={'hub.position_servo.gain': 400.0}."
+        )
     for name, value in (given or {}).items():
         if not isinstance(name, str) or not isinstance(value, numbers.Real) or not math.isfinite(value):
             raise InputError(

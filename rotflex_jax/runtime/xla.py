@@ -62,7 +62,8 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
     """Stores compiled code on disk, so that the next run of the program starts quickly.
 
     Do not call it in a library: the setting holds for the whole process. Old entries are not
-    removed; deleting the folder is safe at any time.
+    removed; deleting the folder is safe at any time. What lies there is run as a program: use a folder that
+    only you can write to, and none that you were given.
 
     Args:
         folder: For compiled code; the user's cache folder unless given. A folder that the user chose before

@@ -4,8 +4,24 @@ import errno
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
+from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
+
+UNFINISHED: set[Path] = set()
+"""Files that are being written, beside their places; whoever ends the process meanwhile takes them away."""
+
+
+def path_of(given: Any) -> Path:
+    """A path of what was given as one.
+
+    Raises:
+        InputError: Something else, such as a number, which would name an open file.
+    """
+    if isinstance(given, str | os.PathLike):
+        return Path(given)
+    raise InputError(f"The path of a file is needed, but {shown(given)} was given; give its name as text.")
 
 
 def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
@@ -21,14 +37,16 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
     Raises:
         InputError: It cannot be written: a full disk, no such folder, no permission.
     """
+    path = path_of(path)
     data = content if isinstance(content, bytes) else content.encode()
     place = Path(os.path.realpath(path))  # a link goes on pointing to the file
     part = place.with_name(f".{place.name[:100]}.{os.getpid()}.part")
     try:
         if place.exists() and not place.is_file():
             place.write_bytes(data)
-            return Path(path)
+            return path
         try:
+            UNFINISHED.add(part)
             with part.open("wb") as file:
                 file.write(data)
             if place.exists():
@@ -38,8 +56,9 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
             part.replace(place)
         finally:
             part.unlink(missing_ok=True)
+            UNFINISHED.discard(part)
     except OSError as error:
         raise InputError(
             f"{path} cannot be written ({error.strerror or error}); make room or name another place."
         ) from error
-    return Path(path)
+    return path

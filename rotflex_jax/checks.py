@@ -1,0 +1,168 @@
+"""Checks of arguments at the edge of the API: what makes no sense is refused with one sentence."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Num
+
+from rotflex_jax.errors import InputError
+
+
+def shown(value: Any) -> str:
+    """What was given, short enough for a sentence.
+
+    >>> shown(np.float64(0.5)), shown("run.csv"), shown([1, 2, 3]), shown(int)
+    ('0.5', "'run.csv'", 'a list', 'the class int')
+    """
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int | float | complex | str):
+        text = repr(value)
+        return text if len(text) <= 60 else f"{text[:57]}..."
+    kind = type(value).__name__
+    return f"an {kind}" if kind[0].lower() in "aeiou" else f"a {kind}"
+
+
+def real(value: Any) -> float:
+    """A real number as a float; nan for anything else, also for True and False."""
+    try:
+        array = np.asarray(value)
+        if array.ndim or array.dtype.kind not in "iuf":
+            return math.nan
+        return float(array)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def number(
+    value: Any,
+    name: str,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    below: float = math.inf,
+    unit: str = "",
+    example: str,
+) -> float:
+    """A finite number within limits.
+
+    Args:
+        value: What was given.
+        name: Of the argument.
+        above: It must be larger.
+        least: It must not be smaller.
+        below: It must be smaller.
+        unit: In words or as a symbol.
+        example: What the sentence offers.
+
+    Raises:
+        InputError: It is none.
+
+    >>> number(float("nan"), "seconds", above=0, unit="s", example="2.0")
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: Argument `seconds` must be a finite number above 0 [s], but is nan; \
+give for instance 2.0.
+    """
+    found = real(value)
+    if math.isfinite(found) and found > above and least <= found < below:
+        return found
+    limits = [f"above {above:g}"] * (above > -math.inf) + [f"from {least:g}"] * (least > -math.inf)
+    limits += [f"below {below:g}"] * (below < math.inf)
+    what = " ".join(["a finite number", *[" and ".join(limits)] * bool(limits), *[f"[{unit}]"] * bool(unit)])
+    raise InputError(f"Argument `{name}` must be {what}, but is {shown(value)}; give for instance {example}.")
+
+
+def positive(value: Any, name: str, unit: str = "s", example: str = "2.0") -> float:
+    """A finite number above zero."""
+    return number(value, name, above=0, unit=unit, example=example)
+
+
+def whole(value: Any, name: str, least: int) -> int:
+    """A whole number that is not too small.
+
+    >>> whole(2.5, "memory", 1)
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: Argument `memory` must be a whole number from 1, but is 2.5; \
+give for instance 1.
+    """
+    found = real(value)
+    if not math.isfinite(found) or found != int(found) or found < least:
+        raise InputError(
+            f"Argument `{name}` must be a whole number from {least}, but is {shown(value)}; "
+            f"give for instance {least}."
+        )
+    return int(value)
+
+
+def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
+    """A word among others."""
+    listed = tuple(choices)
+    if isinstance(value, str) and value in listed:
+        return value
+    raise InputError(
+        f"Argument `{name}` must be one of {', '.join(map(repr, listed))}, but is {shown(value)}; "
+        "give one of these."
+    )
+
+
+def names(value: Any, name: str) -> tuple[str, ...]:
+    """Several names in a sequence; one alone is none of these, as its letters would count."""
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
+        listed = tuple(value)
+        if all(isinstance(entry, str) for entry in listed):
+            return listed
+    hint = f"write [{value!r}]" if isinstance(value, str) else "give for instance ['hub']"
+    raise InputError(f"Argument `{name}` must be a list of names, but is {shown(value)}; {hint}.")
+
+
+def progress(given: Any) -> Callable[[str], Any]:
+    """A function that takes lines of progress; one that does nothing for None."""
+    if given is None:
+        return lambda _: None
+    if callable(given):
+        return given
+    raise InputError(
+        f"Argument `progress` must be a function that takes a line of text, but is {shown(given)}; "
+        "give for instance print."
+    )
+
+
+def seed(value: Any) -> Any:
+    """A whole number from 0, or a generator of NumPy."""
+    return value if isinstance(value, np.random.Generator) else whole(value, "seed", 0)
+
+
+def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
+    """A signal as an array, float32 where that was given, else float64.
+
+    Raises:
+        InputError: More than one column, complex, empty, or not finite.
+    """
+    try:
+        array = np.asarray(u)
+    except (TypeError, ValueError):
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf" or array.ndim != 1 or not array.size:
+        what = f"{array.dtype.name} of shape {array.shape}" if array.dtype != object else shown(u)
+        raise InputError(
+            f"Argument `{name}` must be real numbers of shape (N,), one per sample, but is {what}; "
+            "give one signal."
+        )
+    if not all_finite(array):
+        k = int(np.argmin(np.isfinite(array)))
+        raise InputError(
+            f"Argument `{name}` must be finite, but is {array[k]} at sample {k}; cut the signal there."
+        )
+    return array.astype(np.float32 if array.dtype in (np.float16, np.float32) else np.float64, copy=False)
+
+
+def all_finite(x: Num[np.ndarray, "..."]) -> bool:
+    """Whether all numbers are finite, mostly without an array of results."""
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(np.sum(x)) or np.isfinite(x).all())

@@ -1,0 +1,59 @@
+"""The rounds of a search while it runs, in a file: what was found is there if it is stopped."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rotflex_jax.cli.stopping import STOP
+from rotflex_jax.errors import InputError
+from rotflex_jax.text.files import write_file
+
+
+class RoundsSoFar:
+    """Keeps the models that a search has reached in `NAME.stopped.json`, beside its result to be.
+
+    A result of an earlier search stays as it is until the new one is complete.
+
+    Args:
+        json_file: Where the result goes; None or "-" where it goes to no file, and nothing is kept.
+    """
+
+    def __init__(self, json_file: Path | None) -> None:
+        self.file = None
+        if json_file is not None and str(json_file) != "-" and not _is_special(json_file):
+            self.file = json_file.with_name(f"{json_file.stem}.stopped.json")
+        self._stages: list[dict[str, Any]] = []
+
+    def following(self, step: Callable[[str], None]) -> Callable[[str], None]:
+        """The same function of a line of progress; lines that tell of a model reached are kept too."""
+
+        def follow(line: str) -> None:
+            errors = getattr(line, "errors", None)
+            if self.file is not None and errors is not None:
+                label = str(getattr(line, "label", ""))
+                self._stages.append({"model": label, "held_out_rmse_windows": dict(errors)})
+                self._write(self.file)
+            step(line)
+
+        return follow
+
+    def _write(self, file: Path) -> None:
+        kept = {"schema": 1, "stopped": True, "stages": self._stages}
+        try:
+            write_file(file, json.dumps(kept, indent=2) + "\n")
+        except InputError:
+            return  # the search is worth more than its trace
+        done = len(self._stages) - 1
+        STOP.kept = f"the errors of the model as it is and after {done} finished rounds are in {file}"
+
+    def remove(self) -> None:
+        """Nothing is kept of a search that has ended."""
+        STOP.kept = ""
+        if self.file is not None and self._stages:
+            self.file.unlink(missing_ok=True)
+
+
+def _is_special(path: Path) -> bool:
+    """A device or a pipe, beside which nothing is kept."""
+    return path.exists() and not path.is_file()

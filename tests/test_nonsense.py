@@ -1,0 +1,422 @@
+"""Values that make no sense, function by function: each is refused with one sentence before any work."""
+
+import inspect
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rotflex_jax as rf
+from rotflex_jax import adaptive, basis, checks, export, joints, kernels, metrics
+from rotflex_jax.data import excitation, save_csv
+from rotflex_jax.errors import InputError
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT
+
+NAN, INF = math.nan, math.inf
+N = 200
+U = excitation.noise(N, 0.002, seed=8)
+JOINT = joints.paper()
+Y = rf.simulate(JOINT, U, 0.002) + 1e-4 * np.random.default_rng(0).normal(size=(N, 2))
+RUN = rf.Recording(u=U, y=Y, Ts=0.002)
+A, B = RUN.split(0.7)
+MODEL = Model(JOINT)
+SERIES = basis.Volterra(basis.Delays(3))
+LIMITS = rf.Limits(voltage=5.0)
+NOISE = {"theta": 1e-3, "alpha": 1e-3}
+AT_REST = rf.Recording(
+    u=U, y=np.column_stack([Y[:, 0], np.zeros(N)]), Ts=0.002, accept=("constant", "saturated")
+)
+
+
+def refused(call: Callable[[], object], phrase: str) -> None:
+    """One readable sentence that says it, without Python inside."""
+    with pytest.raises(InputError) as caught:
+        call()
+    sentence = str(caught.value)
+    assert re.search(phrase, sentence), sentence
+    assert sentence[-1] in ".?" and "\n" not in sentence and len(sentence) < 400, sentence
+    assert not re.search("[.!] [A-Z]|np[.]|dtype|array\\(|object at 0x", sentence), sentence
+
+
+# Each function with good arguments, and the arguments that are replaced by what makes no sense.
+FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+    "fit": (rf.fit, {"mechanism": JOINT, "recordings": RUN}),
+    "many_starts": (rf.many_starts, {"mechanism": JOINT, "recordings": RUN}),
+    "discover": (rf.discover, {"mechanism": JOINT, "train": A, "validation": B}),
+    "learn_torque": (rf.learn_torque, {"model": JOINT, "train": A, "test": B}),
+    "latent_torque": (rf.latent_torque, {"model": JOINT, "recordings": RUN}),
+    "compare": (rf.compare, {"recordings": RUN, "methods": ["arx"]}),
+    "least_squares": (rf.least_squares, {"basis": SERIES, "recordings": RUN, "channel": "theta"}),
+    "forward_regression": (rf.forward_regression, {"basis": SERIES, "recordings": RUN, "channel": "theta"}),
+    "simulate": (rf.simulate, {"mechanism": JOINT, "u": U, "Ts": 0.002}),
+    "linearise": (rf.linearise, {"mechanism": JOINT}),
+    "locate": (
+        rf.locate,
+        {"recording": RUN, "residual": Y, "channels": ("theta", "alpha"), "noise": [1e-3, 1e-3]},
+    ),
+    "next_experiment": (
+        rf.next_experiment,
+        {"model": JOINT, "a": "coulomb@hub", "b": "delay@input", "limits": LIMITS, "noise": NOISE},
+    ),
+    "fleet": (rf.fleet, {"joint": JOINT, "recordings": [RUN], "folder": "never-made", "workers": 0}),
+    "load": (rf.load, {"source": "no-such.csv"}),
+    "explore": (rf.explore, {"model": MODEL, "recordings": RUN}),
+    "Limits": (rf.Limits, {"voltage": 5.0}),
+    "Exponential": (rf.Exponential, {}),
+    "SmoothRK4": (rf.SmoothRK4, {}),
+    "Mechanism": (
+        rf.Mechanism,
+        {"coordinates": ("a",), "ports": {"p": (1,)}, "effects": (), "outputs": {"a": "p"}},
+    ),
+    "Model": (Model, {"mechanism": JOINT}),
+    "Recording": (rf.Recording, {"u": U, "y": Y, "Ts": 0.002}),
+    "Recording.split": (RUN.split, {}),
+    "Recording.decimate": (RUN.decimate, {"k": 2}),
+    "Recording.slice": (RUN.slice, {"i": 0, "j": 60}),
+    "Model.simulate": (MODEL.simulate, {"recording": RUN}),
+    "Model.simulate_windows": (MODEL.simulate_windows, {"recording": RUN}),
+    "Model.predict": (
+        MODEL.predict,
+        {"recording": RUN, "process_noise": {"hub": 1e-6}, "noise": [1e-3, 1e-3]},
+    ),
+    "Model.save": (MODEL.save, {"path": "never-made"}),
+    "Mechanism.with_values": (JOINT.with_values, {}),
+    "export.to_c": (export.to_c, {"model": JOINT, "Ts": 0.002}),
+    "export.latex": (export.latex, {"model": JOINT}),
+    "export.text": (export.text, {"model": JOINT}),
+    "export.state_space": (export.state_space, {"model": JOINT}),
+    "export.save": (export.save, {"path": "never-made"}),
+    "export.read": (export.read, {}),
+    "kernels.local_kernels": (
+        kernels.local_kernels,
+        {"model": JOINT, "Ts": 0.002, "channel": "theta", "memory": 5},
+    ),
+    "kernels.average_kernels": (
+        kernels.average_kernels,
+        {"model": JOINT, "data": RUN, "channel": "theta", "memory": 5},
+    ),
+    "adaptive.identify": (
+        adaptive.identify,
+        {"filter": adaptive.LMS(0.1), "basis": SERIES, "recording": RUN, "channel": "theta"},
+    ),
+    "basis.Delays": (basis.Delays, {"memory": 3}),
+    "basis.Volterra": (basis.Volterra, {"bank": basis.Delays(3)}),
+    "save_csv": (save_csv, {"recording": RUN, "path": "never-made"}),
+    "metrics.rmse": (metrics.rmse, {"y": Y, "y_hat": Y}),
+    "noise": (excitation.noise, {"N": 100, "Ts": 0.01}),
+    "multisine": (excitation.multisine, {"N": 100, "Ts": 0.01}),
+    "prbs": (excitation.prbs, {"N": 100, "Ts": 0.01}),
+    "steps": (excitation.steps, {"N": 100, "Ts": 0.01}),
+    "sweep": (excitation.sweep, {"N": 100, "Ts": 0.01}),
+    "pulse": (excitation.pulse, {"N": 100, "Ts": 0.01}),
+}
+
+NO_MODEL = [(None, "None was given"), ("paper", "'paper' was given"), (RUN, "a Recording was given")]
+NO_RECORDINGS = [
+    (None, "is None; read a file"),
+    ("run.csv", r"is 'run\.csv'; read a file with rotflex_jax\.load"),
+    (3, "is 3; read a file"),
+    ([], "No recording was given"),
+    ([RUN, None], "has None as entry 2"),
+    ([Path("a.csv"), RUN], "has a PosixPath as entry 1"),
+    (U, "as entry 1"),
+]
+TOO_SHORT = [(RUN.slice(0, 2), f"has 2 samples, but at least {SHORTEST_TO_FIT} are needed")]
+NO_SECONDS = [(0, "above 0.*is 0;"), (NAN, "is nan"), (INF, "is inf"), (-1.0, "is -1.0"), ("2", "is '2'")]
+NO_PROGRESS = [(3, "`progress` must be a function .* but is 3")]
+PROCESS_NOISE = [
+    ({"hub": -1}, r"`process_noise\['hub'\]` must be a finite number from 0, but is -1"),
+    ({"hub": NAN}, "is nan"),
+    ({"hub": "much"}, "is 'much'"),
+    ({"x": 1.0}, "given at 'x', but the mechanism has the ports hub, joint, arm"),
+    (["hub"], "an intensity for each port, but is a list"),
+    (1e-6, "but is 1e-06"),
+]
+NO_NUMBER = [(NAN, "nan"), ("a", "'a'"), (None, "None")]
+COUNTS = [(0, "is 0"), (1.5, "is 1.5"), (NAN, "is nan"), (-1, "is -1"), ("many", "is 'many'")]
+
+BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
+    ("fit", "mechanism"): NO_MODEL,
+    ("fit", "recordings"): [*NO_RECORDINGS, *TOO_SHORT, (AT_REST, "'alpha' has one value throughout")],
+    ("fit", "process_noise"): PROCESS_NOISE,
+    ("fit", "first"): [("x", "one of 'fitted', 'measured', but is 'x'"), (None, "is None")],
+    ("fit", "max_steps"): COUNTS,
+    ("fit", "window_seconds"): NO_SECONDS,
+    ("fit", "local"): [
+        (("x",), "'x' was to be local"),
+        ("hub.inertia.inertia", "list of names"),
+        (3, "is 3"),
+    ],
+    ("fit", "minimiser"): [(3, "a solver of optimistix, but is 3")],
+    ("fit", "progress"): NO_PROGRESS,
+    ("many_starts", "mechanism"): NO_MODEL,
+    ("many_starts", "recordings"): [*NO_RECORDINGS, *TOO_SHORT, (AT_REST, "one value throughout")],
+    ("many_starts", "starts"): COUNTS,
+    ("many_starts", "keep"): COUNTS,
+    ("many_starts", "max_steps"): COUNTS,
+    ("many_starts", "spread"): [
+        (NAN, "is nan"),
+        (0, "is 0"),
+        (1, "below 1, but is 1"),
+        ("wide", "is 'wide'"),
+    ],
+    ("many_starts", "short_seconds"): NO_SECONDS,
+    ("many_starts", "seed"): [(-1, "is -1"), (1.5, "is 1.5"), ("a", "is 'a'")],
+    ("many_starts", "progress"): NO_PROGRESS,
+    ("discover", "mechanism"): NO_MODEL,
+    ("discover", "train"): [*NO_RECORDINGS, *TOO_SHORT, (AT_REST, "alpha")],
+    ("discover", "validation"): [*NO_RECORDINGS[1:3], *NO_RECORDINGS[4:], *TOO_SHORT],
+    ("discover", "test"): [*NO_RECORDINGS[1:3], *NO_RECORDINGS[4:], *TOO_SHORT],
+    ("discover", "candidates"): [
+        (
+            [(rf.effects.Coulomb, "nowhere")],
+            "Coulomb is to be tried at 'nowhere', but .* 'hub', 'joint'",
+        ),
+        ([(rf.effects.SensorBias, "hub")], "SensorBias .* at 'hub', but .*'theta', 'alpha'"),
+        ([("coulomb", "hub")], "pairs of an effect's class and a port, but has a tuple"),
+        ("coulomb", "but has 'c'"),
+        ([rf.effects.Coulomb], "has the class Coulomb"),
+        (3, "has 3"),
+    ],
+    ("discover", "rounds"): [(-1, "is -1"), (1.5, "is 1.5"), (NAN, "is nan"), ("all", "is 'all'")],
+    ("discover", "window_seconds"): NO_SECONDS,
+    ("discover", "calibrate_seconds"): [(-1, "is -1"), (NAN, "is nan"), (INF, "is inf"), (None, "is None")],
+    ("discover", "progress"): NO_PROGRESS,
+    ("learn_torque", "model"): NO_MODEL,
+    ("learn_torque", "train"): [*NO_RECORDINGS, *TOO_SHORT],
+    ("learn_torque", "test"): [*NO_RECORDINGS, *TOO_SHORT],
+    ("learn_torque", "at"): [("x", "'x' was asked for"), (3, "3 was asked for")],
+    ("learn_torque", "window_seconds"): NO_SECONDS,
+    ("learn_torque", "progress"): NO_PROGRESS,
+    ("latent_torque", "model"): NO_MODEL,
+    ("latent_torque", "recordings"): [*NO_RECORDINGS, *TOO_SHORT, (AT_REST, "one value throughout")],
+    ("latent_torque", "ports"): [(["x"], "'x' was asked for"), (3, "a list of names, but is 3")],
+    ("latent_torque", "progress"): NO_PROGRESS,
+    ("compare", "recordings"): [*NO_RECORDINGS, *TOO_SHORT],
+    ("compare", "methods"): [(3, "a list of methods, but is 3")],
+    ("compare", "mechanism"): NO_MODEL[1:],
+    ("compare", "test"): [*NO_RECORDINGS[1:], *TOO_SHORT],
+    ("compare", "fraction"): [(NAN, "is nan"), ("a", "is 'a'"), (2, "would have 400 of 200")],
+    ("compare", "window_seconds"): NO_SECONDS,
+    ("compare", "progress"): NO_PROGRESS,
+    ("least_squares", "basis"): [(3, "but int was given")],
+    ("least_squares", "recordings"): NO_RECORDINGS,
+    ("least_squares", "channel"): [("x", "no channel 'x'")],
+    ("least_squares", "ridge"): [(NAN, "is nan"), (-1, "is -1"), ("x", "is 'x'")],
+    ("least_squares", "skip"): [(-1, "is -1"), (NAN, "is nan"), ("a", "is 'a'"), (10**9, "are left out")],
+    ("forward_regression", "recordings"): NO_RECORDINGS,
+    ("forward_regression", "terms"): COUNTS,
+    ("forward_regression", "skip"): [(-1, "is -1"), (NAN, "is nan")],
+    ("simulate", "mechanism"): [
+        *NO_MODEL,
+        (joints.paper(hub_inertia=0.0), "Nothing gives theta an inertia|inertia"),
+        (joints.paper(arm_inertia=0.0), "inertia"),
+    ],
+    ("simulate", "u"): [
+        (np.ones((5, 2)), r"is float64 of shape \(5, 2\); give one signal"),
+        ([], r"of shape \(0,\)"),
+        ([1.0, NAN], "is nan at sample 1"),
+        ([1j, 2], "is complex128"),
+        (["a", "b"], "real numbers of shape"),
+        ([[1, 2], [3]], "is a list"),
+        (3.0, r"of shape \(\)"),
+        (None, "is None"),
+        ([True, False], "is bool"),
+    ],
+    ("simulate", "Ts"): [*NO_SECONDS, (None, "is None"), ([0.1, 0.2], "is a list"), (True, "is True")],
+    ("simulate", "x0"): [
+        (np.zeros(9), "has 9 entries, but the model has 4 states"),
+        ([NAN, 0, 0, 0], "is nan at sample 0"),
+        (np.zeros((2, 2)), r"of shape \(2, 2\)"),
+        ("a", "`x0` must be real numbers"),
+        (3.0, r"of shape \(\)"),
+    ],
+    ("simulate", "solver"): [("rk4", r"must be Exponential\(...\) or SmoothRK4\(...\), but is 'rk4'")],
+    ("linearise", "mechanism"): [*NO_MODEL, (joints.paper(arm_inertia=0.0), "inertia")],
+    ("locate", "recording"): NO_RECORDINGS[:3],
+    ("locate", "residual"): [(Y[:5], "a finite number for each"), (np.full_like(Y, NAN), "400 of them")],
+    ("locate", "window_seconds"): NO_SECONDS,
+    ("next_experiment", "model"): NO_MODEL,
+    ("next_experiment", "a"): [("x", "'x'"), ("delay@input", "delay")],
+    ("next_experiment", "limits"): [(5.0, r"must be Limits\(voltage=...\), but is 5.0")],
+    ("next_experiment", "seconds"): [(NAN, "of nan s"), (0, "of 0 s"), ("a", "of 'a' s")],
+    ("next_experiment", "Ts"): [(NAN, "of nan s"), (0, "period of 0 s")],
+    ("next_experiment", "noise"): [
+        ({"theta": -1, "alpha": 1}, "needs a positive standard deviation"),
+        ({"theta": NAN, "alpha": 1}, "needs a positive"),
+        ({"x": 1}, "needs a positive"),
+        ([1e-3, 1e-3], "given as a list"),
+    ],
+    ("next_experiment", "process_noise"): PROCESS_NOISE,
+    ("next_experiment", "reference"): [([NAN] * 10, "is nan at sample 0"), (np.ones((2, 2)), "of shape")],
+    ("next_experiment", "starts"): [(-1, "is -1"), (NAN, "is nan")],
+    ("next_experiment", "looks"): COUNTS,
+    ("next_experiment", "progress"): NO_PROGRESS,
+    ("fleet", "joint"): NO_MODEL,
+    ("fleet", "recordings"): [
+        (None, "None was given"),
+        (3, "3 was given"),
+        ("run.csv", r"'run\.csv' was given"),
+        ([None], "None was given"),
+        ([], "No recording was given"),
+        (["no.csv"], "no.csv does not exist"),
+    ],
+    ("fleet", "split"): [(NAN, "is nan"), ("a", "is 'a'"), (0, "is 0"), (1, "is 1")],
+    ("fleet", "workers"): [(-1, "is -1"), (1.5, "is 1.5"), (NAN, "is nan")],
+    ("fleet", "search"): [(3, "a function of a model and two recordings, but is 3")],
+    ("fleet", "scheduler"): [(3, "must be an address, but is 3")],
+    ("fleet", "folder"): [(3, "must be a path, but is 3")],
+    ("fleet", "progress"): NO_PROGRESS,
+    ("fleet", "degres"): [(True, "did you mean degrees")],
+    ("load", "source"): [(None, "NoneType was given"), (3, "int was given")],
+    ("explore", "recordings"): NO_RECORDINGS,
+    ("Limits", "voltage"): [(NAN, "given as nan"), ("a", "given as 'a'"), (INF, "given as inf")],
+    ("Limits", "slew"): [(NAN, "given as nan"), (0, "given as 0")],
+    ("Limits", "margin"): [(NAN, "is nan"), (1, "is 1")],
+    ("Exponential", "order"): [(3, "2 or 4, but is 3")],
+    ("Exponential", "substeps"): COUNTS,
+    ("Exponential", "passes"): COUNTS,
+    ("Exponential", "between"): [("linear", "one of 'held', 'smooth', but is 'linear'")],
+    ("SmoothRK4", "width"): NO_SECONDS,
+    ("SmoothRK4", "substeps"): COUNTS,
+    ("Mechanism", "coordinates"): [
+        (None, "given as None"),
+        (3, "given as 3"),
+        ("a", "a list is needed"),
+        ((), "no coordinates"),
+    ],
+    ("Mechanism", "ports"): [(None, "given as None"), ({"p": (NAN,)}, "one number per coordinate")],
+    ("Mechanism", "effects"): [(None, "given as None"), ([3], "3 was given as an effect")],
+    ("Mechanism", "trusted"): [(("x",), "'x' was named"), ((3,), "a list of names")],
+    ("Model", "mechanism"): [*NO_MODEL, (joints.paper(arm_inertia=0.0), "inertia")],
+    ("Model", "solver"): [(3, "`solver` must be .* but is 3")],
+    ("Model", "gates"): [((1.0,), "for each of the 6 effects"), ((NAN,) * 6, "a finite number")],
+    ("Recording", "n_init"): [(NAN, "is nan"), (INF, "is inf"), ("a", "is 'a'"), ([1, 2], "is a list")],
+    ("Recording", "Ts"): [([[1, 2], [3]], "is a list"), ([0.1, 0.2], "is 2 values"), (True, "is True")],
+    ("Recording", "start"): [(NAN, "is nan"), ("a", "is 'a'"), (None, "is None")],
+    ("Recording", "source"): [(3, "`source` must be text, but is 3")],
+    ("Recording", "input_name"): [(3, "must be text")],
+    ("Recording", "input_unit"): [(None, "must be text")],
+    ("Recording", "resolution"): [
+        ({"theta": -1}, "is -1"),
+        ({"theta": NAN}, "is nan"),
+        ({"x": 1}, "names 'x', but the recording has the channels theta, alpha"),
+        (3, "is 3"),
+    ],
+    ("Recording", "continues"): [(3, "the recording before this one, but is 3")],
+    ("Recording", "constants"): [(3, "is 3"), ({"a": NAN}, "the value nan")],
+    ("Recording", "channels"): [(3, "must be words"), ((1, 2), "must be words")],
+    ("Recording", "units"): [((1, 2), "must be words")],
+    ("Recording", "accept"): [(3, "but has 3")],
+    ("Recording", "u"): [(None, "`u` must hold real numbers"), ({}, "must hold real numbers")],
+    ("Recording.split", "share"): [(NAN, "is nan"), ("a", "is 'a'"), (INF, "is inf"), (2, "between 0 and 1")],
+    ("Recording.split", "seconds"): [(NAN, "is nan"), (0, "would have 0 of 200")],
+    ("Recording.decimate", "k"): [*COUNTS, (None, "is None"), (INF, "is inf")],
+    ("Recording.slice", "i"): [
+        (0.5, "from 0.5 to 60"),
+        (NAN, "from nan"),
+        ("a", "from 'a'"),
+        (-1, "from -1"),
+    ],
+    ("Model.simulate", "recording"): NO_RECORDINGS,
+    ("Model.simulate", "x0"): [(np.zeros(9), "9 entries"), ([NAN], "is nan"), ("a", "`x0` must be")],
+    ("Model.simulate_windows", "recording"): NO_RECORDINGS[:3],
+    ("Model.simulate_windows", "seconds"): NO_SECONDS,
+    ("Model.predict", "recording"): NO_RECORDINGS[:3],
+    ("Model.predict", "process_noise"): PROCESS_NOISE,
+    ("Model.predict", "noise"): [
+        ([1e-3], "one number for each of theta, alpha"),
+        ([0.0, 1e-3], "is 0.0"),
+        ([NAN, 1e-3], "is nan"),
+        ("ab", "one number for each"),
+        (None, "is None"),
+    ],
+    ("Model.save", "path"): [(3, "path of a file is needed, but 3 was given")],
+    ("Mechanism.with_values", "values"): [
+        ([1.0], "one number for each of the 1[0-9] parameters, but is a list"),
+        (np.ones(99), "one number for each"),
+        (None, "is None"),
+        ({"x": 1.0}, "'x' was named"),
+        ({"hub.inertia.inertia": NAN}, "finite value"),
+    ],
+    ("export.to_c", "model"): NO_MODEL,
+    ("export.to_c", "Ts"): NO_SECONDS,
+    ("export.to_c", "prefix"): [("a b", "begins no name in C"), (3, "begins no name in C"), ("", "no name")],
+    ("export.latex", "model"): NO_MODEL,
+    ("export.text", "model"): NO_MODEL,
+    ("export.state_space", "model"): NO_MODEL,
+    ("export.state_space", "Ts"): NO_SECONDS,
+    ("export.state_space", "voltage"): NO_NUMBER,
+    ("export.save", "saved"): [(3, "3 was given")],
+    ("export.read", "path"): [(3, "but 3 was given"), ("no-such.json", "does not exist")],
+    ("kernels.local_kernels", "model"): NO_MODEL,
+    ("kernels.local_kernels", "channel"): [("x", "'x' were requested")],
+    ("kernels.local_kernels", "memory"): COUNTS,
+    ("kernels.local_kernels", "Ts"): [(0, "."), (NAN, ".")],
+    ("kernels.average_kernels", "model"): NO_MODEL,
+    ("kernels.average_kernels", "blocks"): COUNTS,
+    ("kernels.average_kernels", "reach"): COUNTS,
+    ("adaptive.identify", "recording"): NO_RECORDINGS[:3],
+    ("basis.Delays", "memory"): COUNTS,
+    ("basis.Volterra", "order"): COUNTS,
+    ("save_csv", "recording"): NO_RECORDINGS[:3],
+    ("save_csv", "path"): [(3, "but 3 was given")],
+    ("metrics.rmse", "y_hat"): [(Y[:5], "the same shape"), (None, "arrays of numbers")],
+    ("metrics.rmse", "y"): [(None, "arrays of numbers"), (np.array([["a"]]), "arrays of numbers")],
+    ("metrics.rmse", "n_init"): [(NAN, "is nan"), ("a", "is 'a'"), (1.5, "is 1.5"), (N, "leave samples")],
+    ("noise", "N"): [(n, "`N` and `Ts` must be a number of samples") for n, _ in [*COUNTS, (INF, "")]],
+    ("noise", "Ts"): [(0, "and 0"), (NAN, "and nan"), (INF, "and inf"), ("a", "and 'a'")],
+    ("noise", "rms"): NO_SECONDS,
+    ("noise", "bandwidth"): NO_SECONDS,
+    ("noise", "seed"): [(-1, "is -1"), ("a", "is 'a'"), (0.5, "is 0.5")],
+    ("multisine", "band"): [((NAN, 3), "nan to 3 Hz"), (3, "is 3"), ("ab", "is 'ab'"), ((3, 1), "3 to 1 Hz")],
+    ("multisine", "periods"): [(0, "is 0"), (NAN, "is nan"), (1.5, "a multiple of `periods`")],
+    ("prbs", "hold"): NO_SECONDS,
+    ("steps", "hold"): NO_SECONDS,
+    ("steps", "amplitude"): NO_SECONDS,
+    ("sweep", "band"): [((NAN, 1), "nan to 1 Hz"), (None, "is None")],
+    ("pulse", "amplitude"): NO_NUMBER,
+    ("pulse", "width"): NO_SECONDS,
+    ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
+}
+
+CASES = [
+    pytest.param(function, argument, value, phrase, id=f"{function} {argument} {checks.shown(value)} {k}")
+    for (function, argument), rows in BAD.items()
+    for k, (value, phrase) in enumerate(rows)
+]
+
+
+@pytest.mark.parametrize(("function", "argument", "value", "phrase"), CASES)
+def test_nonsense_is_refused(
+    function: str,
+    argument: str,
+    value: Any,
+    phrase: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if function == "explore":
+        pytest.importorskip("ipywidgets")
+    call, good = FUNCTIONS[function]
+    refused(lambda: call(**{**good, argument: value}), phrase)
+
+
+def test_every_public_function_is_in_the_table() -> None:
+    settings = {"enable_compilation_cache", "enable_fast_loops", "live"}
+    functions = {name for name in rf.__all__ if inspect.isfunction(getattr(rf, name))} - settings
+    inputs = set(excitation.INPUTS)
+    assert functions | inputs <= {function for function, _ in BAD}
+    assert {function for function, _ in BAD} == set(FUNCTIONS)
+
+
+def test_whole_numbers_may_be_floats() -> None:
+    assert RUN.decimate(2.0).N == RUN.decimate(2).N == 100
+    assert RUN.slice(np.int64(0), 60).N == 60
+    assert rf.Recording(u=U, y=Y, Ts=np.array([[0.002]]), n_init=np.float64(20)).n_init == 20
