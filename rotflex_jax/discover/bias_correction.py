@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from rotflex_jax.discover.batched_predictor import BatchedPredictor
-from rotflex_jax.discover.coordinates import FitCoordinates
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import MAX_COORDINATE_STEP, MIN_DECREASE_NATS

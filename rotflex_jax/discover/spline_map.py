@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from rotflex_jax.discover.coordinates import FitCoordinates
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import MAX_COORDINATE_STEP, choose_process_noise

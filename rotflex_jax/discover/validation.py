@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.coordinates import FitCoordinates
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
 from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_blocks
 from rotflex_jax.discover.refit import refit
