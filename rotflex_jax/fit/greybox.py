@@ -433,6 +433,10 @@ class GreyBoxProblem:
         self, point: FitPoint, stage: Stage, K: Float[np.ndarray, "R n C"], tolerance: float
     ) -> Minimum:
         """The least cost near a point."""
+        if self.minimiser is not None:
+            from rotflex_jax.fit.optimistix_adapter import minimise_by  # takes long to import
+
+            return minimise_by(self.minimiser, self, point, stage, K)
         coordinates = self.coordinates(point, stage.windows)
 
         def tell(progress: Progress) -> None:
