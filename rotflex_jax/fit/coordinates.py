@@ -103,9 +103,7 @@ class FitCoordinates:
                 g[columns] += J @ w[r, samples].ravel()
         return H, g
 
-    def parts(
-        self, e: Float[np.ndarray, "R N C"], J: Float[np.ndarray, "R N C D"]
-    ) -> list[RecordingSlopes]:
+    def parts(self, e: Float[np.ndarray, "R N C"], J: Float[np.ndarray, "R N C D"]) -> list[RecordingSlopes]:
         """Errors and slopes window by window, with their columns."""
         return [
             RecordingSlopes(J[r, samples], e[r, samples], self.columns(r, k))

@@ -22,6 +22,7 @@ from rotflex_jax.fit.inference import (
     sandwich,
 )
 from rotflex_jax.fit.physical_ranges import physical_ranges
+from rotflex_jax.fit.plausibility import AT_BOUND, Reach, at_bounds, beyond_recordings
 from rotflex_jax.fit.problem import (
     LARGEST_STEP,
     LikelihoodEquations,
@@ -69,8 +70,8 @@ LEAST_SCALE = 0.1
 FAR_START_ERROR = 0.7
 # Free runs that miss a channel by more than so many times its noise lack something.
 MISSING = 3.0
-# Horizons on the way to a long one: the first [s], how many times longer the next is, and the largest share of
-# the long one that is worth a stage.
+# Horizons on the way to a long one: the first [s], how many times longer the next is, and the largest share
+# of the long one that is worth a stage.
 SHORTEST_HORIZON, NEXT_HORIZON, LONGEST_SHARE = 2.0, 2.5, 0.75
 # An end is one where the slopes promise no more than this share of a nat for each coordinate.
 RUGGED = 0.5
@@ -250,9 +251,7 @@ class GreyBoxProblem:
         seen = self.dataset.data.seen > 0
         return np.maximum(np.std(self.dataset.data.y[seen], axis=0), self.dataset.noise)
 
-    def equations(
-        self, point: FitPoint, stage: Stage, K: Float[np.ndarray, "R n C"]
-    ) -> LikelihoodEquations:
+    def equations(self, point: FitPoint, stage: Stage, K: Float[np.ndarray, "R n C"]) -> LikelihoodEquations:
         """Likelihood and its quadratic model at a point."""
         e, J = self.errors(point, stage, K)
         return likelihood_equations(
@@ -361,7 +360,7 @@ class GreyBoxProblem:
             z = point.local_z[:, point.local.index(i)] if i in point.local else point.z[i : i + 1]
             for bound, which in zip(self.ranges, ("lower", "upper"), strict=True):
                 if np.any(z == bound[i]):
-                    found[names[i]] = f"at its {which} bound"
+                    found[names[i]] = AT_BOUND[which]
         return found
 
     def held_by_ends(self, point: FitPoint, windows: Windows) -> Bool[np.ndarray, " M"]:
@@ -372,7 +371,9 @@ class GreyBoxProblem:
     def _follows(self, stage: Stage) -> bool:
         """Whether first states are held at what the parameters imply, wholly or in part."""
         unseen = len(rest_state(self.model.mechanism.structure, np.float64)) > self._moving
-        return not self.layout.states or (unseen and stage.windows.number > 1 and max(stage.windows.counts) > 1)
+        return not self.layout.states or (
+            unseen and stage.windows.number > 1 and max(stage.windows.counts) > 1
+        )
 
     @property
     def _moving(self) -> int:
@@ -403,7 +404,9 @@ class GreyBoxProblem:
             return np.zeros((len(recordings), n, C))
         return np.stack(
             [
-                kalman_gains(self.model_at(point, r).mechanism, [stage.process_noise], self.dataset.noise, x.Ts)[0]
+                kalman_gains(
+                    self.model_at(point, r).mechanism, [stage.process_noise], self.dataset.noise, x.Ts
+                )[0]
                 for r, x in enumerate(recordings)
             ]
         )
@@ -493,7 +496,9 @@ def report(
             counts, columns = seen[r, samples], coordinates.columns(r, k)
             inside = moves[columns]
             slopes = (J[r, samples] / scale[:, None])[counts]
-            own = RecordingSlopes(slopes[..., inside], (e[r, samples] / scale)[counts], place[columns[inside]])
+            own = RecordingSlopes(
+                slopes[..., inside], (e[r, samples] / scale)[counts], place[columns[inside]]
+            )
             parts.append(own)
     H = curvature(parts, int(moves.sum()))
     covariance = _spread_out(sandwich(parts, H), moves)
@@ -521,11 +526,14 @@ def report(
     together = together[moves]
     determined = [k for k in range(len(free)) if together[:, k].any()]
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
+    notes = [at_end.get(name, "") for name in names]
+    fitted, found = m.with_values(common), estimates(names, common, specs, combinations, covariance, notes)
+    reach = Reach.of(model, problem.dataset.recordings)
     return Fit(
-        model=dataclasses.replace(model, mechanism=m.with_values(common)),
+        model=dataclasses.replace(model, mechanism=fitted),
         cost=cost,
         status=end.status,
-        parameters=estimates(names, common, specs, combinations, covariance, [at_end.get(n, "") for n in names]),
+        parameters=found,
         noise=dict(zip(m.channels, deviation.tolist(), strict=True)),
         covariance=combined_covariance(covariance, free),
         free_names=free_names,
@@ -535,6 +543,7 @@ def report(
             together[:, determined].T @ H @ together[:, determined], [free_names[k] for k in determined]
         ),
         local=local,
+        remarks=(*at_bounds(found), *beyond_recordings(fitted, reach)),
     )
 
 

@@ -84,7 +84,7 @@ def long_run_scores(parts: Sequence[RecordingSlopes], size: int) -> Float[np.nda
 
 
 def nats_that_count(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> float:
-    """Nats of a likelihood of white errors that say as much as one would if the errors were white; 1 at least.
+    """Nats of a likelihood that say as much as one would if the errors were white; 1 at least.
 
         trace(H^-1 S) / D
 

@@ -52,7 +52,9 @@ class Moves(NamedTuple):
         return cls(
             (*point.free, *point.local),
             tuple((*shared, *c.local_columns(r).tolist()) for r in recordings),
-            tuple(tuple(tuple(c.state_columns(r, k).tolist()) for k, _ in c.windows.of(r)) for r in recordings),
+            tuple(
+                tuple(tuple(c.state_columns(r, k).tolist()) for k, _ in c.windows.of(r)) for r in recordings
+            ),
         )
 
 
@@ -86,7 +88,11 @@ def minimise_by(
             jnp.asarray(K),
             jnp.asarray(here.scale),
         )
-        which = (problem.layout, problem.model.mechanism.parameter_specifications, Moves.of(point, coordinates))
+        which = (
+            problem.layout,
+            problem.model.mechanism.parameter_specifications,
+            Moves.of(point, coordinates),
+        )
         none = jnp.zeros(coordinates.size)
         step, count, result = _solved(minimiser, which, none, fixed, problem.max_steps)
         before, point, steps = here.scale, coordinates.moved(point, np.asarray(step)), steps + int(count)

@@ -264,7 +264,11 @@ class LikelihoodEquations:
         i, o = np.flatnonzero(self.inner), np.flatnonzero(~self.inner)
         A = A + RIDGE * np.eye(len(b))
         own = A[np.ix_(i, i)] + damping**2 / (1 + damping) * np.eye(len(i))
-        solved = np.linalg.solve(own, np.column_stack([A[np.ix_(i, o)], b[i]])) if len(i) else np.zeros((0, len(o) + 1))
+        solved = (
+            np.linalg.solve(own, np.column_stack([A[np.ix_(i, o)], b[i]]))
+            if len(i)
+            else np.zeros((0, len(o) + 1))
+        )
         left = A[np.ix_(o, o)] - A[np.ix_(o, i)] @ solved[:, :-1]
         right = b[o] - A[np.ix_(o, i)] @ solved[:, -1]
         left = left + np.diag(damping * np.maximum(np.diag(left), 1e-12))
