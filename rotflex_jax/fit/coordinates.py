@@ -6,7 +6,7 @@ recording, so that products and projections are formed block by block.
 """
 
 import dataclasses
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,7 +21,7 @@ RANK_TOLERANCE = 1e-10
 class Point(Protocol):
     """Numbers that a fit moves: a dataclass with at least these fields."""
 
-    __dataclass_fields__: dict[str, Any]
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def free(self) -> tuple[int, ...]: ...  # noqa: D102 - parameters that all recordings share

@@ -106,7 +106,7 @@ class FitPoint:
 
 
 @dataclasses.dataclass(frozen=True)
-class Stage:
+class FitStage:
     """What is fitted in one stage: free runs of some length, or predictions.
 
     Attributes:
@@ -134,7 +134,7 @@ class FitAttempt:
     """
 
     point: FitPoint
-    stage: Stage
+    stage: FitStage
     K: Float[np.ndarray, "R n C"]
     status: str
     steps: int
@@ -206,7 +206,7 @@ class GreyBoxProblem:
         """What moves."""
         return FitCoordinates(len(point.free), len(point.local), self.layout.states, windows)
 
-    def attempt(self, point: FitPoint, stages: Sequence[Stage]) -> FitAttempt:
+    def attempt(self, point: FitPoint, stages: Sequence[FitStage]) -> FitAttempt:
         """One stage after the other, from a start; each but the last only until it is near its end."""
         history, steps, status = [], 0, "converged"
         start_error = np.full(len(self.dataset.noise), np.inf)
@@ -251,7 +251,9 @@ class GreyBoxProblem:
         seen = self.dataset.data.seen > 0
         return np.maximum(np.std(self.dataset.data.y[seen], axis=0), self.dataset.noise)
 
-    def equations(self, point: FitPoint, stage: Stage, K: Float[np.ndarray, "R n C"]) -> LikelihoodEquations:
+    def equations(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> LikelihoodEquations:
         """Likelihood and its quadratic model at a point."""
         e, J = self.errors(point, stage, K)
         return likelihood_equations(
@@ -264,7 +266,7 @@ class GreyBoxProblem:
         )
 
     def errors(
-        self, point: FitPoint, stage: Stage, K: Float[np.ndarray, "R n C"]
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
         """Errors of the runs and their slopes; zero where a sample does not count."""
         values, slopes = self.physical(point)
@@ -313,13 +315,13 @@ class GreyBoxProblem:
     ) -> FitAttempt:
         """The best end of the ways that are worth trying."""
         *shorter, horizon = self.horizons(window_seconds)
-        start, last = self.start(local, horizon), Stage(horizon, process_noise)
+        start, last = self.start(local, horizon), FitStage(horizon, process_noise)
         end = self.attempt(start, [last])
         better = functools.partial(min, key=lambda attempt: attempt.rank)
         if process_noise is None and shorter and (end.doubtful or self._misses_something(end)):
             self.say("fit: again, from short horizons to long ones")
-            first = Stage(shorter[0])
-            way = [first, *map(Stage, shorter[1:]), last]
+            first = FitStage(shorter[0])
+            way = [first, *map(FitStage, shorter[1:]), last]
             end = better(end, self.attempt(self._at_windows(start, first.windows), way))
             end = self._from_nearby(end)
         elif end.doubtful:
@@ -327,7 +329,7 @@ class GreyBoxProblem:
             # Torques as large as those of the motion make the filter follow the data within a few samples.
             m = self.model.mechanism
             short = process_noise_ports(m, (0.03 * self.dataset.torque_scale) ** 2)
-            end = better(end, self.attempt(start, [Stage(horizon, short), last]))
+            end = better(end, self.attempt(start, [FitStage(horizon, short), last]))
         return end
 
     def _misses_something(self, end: FitAttempt) -> bool:
@@ -368,7 +370,7 @@ class GreyBoxProblem:
         room = self._room(point, windows)
         return (room[0] == 0) | (room[1] == 0)
 
-    def _follows(self, stage: Stage) -> bool:
+    def _follows(self, stage: FitStage) -> bool:
         """Whether first states are held at what the parameters imply, wholly or in part."""
         unseen = len(rest_state(self.model.mechanism.structure, np.float64)) > self._moving
         return not self.layout.states or (
@@ -385,7 +387,7 @@ class GreyBoxProblem:
         x0[..., : self._moving] = windows.first_states
         return dataclasses.replace(point, x0=x0)
 
-    def _with_shown_states(self, point: FitPoint, stage: Stage) -> FitPoint:
+    def _with_shown_states(self, point: FitPoint, stage: FitStage) -> FitPoint:
         """First states that the first samples show, where they are held, and memories of a whole run."""
         if not self._follows(stage):
             return point
@@ -397,7 +399,7 @@ class GreyBoxProblem:
             x0[r, : len(begins)] = there.states_at(recording, begins, moving)
         return dataclasses.replace(point, x0=x0)
 
-    def _gains(self, point: FitPoint, stage: Stage) -> Float[np.ndarray, "R n C"]:
+    def _gains(self, point: FitPoint, stage: FitStage) -> Float[np.ndarray, "R n C"]:
         n, C = point.x0.shape[-1], len(self.dataset.noise)
         recordings = self.dataset.recordings
         if stage.process_noise is None:
@@ -433,7 +435,7 @@ class GreyBoxProblem:
         return limit
 
     def _minimum(
-        self, point: FitPoint, stage: Stage, K: Float[np.ndarray, "R n C"], tolerance: float
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"], tolerance: float
     ) -> Minimum:
         """The least cost near a point."""
         if self.minimiser is not None:

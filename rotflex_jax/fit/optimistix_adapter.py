@@ -20,10 +20,10 @@ from jaxtyping import Array, Float
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.problem import LikelihoodEquations, RunLayout, runs_with_slopes
 from rotflex_jax.optimise.damped_least_squares import Minimum, Status
-from rotflex_jax.parameters import Transform
+from rotflex_jax.parameters import Specification, Transform
 
 if TYPE_CHECKING:
-    from rotflex_jax.fit.greybox import FitPoint, GreyBoxProblem, Stage
+    from rotflex_jax.fit.greybox import FitPoint, GreyBoxProblem, FitStage
 
 Minimiser = optx.AbstractLeastSquaresSolver
 
@@ -62,7 +62,7 @@ def minimise_by(
     minimiser: Minimiser,
     problem: "GreyBoxProblem",
     point: "FitPoint",
-    stage: "Stage",
+    stage: "FitStage",
     K: Float[np.ndarray, "R n C"],
 ) -> Minimum:
     """Where the solver ends, in float64; takes the place of `optimise.damped_least_squares.minimise`.
@@ -127,30 +127,22 @@ def _slopes(which: Any, at: Any, way: Any) -> tuple[Array, Array]:
 
 def _compressed(which: Any, step: Float[Array, " M"], fixed: Any) -> tuple[Array, Array]:
     """`r`, and the rows of `J` that are not zero."""
-    costs, g, H = _sums(*which, step, *fixed)
+    cost, g, H = _sums(which, step, fixed)
     # Scaled to a unit diagonal first: coordinates may differ by many orders of size.
     diagonal = jnp.diagonal(H)
     size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     L = jnp.linalg.cholesky(H / jnp.outer(size, size) + 1e-14 * len(g) * jnp.eye(len(g), dtype=g.dtype))
     a = jax.scipy.linalg.solve_triangular(L, g / size, lower=True)
-    rest = jnp.maximum(2 * jnp.sum(costs) - a @ a, 0.0)
+    rest = jnp.maximum(2 * cost - a @ a, 0.0)
     return jnp.append(a, jnp.sqrt(rest)), (L * size[:, None]).T
 
 
 def _sums(
-    layout: RunLayout,
-    specs: Any,
-    moves: Moves,
-    step: Array,
-    z: Array,
-    local_z: Array,
-    x0: Array,
-    given: Any,
-    window: Array,
-    K: Array,
-    scale: Array,
-) -> tuple[Array, Array, Array]:
-    """Half the squared scaled errors of each channel, their gradient, and `J'J`, after a step."""
+    which: tuple[RunLayout, tuple[Specification, ...], Moves], step: Float[Array, " M"], fixed: Any
+) -> tuple[Float[Array, ""], Float[Array, " M"], Float[Array, "M M"]]:
+    """Half the squared scaled errors, their gradient, and `J'J`, after a step."""
+    layout, specs, moves = which
+    z, local_z, x0, given, window, K, scale = fixed
     (data, constants), free = given, np.array(moves.free)
     shared, transform = len(free) - local_z.shape[1], Transform.of(specs)
     Z = jnp.tile(z, (len(x0), 1)).at[:, free[shared:]].set(local_z)
@@ -176,4 +168,4 @@ def _sums(
             part = jnp.where(inside, J[r], 0.0).reshape(-1, len(own))
             g = g.at[own].add(part.T @ e[r].reshape(-1))
             H = H.at[np.ix_(own, own)].add(part.T @ part)
-    return jnp.sum(e * e, axis=(0, 1)) / 2, g, H
+    return jnp.sum(e * e) / 2, g, H
