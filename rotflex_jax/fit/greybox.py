@@ -214,21 +214,29 @@ class GreyBoxProblem:
             last = number == len(stages) - 1
             if number:
                 point = self._at_windows(point, stage.windows)
-            follows = self._follows(stage)
+            follows, best = self._follows(stage), None
             for repetition in range(MOST_REPETITIONS if last and follows else 1):
                 point, K = self._with_shown_states(point, stage), self._gains(point, stage)
                 found = self._minimum(
                     point, stage, K, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE
                 )
-                point, steps = found.x, steps + found.evaluations
+                point, cost, steps = found.x, found.cost, steps + found.evaluations
                 status = self._status(found)
                 if not history:
                     start_error = found.first.scale / self._spread
-                history.append(float(found.cost))
-                settled = len(history) > 1 and abs(history[-1] - history[-2]) < SETTLED
-                if status != "converged" or (settled and repetition + 1 >= LEAST_REPETITIONS):
+                if follows:
+                    # What counts is the run from the states that go with these parameters.
+                    point = self._with_shown_states(point, stage)
+                    cost = self.equations(point, stage, K).cost
+                history.append(float(cost))
+                if best is None or cost < best[0]:
+                    best = cost, point, K, status
+                worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - SETTLED
+                if status != "converged" or not worth:
                     break
-        cost = history[-1] if np.isfinite(history[-1]) else np.inf
+            assert best
+            cost, point, K, status = best
+        cost = float(cost) if np.isfinite(cost) else np.inf
         return FitAttempt(point, stage, K, status, steps, history, start_error, cost)
 
     def _status(self, found: Minimum) -> str:
