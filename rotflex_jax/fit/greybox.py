@@ -595,11 +595,20 @@ def fit(
     `y_hat` is a free run, or, with `process_noise`, the prediction of a steady Kalman filter whose
     model admits white torques of that intensity. A free run asks the model to be right over the whole
     recording; where physics is missing, it biases the parameters to hide that, and a prediction biases
-    them less. Where the run or prediction at the start misses most of the motion, or the fit does not
-    converge, it starts a second time with short predictions, which are easy to match from far away, and the
-    better of the two ends counts. From a near start they would lead away, since they are insensitive to
-    parameters that only a long run shows. The scale `s` of each channel is the standard deviation of its
-    residuals.
+    them less. The scale `s` of each channel is the standard deviation of its residuals, at every step of the
+    fit.
+
+    Over a long run of a machine that the model does not know wholly the cost is rugged: friction that stops a
+    little earlier shifts all that follows. Where a run of more than a few seconds leaves errors far above the
+    noise, or does not converge, the fit starts a second time with free runs of 2 s, then of 5 s and so on to
+    the whole, and from a few places around the better end; the best of all ends counts. Where a short run or
+    prediction at the start misses most of the motion, or does not converge, the second start is with short
+    predictions, which are easy to match from far away.
+
+    A fit has converged where steps bring less than a small part of a standard deviation of the parameters;
+    errors that go on for many samples make that many nats. Parameters stay within the physical range that
+    their effects declare, a damper as far as the damping of its port is not negative; one that is at the end
+    of its range, or a size far beyond what the recordings reach, is named in `remarks`.
 
     Args:
         mechanism: What to fit; its values are the start, its trusted parameters are held.
@@ -608,8 +617,9 @@ def fit(
         local: Full names of parameters that each recording has for itself, an offset for instance.
         first: Whether first states are fitted, or held at what the first `n_init` samples show: where
             nothing pulls the machine back, a free first position hides a drift of the model.
-        window_seconds: Start again every so often [s], each time with a first state of its own and with
-            memories at rest: the parameters with which free runs of that length are best.
+        window_seconds: Start again every so often [s], each time with a first state of its own: the
+            parameters with which free runs of that length are best. Delays and lags go on across windows, and
+            memories begin as a run over the whole recording leaves them, as in the errors over windows.
         max_steps: Most iterations of each minimisation; there are several, each with the scale of the one
             before.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
