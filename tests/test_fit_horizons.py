@@ -18,6 +18,7 @@ from rotflex_jax.fit.physical_ranges import physical_ranges
 from rotflex_jax.fit.plausibility import Reach, beyond_recordings
 from rotflex_jax.joints import paper, quanser_2010
 from rotflex_jax.mechanism import Mechanism, simulate
+from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import (
     NormalEquations,
@@ -89,6 +90,9 @@ def test_a_long_run_of_a_model_that_lacks_something_ends_at_the_best_end_of_scip
 
 def test_shorter_horizons_are_tried_only_where_something_is_missing(lacking):
     assert any("short horizons" in line for line in lacking[3])
+    again: list[str] = []
+    nearby = fit(lacking[2].model, lacking[0], progress=again.append)  # it begins near and converges
+    assert any("short horizons" in line for line in again) and nearby.cost < lacking[2].cost + 5.0
     rec, plant = recorded([("coulomb", "hub")])
     lines: list[str] = []
     right = fit(paper() + fx.Coulomb("hub", level=0.015), rec, progress=lines.append)
@@ -154,6 +158,10 @@ def test_windows_are_driven_by_the_voltage_of_the_whole_recording():
     found = fit(model, rec, first="measured", window_seconds=0.25)
     e = found.model.simulate_windows(rec, 0.25) - rec.y
     np.testing.assert_allclose(np.sqrt(np.mean(e**2, axis=0)), list(found.noise.values()), rtol=1e-4)
+    starts = window_starts(rec, 0.25)[0]
+    going_on = found.model.simulate_states(rec)[starts, 4:]
+    np.testing.assert_allclose(found.model.states_at(rec, starts)[:, 4:], going_on, atol=1e-12)
+    assert np.abs(going_on[1:]).min() > 0
     both = found["input.delay.time"].value + found["input.lag.time"].value
     assert both == pytest.approx(6 * rec.Ts, abs=0.25 * rec.Ts)
 
