@@ -120,6 +120,15 @@ class Transform:
         return np.where(boxed, np.log(share / (1 - share)), z)
 
 
+def _bound_reached(value: float, std: float, spec: Specification) -> str:
+    """The bound that an estimate is at: by its number, or near it with an interval that goes beyond."""
+    for room, which in ((value - spec.lower, "lower"), (spec.upper - value, "upper")):
+        near = room < 1e-2 * spec.typical and (math.isnan(std) or room <= 1.96 * std)
+        if math.isfinite(room) and (room < 1e-6 * spec.typical or near):
+            return f"at its {which} bound"
+    return ""
+
+
 @dataclasses.dataclass(frozen=True)
 class Estimate:
     """One fitted or trusted parameter.
@@ -149,12 +158,11 @@ class Estimate:
         remarks = [note] if note else []
         if not low <= value <= high:
             remarks.append("outside its physical range")
-        if math.isnan(std):
+        bound = "" if "bound" in note else _bound_reached(value, std, spec)
+        if bound:
+            remarks.append(bound)
+        elif math.isnan(std) and "bound" not in note:
             remarks.append("not determined by these data")
-        elif math.isfinite(spec.lower) and value - spec.lower < 1e-6 * spec.typical:
-            remarks.append("at its lower bound")
-        elif math.isfinite(spec.upper) and spec.upper - value < 1e-6 * spec.typical:
-            remarks.append("at its upper bound")
         return cls(
             name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note="; ".join(remarks)
         )

@@ -8,7 +8,6 @@ import small_problem as sp
 from scipy.optimize import least_squares
 
 from rotflex_jax.discover import refit as refit_module
-from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.refit import (
     EXTRA_ALTERNATIONS,
     MAX_COORDINATE_STEP,
@@ -18,7 +17,8 @@ from rotflex_jax.discover.refit import (
     refit,
 )
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.windows import Windows
+from rotflex_jax.fit.coordinates import FitCoordinates
+from rotflex_jax.fit.windows import Windows
 from rotflex_jax.parameters import Transform
 
 

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 from rotflex_jax.discover.batched_predictor import BatchedPredictor
-from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import MAX_COORDINATE_STEP, MIN_DECREASE_NATS
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.horizon import Horizons, SearchHorizon
 from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
 from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem
@@ -23,13 +22,14 @@ from rotflex_jax.discover.validation import (
     adapted_to_recordings,
     carried_over,
 )
-from rotflex_jax.discover.windows import Windows
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import inference
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import padded_length, prepare
 from rotflex_jax.fit.inference import Combination, RecordingSlopes, curvature, sandwich
 from rotflex_jax.fit.signs import check_signs
+from rotflex_jax.fit.windows import Windows
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate

@@ -5,7 +5,7 @@ import dataclasses
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
-from rotflex_jax.discover.windows import Windows
+from rotflex_jax.fit.windows import Windows
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 

@@ -15,11 +15,12 @@ from rotflex_jax.discover.result import Stage
 from rotflex_jax.discover.selection import paired_gain
 from rotflex_jax.discover.spline_map import fit_map, position_differences
 from rotflex_jax.discover.stepwise import fit_baseline
-from rotflex_jax.discover.supermodel import build, motion, scales
+from rotflex_jax.discover.supermodel import build, scales
 from rotflex_jax.discover.validation import ValidationSet, validate
 from rotflex_jax.effects import LearnedTorque, Viscous
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare, process_noise_ports
+from rotflex_jax.fit.motion import motion
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording

@@ -17,8 +17,8 @@ from rotflex_jax.discover.batched_predictor import BatchedPredictor, ParameterSe
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.supermodel import SuperModel
 from rotflex_jax.discover.whitening import Whitener, fit_whitener
-from rotflex_jax.discover.windows import Windows
 from rotflex_jax.fit.dataset import Dataset, StackedRecordings
+from rotflex_jax.fit.windows import Windows
 from rotflex_jax.mechanism import Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
 
 # Levenberg-Marquardt stops on this decrease of the negative log-likelihood [nat]; a relative tolerance

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.experiment import Experiment
+from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
@@ -273,6 +274,7 @@ class SearchResult:
         notes: Remarks for a reader.
         proposal: Where two effects remain: the standard input that distinguishes them best.
         test: Recordings that had no say in anything.
+        remarks: Parameters of the final model at a bound, or far beyond what the recordings reach.
     """
 
     verdict: Verdict
@@ -288,6 +290,7 @@ class SearchResult:
     notes: tuple[str, ...] = ()
     proposal: Experiment | None = None
     test: tuple[Recording, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     @property
     def model(self) -> Model:
@@ -317,6 +320,7 @@ class SearchResult:
             "where": [w.to_dict() for w in self.where],
             "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,
             "notes": list(self.notes),
+            "remarks": [r.to_dict() for r in self.remarks],
             "elapsed_s": self.elapsed_s,
         }
 

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
-from rotflex_jax.discover.coordinates import FitCoordinates, Projection
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ReducedModel, SuperModel
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.fit.coordinates import FitCoordinates, Projection
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.fit.problem import each_recording
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver

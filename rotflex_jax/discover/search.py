@@ -1,6 +1,7 @@
 """The search: fit, score, refit, decide, repeat; then leave out what is not needed and report."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
 
@@ -60,6 +61,7 @@ from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, 
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import padded_length, prepare, process_noise_ports
+from rotflex_jax.fit.plausibility import Reach, Remark, at_bounds, beyond_recordings
 from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
@@ -112,6 +114,19 @@ class SearchState:
         default_factory=dict
     )
     final: Hypothesis | None = None
+
+    @functools.cached_property
+    def reach(self) -> Reach:
+        """How far the signals of the training recordings go."""
+        return Reach.of(self.model, self.problem.dataset.recordings)
+
+    def is_plausible(self, h: Hypothesis, location: EffectLocation) -> bool:
+        """Whether the parameters of an effect are physical, and of sizes that the recordings reach."""
+        s = self.problem.supermodel
+        if not is_physical(s, h, location):
+            return False
+        m = s.clean(h.mean_values(s), h.locations)
+        return not beyond_recordings(m, self.reach, [m.effect(*location)])
 
     @property
     def problem(self) -> LikelihoodProblem:
@@ -294,7 +309,7 @@ def _score_candidates(
 def _refit(
     state: SearchState, starts: list[CandidateStart], runs_starts: list[CandidateStart]
 ) -> list[ValidatedHypothesis]:
-    """The current model with each candidate, refitted and validated; those that are not physical left out."""
+    """The current model with each candidate, refitted and validated; what is not plausible is left out."""
     current, s, horizons = state.current, state.problem.supermodel, state.horizons
     assert current.free_run
     grown = refit_candidates(state.problem, current.hypothesis, starts)
@@ -315,7 +330,7 @@ def _refit(
             parameter_count=parameter_count(s, h, c.location),
         )
         for h, f, c in zip(grown, runs, starts, strict=True)
-        if is_physical(s, h, c.location) and is_physical(s, f, c.location)
+        if state.is_plausible(h, c.location) and state.is_plausible(f, c.location)
     ]
     return validate_from_best_states(state.validation, validated)
 
@@ -384,7 +399,9 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
     floor = dict(zip(channels, noise.tolist(), strict=True))
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
-    rounds = _rounds(state, stages, pairs)
+    m = stages[-1].model.mechanism
+    remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
+    rounds = _rounds(state, stages, pairs, remarks)
     listed = [s for s, _ in state.ranking]
     verdict, sentence = end_state(rounds, stages[-1], floor, listed, held_back)
     return Discovery(
@@ -406,7 +423,9 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
             *calibration_notes(problem.supermodel, validated[-1], state.own),
             *difference_notes(problem.supermodel, pairs),
             *state.notes,
+            *(f"{remark.sentence}." for remark in remarks),
         ),
+        remarks=remarks,
     )
 
 
@@ -422,7 +441,10 @@ def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stag
 
 
 def _rounds(
-    state: SearchState, stages: Sequence[Stage], pairs: Sequence[PairedEstimates]
+    state: SearchState,
+    stages: Sequence[Stage],
+    pairs: Sequence[PairedEstimates],
+    remarks: Sequence[Remark],
 ) -> tuple[Round, ...]:
     """What was added, in order, each effect with the stage that it led to.
 
@@ -430,6 +452,7 @@ def _rounds(
         state: What was found.
         stages: Models, each with one effect more.
         pairs: The last one fitted to different recordings.
+        remarks: On parameters of the last one.
     """
     mechanism = stages[-1].model.mechanism
     return tuple(
@@ -443,7 +466,7 @@ def _rounds(
             held_out_gain_nats=_gain_of_predictions(state, location, stage, before),
             sentence=mechanism.sentence(mechanism.effect(*location)),
             equation=mechanism.effect(*location).equation,
-            doubts=_doubts(state, location, pairs),
+            doubts=(*_doubts(state, location, pairs), *_beyond(remarks, location)),
             prediction=state.gains.get(location, (None, None))[0],
             free_run=state.gains.get(location, (None, None))[1],
         )
@@ -456,6 +479,14 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
     if stage.horizon == "prediction":
         return stage.log_likelihood - before.log_likelihood
     return state.gains[location][0].gain if location in state.gains else float("nan")
+
+
+def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
+    """Which numbers of an effect the recordings do not speak for."""
+    head = f"{location.port}.{location.effect}."
+    return tuple(
+        r.sentence for r in remarks if r.kind == "beyond the recordings" and r.parameter.startswith(head)
+    )
 
 
 def _doubts(

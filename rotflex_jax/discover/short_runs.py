@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, ParameterSet
-from rotflex_jax.discover.windows import Windows
 from rotflex_jax.fit.dataset import Dataset
+from rotflex_jax.fit.windows import Windows
 from rotflex_jax.mechanism.initial_state import DIFFERENCE
 from rotflex_jax.metrics import counted
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together

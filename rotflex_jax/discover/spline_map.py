@@ -6,11 +6,11 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import MAX_COORDINATE_STEP, choose_process_noise
 from rotflex_jax.effects.learned import LearnedTorque
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, after_trial, begin
 
 # A step that lowers the penalised cost by less is the last with its process noise [nat].

@@ -11,45 +11,20 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Float, Shaped
 
 from rotflex_jax.checks import shown
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect, Scale
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit.motion import motion
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.assembly import Layout, own_states
+from rotflex_jax.mechanism.assembly import own_states
 from rotflex_jax.mechanism.linear import inverse_mass
 from rotflex_jax.mechanism.roles import calibrations as usual_calibrations
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
-
-
-def motion(
-    mechanism: Mechanism, y: Float[np.ndarray, "N C"], Ts: float, smooth: float = 0.03
-) -> dict[str, tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]]:
-    """Port -> (position, speed) by smoothing measured outputs over `smooth` seconds.
-
-    Ports that the measured positions do not determine are left out.
-    """
-    layout = Layout.of(mechanism.structure)
-    rows = np.array(layout.output_rows)
-    is_position = np.array([q.is_position for q in mechanism.quantities])
-    if not is_position.any():
-        return {}
-    width = max(2 * round(smooth / Ts / 2) + 1, 5)
-    width = min(width, len(y) - 1 + len(y) % 2)
-    C = rows[is_position, : layout.n]
-    position = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, axis=0))
-    speed = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0))
-    back, out = np.linalg.pinv(C), {}
-    for port, vector in mechanism.port_vectors.items():
-        p = np.array(vector) @ back
-        if np.allclose(p @ C, vector):
-            out[port] = (position @ p, speed @ p)
-    return out
 
 
 def _known_motion(model: Model, recording: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.discover.batched_predictor import ParameterSet
-from rotflex_jax.discover.coordinates import FitCoordinates
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
 from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_blocks
 from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.short_runs import ShortRuns
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.windows import Windows
+from rotflex_jax.fit.coordinates import FitCoordinates
+from rotflex_jax.fit.windows import Windows
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together

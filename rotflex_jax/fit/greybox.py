@@ -1,17 +1,19 @@
 """The grey-box fit: parameters of the physics, first states and bounds, by damped least squares."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float
 
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import StackedRecordings, prepare, process_noise_ports
+from rotflex_jax.fit.coordinates import FitCoordinates
+from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports
 from rotflex_jax.fit.inference import (
     Combination,
     RecordingSlopes,
@@ -20,28 +22,30 @@ from rotflex_jax.fit.inference import (
     estimates,
     sandwich,
 )
+from rotflex_jax.fit.physical_ranges import physical_ranges
+from rotflex_jax.fit.plausibility import AT_BOUND, Reach, at_bounds, beyond_recordings
 from rotflex_jax.fit.problem import (
-    Coordinates,
-    FreeCoordinates,
-    RunInputs,
-    residuals_and_slopes,
-    summed_equations,
+    LARGEST_STEP,
+    LikelihoodEquations,
+    RunLayout,
+    likelihood_equations,
+    runs_with_slopes,
 )
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.fit.signs import check_signs
+from rotflex_jax.fit.windows import Windows
 from rotflex_jax.mechanism import Mechanism, kalman_gains
+from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.validation import process_noise_of
-from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import (
     Minimum,
-    NormalEquations,
     Progress,
     Rules,
     Status,
     minimise,
 )
-from rotflex_jax.parameters import Estimate
+from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread
@@ -61,11 +65,22 @@ LAST_STAGE_TOLERANCE, EARLY_STAGE_TOLERANCE = 1e-3, 1.0
 # A fit also ends where so many steps lower the cost by less than this [nat]: along a curved valley, or
 # towards a bound.
 PROGRESS_STEPS, LEAST_PROGRESS = 8, 0.1
-# Minimisations of the last stage at most, each with the scale that the one before left; they end where it
-# changes by less than this share, with measured first states after so many at least.
-MAX_RESCALINGS, SCALE_TOLERANCE, RESCALINGS_OF_MEASURED_STATES = 5, 0.02, 4
+# States that the first samples show, or that a run over the whole recording leaves in memories, follow the
+# parameters: the last stage is repeated with new ones until they settle, so many times at least and at most.
+LEAST_REPETITIONS, MOST_REPETITIONS, SETTLED = 4, 6, 0.1
+# The scale of a channel is this share of the sensor's noise at least.
+LEAST_SCALE = 0.1
 # A start is far where its run misses a channel by more than this share of the channel's standard deviation.
 FAR_START_ERROR = 0.7
+# Free runs that miss a channel by more than so many times its noise lack something.
+MISSING = 3.0
+# Horizons on the way to a long one: the first [s], how many times longer the next is, and the largest share
+# of the long one that is worth a stage.
+SHORTEST_HORIZON, NEXT_HORIZON, LONGEST_SHARE = 2.0, 2.5, 0.75
+# An end is one where the slopes promise no more than this share of a nat for each coordinate.
+RUGGED = 0.5
+# Further starts around the end of a rugged cost, and their distance as a share of each parameter.
+NEARBY_STARTS, NEARBY = 3, 0.3
 # Of two attempts whose costs differ by less, one that converged is better [nat].
 EQUAL_COST = 0.1
 _STATUS = {
@@ -76,21 +91,55 @@ _STATUS = {
 
 
 @dataclasses.dataclass(frozen=True)
+class FitPoint:
+    """Where a fit is.
+
+    Attributes:
+        free: Parameters that all recordings share and that are fitted.
+        local: Fitted parameters that each recording has for itself.
+        z: Unconstrained values of all parameters.
+        local_z: Of the recordings' own.
+        x0: First states of the windows, complete.
+    """
+
+    free: tuple[int, ...]
+    local: tuple[int, ...]
+    z: Float[np.ndarray, " P"]
+    local_z: Float[np.ndarray, "R L"]
+    x0: Float[np.ndarray, "R W n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class FitStage:
+    """What is fitted in one stage: free runs of some length, or predictions.
+
+    Attributes:
+        windows: Where runs start again.
+        process_noise: Of the predictor; None for free runs.
+    """
+
+    windows: Windows
+    process_noise: ProcessNoise = None
+
+
+@dataclasses.dataclass(frozen=True)
 class FitAttempt:
     """Where a sequence of stages ended.
 
     Attributes:
-        flat: All coordinates.
-        inputs: What the last runs were made with, with the scale of the last residuals.
+        point: The numbers.
+        stage: The last one.
+        K: Gains of the last runs.
         status: "converged", or why not.
         steps: Iterations.
-        history: Half the squared error after each minimisation.
+        history: Negative log-likelihood after each minimisation, constants left out [nat].
         start_error: Error of the run at the start, as a share of the standard deviation of each channel.
-        cost: Negative log-likelihood with the last scale, constants left out; infinite if diverged.
+        cost: Negative log-likelihood, constants left out; infinite if diverged.
     """
 
-    flat: Float[np.ndarray, " F"]
-    inputs: RunInputs
+    point: FitPoint
+    stage: FitStage
+    K: Float[np.ndarray, "R n C"]
     status: str
     steps: int
     history: list[float]
@@ -114,99 +163,309 @@ class GreyBoxProblem:
 
     Attributes:
         model: Mechanism and solver.
-        recordings: One or several.
-        free: Which coordinates are adjusted.
-        data: The recordings, stacked.
-        noise: Standard deviation of the sensor noise.
-        measured: Whether first states are held at what the first samples show.
+        dataset: The recordings.
+        layout: What runs are compiled for.
+        ranges: Least and largest unconstrained value of each parameter.
         max_steps: Most iterations of a minimisation.
         minimiser: Solver of optimistix, or None for the toolkit's own.
         say: Called with lines of progress.
     """
 
     model: Model
-    recordings: Sequence[Recording]
-    free: FreeCoordinates
-    data: StackedRecordings
-    noise: Float[np.ndarray, " C"]
-    measured: bool
+    dataset: Dataset
+    layout: RunLayout
+    ranges: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]
     max_steps: int
     minimiser: "Minimiser | None"
     say: Callable[[str], None]
 
-    def attempt(self, flat: Float[np.ndarray, " F"], stages: Sequence[ProcessNoise]) -> FitAttempt:
+    def start(self, local: Sequence[int], windows: Windows) -> FitPoint:
+        """The point of the model as it is."""
+        m = self.model.mechanism
+        free = tuple(m.parameter_names.index(name) for name in m.free_names)
+        z = np.clip(self.transform.unconstrain(m.values), *self.ranges)
+        own = np.tile(z[list(local)], (len(self.dataset.recordings), 1))
+        rest = rest_state(m.structure, np.float64)
+        x0 = np.tile(rest, (*windows.first_states.shape[:2], 1))
+        x0[..., : windows.first_states.shape[-1]] = windows.first_states
+        return FitPoint(tuple(i for i in free if i not in local), tuple(local), z, own, x0)
+
+    @property
+    def transform(self) -> Transform:
+        """Unconstrained <-> physical, by the declared bounds."""
+        return Transform.of(self.model.mechanism.parameter_specifications)
+
+    def physical(self, point: FitPoint) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, "R P"]]:
+        """Parameter values of each recording, and their derivatives by the unconstrained ones."""
+        z = np.tile(point.z, (len(point.local_z), 1))
+        z[:, list(point.local)] = point.local_z
+        values, slopes = self.transform.physical(z)
+        known = ~np.isnan(self.dataset.constants)
+        m = self.model.mechanism
+        held = np.array([name in m.trusted for name in m.parameter_names])
+        values = np.where(held, m.values, values)
+        return np.where(known, self.dataset.constants, values), np.where(known | held, 0.0, slopes)
+
+    def coordinates(self, point: FitPoint, windows: Windows) -> FitCoordinates:
+        """What moves."""
+        return FitCoordinates(len(point.free), len(point.local), self.layout.states, windows)
+
+    def attempt(self, point: FitPoint, stages: Sequence[FitStage]) -> FitAttempt:
         """One stage after the other, from a start; each but the last only until it is near its end."""
-        seen = self.data.seen > 0
-        spread = np.maximum(np.std(self.data.y[seen], axis=0), self.noise)
-        error = lambda costs, scale: np.sqrt(2 * costs / np.sum(seen)) * scale  # noqa: E731
-        scale, start_error = self.noise, np.full_like(spread, np.inf)
         history, steps, status = [], 0, "converged"
+        start_error = np.full(len(self.dataset.noise), np.inf)
         for number, stage in enumerate(stages):
             last = number == len(stages) - 1
-            for repetition in range(MAX_RESCALINGS if last else 1):
-                if self.measured:
-                    flat = self._with_measured_states(flat)
-                inputs = self._inputs(flat, stage, scale)
-                found = self._minimum(flat, inputs, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE)
-                flat, steps = self._with_free(flat, found.x), steps + found.evaluations
-                status = _STATUS.get(found.status, f"stopped after {self.max_steps} steps")
+            if number:
+                point = self._at_windows(point, stage.windows)
+            follows, best = self._follows(stage), None
+            for repetition in range(MOST_REPETITIONS if last and follows else 1):
+                point, K = self._with_shown_states(point, stage), self._gains(point, stage)
+                found = self._minimum(
+                    point, stage, K, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE
+                )
+                point, cost, steps = found.x, found.cost, steps + found.evaluations
+                status = self._status(found)
                 if not history:
-                    start_error = error(found.first.costs, scale) / spread
-                history.append(found.cost)
-                new = error(found.equations.costs, scale)
-                settled = np.all(np.abs(np.log(new / scale)) < SCALE_TOLERANCE)
-                scale = np.where(np.isfinite(new), np.maximum(new, self.noise * 0.1), scale)
-                # States that the first samples show follow the parameters, fitted with the former ones.
-                enough = RESCALINGS_OF_MEASURED_STATES if self.measured else 0
-                if status != "converged" or (settled and repetition + 1 >= enough):
+                    start_error = found.first.scale / self._spread
+                if follows:
+                    # What counts is the run from the states that go with these parameters.
+                    point = self._with_shown_states(point, stage)
+                    cost = self.equations(point, stage, K).cost
+                history.append(float(cost))
+                if best is None or cost < best[0]:
+                    best = cost, point, K, status
+                worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - SETTLED
+                if status != "converged" or not worth:
                     break
-        inputs = inputs._replace(scale=jnp.asarray(scale))
-        cost = float(np.sum(seen) * np.sum(np.log(scale)))
-        if status.startswith("diverged") or not np.isfinite(cost):
-            cost = np.inf
-        return FitAttempt(flat, inputs, status, steps, history, start_error, cost)
+            assert best
+            cost, point, K, status = best
+        cost = float(cost) if np.isfinite(cost) else np.inf
+        return FitAttempt(point, stage, K, status, steps, history, start_error, cost)
 
-    def _model(self, flat: np.ndarray) -> Model:
-        values = _common_values(self.model.mechanism, self.free.coordinates.values(flat))
-        return dataclasses.replace(self.model, mechanism=self.model.mechanism.with_values(values))
+    def _status(self, found: Minimum) -> str:
+        """How a minimisation ended, in words."""
+        status = _STATUS.get(found.status, f"stopped after {self.max_steps} steps")
+        if status != "converged":
+            return status
+        end = found.equations
+        left = end.promised() / (end.nats_that_count * len(end.gradient))
+        if left <= RUGGED:
+            return status
+        return (
+            "stopped: no step lowers the cost, though its slopes promise to move parameters by more than "
+            f"{np.sqrt(2 * left):.1f} standard deviations; the cost is rugged here"
+        )
 
-    def _with_free(self, flat: np.ndarray, x: np.ndarray) -> np.ndarray:
-        flat = flat.copy()
-        flat[self.free.index] = x
-        return flat
+    @functools.cached_property
+    def _spread(self) -> Float[np.ndarray, " C"]:
+        """Standard deviation of each channel."""
+        seen = self.dataset.data.seen > 0
+        return np.maximum(np.std(self.dataset.data.y[seen], axis=0), self.dataset.noise)
 
-    def _with_measured_states(self, flat: np.ndarray) -> np.ndarray:
-        """The first states that the first samples show to the model."""
-        c, there, flat = self.free.coordinates, self._model(flat), flat.copy()
-        for r, recording in enumerate(self.recordings):
-            flat[c.state_index(r)] = there._start(recording)[: c.states]
-        return flat
+    def equations(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> LikelihoodEquations:
+        """Likelihood and its quadratic model at a point."""
+        e, J = self.errors(point, stage, K)
+        return likelihood_equations(
+            self.coordinates(point, stage.windows),
+            e,
+            J,
+            int(np.sum(self.dataset.data.seen)),
+            LEAST_SCALE * self.dataset.noise,
+            self._room(point, stage.windows),
+        )
 
-    def _inputs(self, flat: np.ndarray, stage: ProcessNoise, scale: np.ndarray) -> RunInputs:
-        here = self._model(flat)
-        gain = lambda r: kalman_gains(here.at(r).mechanism, [stage or {}], self.noise, r.Ts)[0]  # noqa: E731
-        K = np.stack([gain(r) for r in self.recordings])
-        gates = np.ones(len(here.mechanism.effects))
-        return RunInputs(*jax.tree.map(jnp.asarray, (gates, self.data, K, scale)))
+    def errors(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
+        """Errors of the runs and their slopes; zero where a sample does not count."""
+        values, slopes = self.physical(point)
+        many = point.x0.shape[1] > 1
+        y_hat, J = jax.device_get(
+            runs_with_slopes(
+                self.layout,
+                *map(jnp.asarray, (values, slopes, np.array((*point.free, *point.local)))),
+                jnp.asarray(point.x0 if many else point.x0[:, 0]),
+                jax.tree.map(jnp.asarray, self.dataset.data),
+                jnp.asarray(K),
+                jnp.asarray(stage.windows.index) if many else None,
+            )
+        )
+        seen = self.dataset.data.seen[:, :, None] > 0
+        return np.where(seen, y_hat - self.dataset.data.y, 0.0), np.where(seen[..., None], J, 0.0)
 
-    def _minimum(self, flat: np.ndarray, inputs: RunInputs, tolerance: float) -> Minimum:
-        """The least squared error near a point, by the free coordinates."""
+    def model_at(self, point: FitPoint, recording: int) -> Model:
+        """The model of a recording."""
+        m = self.model.mechanism
+        return dataclasses.replace(self.model, mechanism=m.with_values(self.physical(point)[0][recording]))
+
+    def horizons(self, seconds: float | None) -> list[Windows]:
+        """Windows of some seconds, or whole recordings, behind those of shorter horizons on the way there.
+
+        They have the same number of windows, so that all share one compiled program.
+        """
+        if seconds is not None and not seconds > 0:
+            raise InputError(
+                f"Argument `window_seconds` is {seconds}, but windows need a positive length; give for "
+                "instance 2.0, or None for whole recordings."
+            )
+        of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
+        longest = max(r.N * r.Ts for r in self.dataset.recordings)
+        horizon, found, length = min(seconds or longest, longest), [], SHORTEST_HORIZON
+        while length < LONGEST_SHARE * horizon:
+            found.append(of_seconds(length, found[0].number if found else 1))
+            length *= NEXT_HORIZON
+        number = found[0].number if found else 1
+        if seconds is None:
+            return [*found, Windows.whole(self.dataset, number)]
+        return [*found, of_seconds(seconds, number)]
+
+    def solve(
+        self, local: Sequence[int], process_noise: ProcessNoise, window_seconds: float | None
+    ) -> FitAttempt:
+        """The best end of the ways that are worth trying."""
+        *shorter, horizon = self.horizons(window_seconds)
+        start, last = self.start(local, horizon), FitStage(horizon, process_noise)
+        end = self.attempt(start, [last])
+        better = functools.partial(min, key=lambda attempt: attempt.rank)
+        if process_noise is None and shorter and (end.doubtful or self._misses_something(end)):
+            self.say("fit: again, from short horizons to long ones")
+            first = FitStage(shorter[0])
+            way = [first, *map(FitStage, shorter[1:]), last]
+            end = better(end, self.attempt(self._at_windows(start, first.windows), way))
+            end = self._from_nearby(end)
+        elif end.doubtful:
+            self.say("fit: again, from short predictions")
+            # Torques as large as those of the motion make the filter follow the data within a few samples.
+            m = self.model.mechanism
+            short = process_noise_ports(m, (0.03 * self.dataset.torque_scale) ** 2)
+            end = better(end, self.attempt(start, [FitStage(horizon, short), last]))
+        return end
+
+    def _misses_something(self, end: FitAttempt) -> bool:
+        """Whether errors are far beyond the noise, so that a long run may have its least cost elsewhere."""
+        scale = self.equations(end.point, end.stage, end.K).scale
+        return not np.all(scale < MISSING * self.dataset.noise)
+
+    def _from_nearby(self, end: FitAttempt) -> FitAttempt:
+        """The best of some further starts around an end, where the slopes there say that it is none."""
+        bounded = self._limit(end.point, end.stage.windows)[: len(end.point.free)] < np.inf
+        free, random = list(end.point.free), np.random.default_rng(0)
+        for number in range(NEARBY_STARTS):
+            here = self.equations(end.point, end.stage, end.K)
+            if here.promised() < here.nats_that_count:
+                break
+            self.say(f"fit: again, from nearby, {number + 1} of {NEARBY_STARTS}")
+            z = end.point.z.copy()
+            size = np.where(bounded, 1.0, np.maximum(np.abs(z[free]), NEARBY))
+            z[free] += NEARBY * size * np.clip(random.standard_normal(len(free)), -2, 2)
+            near = dataclasses.replace(end.point, z=np.clip(z, *self.ranges))
+            near = self.attempt(near, [end.stage])
+            steps = end.steps + near.steps
+            end = dataclasses.replace(min(end, near, key=lambda attempt: attempt.rank), steps=steps)
+        return end
+
+    def at_ends(self, point: FitPoint) -> dict[str, str]:
+        """Parameters at the end of the range of a healthy machine, with a remark."""
+        names, found = self.model.mechanism.parameter_names, {}
+        for i in (*point.free, *point.local):
+            z = point.local_z[:, point.local.index(i)] if i in point.local else point.z[i : i + 1]
+            for bound, which in zip(self.ranges, ("lower", "upper"), strict=True):
+                if np.any(z == bound[i]):
+                    found[names[i]] = AT_BOUND[which]
+        return found
+
+    def held_by_ends(self, point: FitPoint, windows: Windows) -> Bool[np.ndarray, " M"]:
+        """Coordinates that are at the end of their range."""
+        room = self._room(point, windows)
+        return (room[0] == 0) | (room[1] == 0)
+
+    def _follows(self, stage: FitStage) -> bool:
+        """Whether first states are held at what the parameters imply, wholly or in part."""
+        unseen = len(rest_state(self.model.mechanism.structure, np.float64)) > self._moving
+        return not self.layout.states or (
+            unseen and stage.windows.number > 1 and max(stage.windows.counts) > 1
+        )
+
+    @property
+    def _moving(self) -> int:
+        return 2 * len(self.model.mechanism.coordinates)
+
+    def _at_windows(self, point: FitPoint, windows: Windows) -> FitPoint:
+        """The same parameters, with the first states where fits of these windows start."""
+        x0 = point.x0.copy()
+        x0[..., : self._moving] = windows.first_states
+        return dataclasses.replace(point, x0=x0)
+
+    def _with_shown_states(self, point: FitPoint, stage: FitStage) -> FitPoint:
+        """First states that the first samples show, where they are held, and memories of a whole run."""
+        if not self._follows(stage):
+            return point
+        x0 = point.x0.copy()
+        for r, recording in enumerate(self.dataset.recordings):
+            there = self.model_at(point, r)
+            begins = np.array([samples.start for _, samples in stage.windows.of(r)])
+            moving = x0[r, : len(begins), : self._moving] if self.layout.states else None
+            x0[r, : len(begins)] = there.states_at(recording, begins, moving)
+        return dataclasses.replace(point, x0=x0)
+
+    def _gains(self, point: FitPoint, stage: FitStage) -> Float[np.ndarray, "R n C"]:
+        n, C = point.x0.shape[-1], len(self.dataset.noise)
+        recordings = self.dataset.recordings
+        if stage.process_noise is None:
+            return np.zeros((len(recordings), n, C))
+        return np.stack(
+            [
+                kalman_gains(
+                    self.model_at(point, r).mechanism, [stage.process_noise], self.dataset.noise, x.Ts
+                )[0]
+                for r, x in enumerate(recordings)
+            ]
+        )
+
+    def _room(self, point: FitPoint, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+        """How far each coordinate may go down (not positive) and up (not negative)."""
+        c = self.coordinates(point, windows)
+        room = np.full((2, c.size), np.inf) * np.array([[-1], [1]])
+        for own, bound in zip(room, self.ranges, strict=True):
+            own[: c.shared] = (bound - point.z)[list(point.free)]
+            for r, z in enumerate(point.local_z):
+                own[c.local_columns(r)] = bound[list(point.local)] - z
+        return room[0], room[1]
+
+    def _limit(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
+        """Largest step of each coordinate: a parameter with a bound by a factor of e."""
+        c, specs = self.coordinates(point, windows), self.model.mechanism.parameter_specifications
+        bounded = np.array([bool(np.isfinite(s.lower) or np.isfinite(s.upper)) for s in specs])
+        most = np.where(bounded, LARGEST_STEP, np.inf)
+        limit = np.full(c.size, np.inf)
+        limit[: c.shared] = most[list(point.free)]
+        for r in range(len(point.local_z)):
+            limit[c.local_columns(r)] = most[list(point.local)]
+        return limit
+
+    def _minimum(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"], tolerance: float
+    ) -> Minimum:
+        """The least cost near a point."""
         if self.minimiser is not None:
             from rotflex_jax.fit.optimistix_adapter import minimise_by  # takes long to import
 
-            return minimise_by(self.minimiser, self.free, flat, inputs, self.max_steps)
-
-        def linearised(x: np.ndarray) -> NormalEquations:
-            return jax.device_get(summed_equations(self.free, self._with_free(flat, x), inputs))
+            return minimise_by(self.minimiser, self, point, stage, K)
+        coordinates = self.coordinates(point, stage.windows)
 
         def tell(progress: Progress) -> None:
             self.say(f"fit: {progress.evaluations} steps, cost {progress.cost:.1f}")
 
         return minimise(
-            linearised,
-            flat[self.free.index],
+            lambda at: self.equations(at, stage, K),
+            point,
             Rules(enough=tolerance, window=PROGRESS_STEPS, least_progress=LEAST_PROGRESS),
-            limit=self.free.step_limit,
+            limit=self._limit(point, stage.windows),
+            move=coordinates.moved,
+            unit=lambda equations: equations.nats_that_count,
             max_steps=self.max_steps,
             report=tell,
         )
@@ -221,44 +480,50 @@ def _common_values(m: Mechanism, values: Float[np.ndarray, "R P"]) -> Float[np.n
 def report(
     problem: GreyBoxProblem,
     end: FitAttempt,
-    e: Float[Array, "R N C"],
-    J: Float[Array, "R N C D"],
+    e: Float[np.ndarray, "R N C"],
+    J: Float[np.ndarray, "R N C D"],
 ) -> Fit:
     """Estimates with intervals.
+
+    A parameter at the end of its range is held there: the others have the intervals that go with that.
 
     Args:
         problem: What was fitted to what.
         end: The optimum.
-        e: Scaled errors there.
+        e: Errors there.
         J: Their slopes by the directions of each recording.
     """
-    model, data, coordinates, index = (
-        problem.model,
-        problem.data,
-        problem.free.coordinates,
-        problem.free.index,
-    )
-    m = model.mechanism
-    slopes, left, seen = np.asarray(J), np.asarray(e), data.seen > 0
-    parts = [RecordingSlopes(slopes[r, s], left[r, s], problem.free.columns[r]) for r, s in enumerate(seen)]
-    residual = np.concatenate([part.e for part in parts])
-    each = range(coordinates.owning)
-    z = np.tile(end.flat[: coordinates.parameters], (len(each), 1))
-    for i in coordinates.local:
-        z[:, i] = [end.flat[coordinates.local_index(r, i)] for r in each]
-    values, stretch = coordinates.transform.physical(z)
+    model, data, point, windows = problem.model, problem.dataset.data, end.point, end.stage.windows
+    m, coordinates, seen = model.mechanism, problem.coordinates(point, windows), data.seen > 0
+    each = range(len(e))
+    residual = np.concatenate([e[r, s] for r, s in enumerate(seen)])
+    deviation = np.sqrt(np.mean(residual**2, axis=0))
+    scale = np.maximum(deviation, LEAST_SCALE * problem.dataset.noise)
+    values, stretch = problem.physical(point)
     common = _common_values(m, values)
-    H = curvature(parts, len(index))
-    covariance = sandwich(parts, H)
-    row_of = {int(k): row for row, k in enumerate(index)}
+    at_end = problem.at_ends(point)
+    moves = ~problem.held_by_ends(point, windows)
+    place = np.cumsum(moves) - 1
+    parts = []
+    for r in each:
+        for k, samples in windows.of(r):
+            counts, columns = seen[r, samples], coordinates.columns(r, k)
+            inside = moves[columns]
+            slopes = (J[r, samples] / scale[:, None])[counts]
+            own = RecordingSlopes(
+                slopes[..., inside], (e[r, samples] / scale)[counts], place[columns[inside]]
+            )
+            parts.append(own)
+    H = curvature(parts, int(moves.sum()))
+    covariance = _spread_out(sandwich(parts, H), moves)
     names, specs = m.parameter_names, m.parameter_specifications
     combinations: list[Combination | None] = []
     local: dict[str, tuple[Estimate, ...]] = {}
     for i, name in enumerate(names):
         if name in m.trusted:
             combinations.append(None)
-        elif i in coordinates.local:
-            rows = [row_of[coordinates.local_index(r, i)] for r in each]
+        elif i in point.local:
+            rows = [int(coordinates.local_columns(r)[point.local.index(i)]) for r in each]
             combinations.append(Combination(rows, stretch[:, i] / len(rows)))
             own = [
                 Combination([row], factor) for row, factor in zip(rows, stretch[:, i : i + 1], strict=True)
@@ -266,27 +531,41 @@ def report(
             kinds = [specs[i]] * len(rows)
             local[name] = estimates([name] * len(rows), values[:, i], kinds, own, covariance)
         else:
-            combinations.append(Combination([row_of[i]], stretch[:1, i]))
+            combinations.append(Combination([point.free.index(i)], stretch[:1, i]))
     free = [c for c in combinations if c is not None]
     free_names = tuple(name for name, c in zip(names, combinations, strict=True) if c is not None)
-    together = np.zeros((len(index), len(free)))
+    together = np.zeros((coordinates.size, len(free)))
     for column, combination in enumerate(free):
         together[combination.rows, column] = 1.0
-    deviation = np.sqrt(np.mean(residual**2, axis=0)) * np.asarray(end.inputs.scale)
+    together = together[moves]
+    determined = [k for k in range(len(free)) if together[:, k].any()]
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
+    notes = [at_end.get(name, "") for name in names]
+    fitted, found = m.with_values(common), estimates(names, common, specs, combinations, covariance, notes)
+    reach = Reach.of(model, problem.dataset.recordings)
     return Fit(
-        model=dataclasses.replace(model, mechanism=m.with_values(common)),
+        model=dataclasses.replace(model, mechanism=fitted),
         cost=cost,
         status=end.status,
-        parameters=estimates(names, common, specs, combinations, covariance),
+        parameters=found,
         noise=dict(zip(m.channels, deviation.tolist(), strict=True)),
         covariance=combined_covariance(covariance, free),
         free_names=free_names,
         steps=end.steps,
         history=tuple(end.history),
-        weakest=_weakest(together.T @ H @ together, list(free_names)),
+        weakest=_weakest(
+            together[:, determined].T @ H @ together[:, determined], [free_names[k] for k in determined]
+        ),
         local=local,
+        remarks=(*at_bounds(found), *beyond_recordings(fitted, reach)),
     )
+
+
+def _spread_out(covariance: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """The covariance of all coordinates, nan for those that are held."""
+    whole = np.full((len(moves), len(moves)), np.nan)
+    whole[np.ix_(moves, moves)] = covariance
+    return whole
 
 
 def _weakest(H: np.ndarray, names: list[str]) -> dict[str, float]:
@@ -320,11 +599,20 @@ def fit(
     `y_hat` is a free run, or, with `process_noise`, the prediction of a steady Kalman filter whose
     model admits white torques of that intensity. A free run asks the model to be right over the whole
     recording; where physics is missing, it biases the parameters to hide that, and a prediction biases
-    them less. Where the run or prediction at the start misses most of the motion, or the fit does not
-    converge, it starts a second time with short predictions, which are easy to match from far away, and the
-    better of the two ends counts. From a near start they would lead away, since they are insensitive to
-    parameters that only a long run shows. The scale `s` of each channel is the standard deviation of its
-    residuals.
+    them less. The scale `s` of each channel is the standard deviation of its residuals, at every step of the
+    fit.
+
+    Over a long run of a machine that the model does not know wholly the cost is rugged: friction that stops a
+    little earlier shifts all that follows. Where a run of more than a few seconds leaves errors far above the
+    noise, or does not converge, the fit starts a second time with free runs of 2 s, then of 5 s and so on to
+    the whole, and from a few places around the better end; the best of all ends counts. Where a short run or
+    prediction at the start misses most of the motion, or does not converge, the second start is with short
+    predictions, which are easy to match from far away.
+
+    A fit has converged where steps bring less than a small part of a standard deviation of the parameters;
+    errors that go on for many samples make that many nats. Parameters stay within the physical range that
+    their effects declare, a damper as far as the damping of its port is not negative; one that is at the end
+    of its range, or a size far beyond what the recordings reach, is named in `remarks`.
 
     Args:
         mechanism: What to fit; its values are the start, its trusted parameters are held.
@@ -333,8 +621,9 @@ def fit(
         local: Full names of parameters that each recording has for itself, an offset for instance.
         first: Whether first states are fitted, or held at what the first `n_init` samples show: where
             nothing pulls the machine back, a free first position hides a drift of the model.
-        window_seconds: Start again every so often [s], each time with a first state of its own and with
-            memories at rest: the parameters with which free runs of that length are best.
+        window_seconds: Start again every so often [s], each time with a first state of its own: the
+            parameters with which free runs of that length are best. Delays and lags go on across windows, and
+            memories begin as a run over the whole recording leaves them, as in the errors over windows.
         max_steps: Most iterations of each minimisation; there are several, each with the scale of the one
             before.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
@@ -374,41 +663,35 @@ def fit(
             )
     if not m.free_names:
         raise InputError("All parameters are trusted, but a fit needs a free one; release one.")
+    if window_seconds is not None:
+        checks.positive(window_seconds, "window_seconds", "s", "2.0, or None for whole recordings")
     check_signs(model, given)
-    indices = tuple(names.index(n) for n in local)
-    windows, windows_of = _windows(given, window_seconds)
-    dataset = prepare(model, windows)
-    known = np.flatnonzero(np.any(~np.isnan(dataset.constants), axis=0)).tolist()
-    coordinates = Coordinates(m.structure, (*indices, *known), len(windows), windows_of)
-    flat = coordinates.flatten(m.values, dataset.first_states)
-    flat = coordinates.with_constants(flat, dataset.constants)
-    parameters = tuple(names.index(n) for n in m.free_names)
-    mesh = mesh_of(devices) if len(windows) > 1 else None
-    measured = first == "measured"
-    free = FreeCoordinates(coordinates, model.solver, parameters, not measured, mesh)
-    problem = GreyBoxProblem(
-        model, windows, free, dataset.data, dataset.noise, measured, max_steps, minimiser, say
-    )
+    problem = _problem(model, given, first, max_steps, minimiser, devices, say)
     with double_precision():
-        end = problem.attempt(flat, [process_noise])
-        if end.doubtful:
-            say("fit: again, from short predictions")
-            # Torques as large as those of the motion make the filter follow the data within a few samples.
-            short = process_noise_ports(m, (0.03 * dataset.torque_scale) ** 2)
-            end = min(end, problem.attempt(flat, [short, process_noise]), key=lambda e: e.rank)
-        e, J = residuals_and_slopes(problem.free, jnp.asarray(end.flat), end.inputs)
+        end = problem.solve([names.index(n) for n in local], process_noise, window_seconds)
         if throw and end.status != "converged":
             raise RuntimeError(f"The fit did not converge: {end.status}.")
-        return report(problem, end, e, J)
+        return report(problem, end, *problem.errors(end.point, end.stage, end.K))
 
 
-def _windows(recordings: list[Recording], seconds: float | None) -> tuple[list[Recording], tuple[int, ...]]:
-    """The recordings cut into windows, and of which recording each is; whole where no length is given."""
-    if seconds is None:
-        return recordings, ()
-    checks.positive(seconds, "window_seconds", "s", "2.0, or None for whole recordings")
-    cut = []
-    for number, r in enumerate(recordings):
-        starts = window_starts(r, seconds)[0].tolist()
-        cut += [(r.slice(i, j), number) for i, j in zip(starts, [*starts[1:], r.N], strict=True)]
-    return [part for part, _ in cut], tuple(number for _, number in cut)
+def _problem(
+    model: Model,
+    recordings: Sequence[Recording],
+    first: str,
+    max_steps: int,
+    minimiser: "Minimiser | None",
+    devices: Sequence[Any] | None,
+    progress: Callable[[str], None] | None,
+) -> GreyBoxProblem:
+    m = model.mechanism
+    mesh = mesh_of(devices) if len(recordings) > 1 else None
+    states = 2 * len(m.coordinates) if first == "fitted" else 0
+    return GreyBoxProblem(
+        model,
+        prepare(model, recordings),
+        RunLayout(m.structure, model.solver, states, mesh),
+        physical_ranges(m),
+        max_steps,
+        minimiser,
+        progress or (lambda _: None),
+    )

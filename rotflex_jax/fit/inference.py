@@ -69,6 +69,40 @@ def curvature(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, 
     return H
 
 
+def long_run_scores(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, "D D"]:
+    """Covariance of the sum of `J_k' e_k`, of errors that go on from sample to sample (Bartlett kernel)."""
+    S = np.zeros((size, size))
+    for J, e, columns in parts:
+        scores = np.einsum("nc,ncd->nd", e, J)
+        width, none = bandwidth(e), np.zeros((1, len(columns)))
+        # Sums over all stretches of `width` samples give exactly the Bartlett kernel.
+        total = np.cumsum(np.concatenate([none, scores, np.repeat(none, width - 1, axis=0)]), axis=0)
+        sums = total[1:].copy()
+        sums[width:] -= total[1:-width]
+        S[np.ix_(columns, columns)] += sums.T @ sums / width
+    return S
+
+
+def nats_that_count(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> float:
+    """Nats of a likelihood that say as much as one would if the errors were white; 1 at least.
+
+        trace(H^-1 S) / D
+
+    Errors of a model that lacks something go on for many samples, so that the same information counts many
+    times over.
+
+    Args:
+        parts: The recordings, scaled by the size of their errors.
+        H: Their `curvature`.
+    """
+    if not np.isfinite(H).all():
+        return 1.0
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    ratios = np.linalg.pinv(H / np.outer(size, size), rcond=UNDETERMINED_CURVATURE, hermitian=True)
+    S = long_run_scores(parts, len(H)) / np.outer(size, size)
+    return max(1.0, float(np.sum(ratios * S)) / len(H))
+
+
 def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> Float[np.ndarray, "D D"]:
     """Covariance of least-squares estimates, robust to autocorrelation and unequal variance of the residuals.
 
@@ -94,17 +128,10 @@ def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> F
     if not (np.isfinite(H).all() and all(np.isfinite(p.e).all() for p in parts)):
         return np.full((size, size), np.nan)
     residual_covariance = sum(p.e.T @ p.e for p in parts) / n
-    white, S = np.zeros((size, size)), np.zeros((size, size))
-    for J, e, columns in parts:
+    white, S = np.zeros((size, size)), long_run_scores(parts, size)
+    for J, _, columns in parts:
         own = np.ix_(columns, columns)
         white[own] += J.reshape(-1, len(columns)).T @ (residual_covariance @ J).reshape(-1, len(columns))
-        scores = np.einsum("nc,ncd->nd", e, J)
-        width, none = bandwidth(e), np.zeros((1, len(columns)))
-        # Sums over all stretches of `width` samples give exactly the Bartlett kernel.
-        total = np.cumsum(np.concatenate([none, scores, np.repeat(none, width - 1, axis=0)]), axis=0)
-        sums = total[1:].copy()
-        sums[width:] -= total[1:-width]
-        S[own] += sums.T @ sums / width
     # In units in which each parameter alone is as well determined as any other, an eigenvalue at the
     # level of rounding is a direction that the data do not determine: no interval, rather than a narrow one.
     scale = np.sqrt(np.maximum(np.diag(H), 1e-300))

@@ -1,29 +1,30 @@
-"""Model errors of recordings as a function of one flat vector of coordinates, and their normal equations.
+"""Runs of recordings with their slopes, and the likelihood of their errors with its quadratic model.
 
-The coordinates are the unconstrained values of all parameters, then values that belong to one recording
-alone, then the first states of all recordings. A fit adjusts some of them; the rest are held.
+    e = y_hat - y,   J = de / dp
+    cost = sum over channels of  n ln s + sum e^2 / (2 s^2) - n / 2,   s = max(rms e, floor)
+    g = sum J'e / s^2,   H = sum J'J / s^2
 
-The scan carries the state, its slopes along every direction, and the sums
+The scale of each channel is that of the errors at the same point, so that no channel counts for more than
+it can be explained, and one nat is one nat at every step. Runs with slopes are one compiled program for free
+runs and predictions of any horizon: gains and windows are data.
 
-    cost = sum e'e / 2,   g = sum J'e,   H = sum J'J,   e = (y_hat - y) / s,   J = de/dp
-
-so that nothing of the length of a recording is stored. A fit that needs only these three is
-several times quicker with it than with the slopes of all samples, as long as small loops are compiled
-into one function (`enable_fast_loops`).
+Many starts add up the same sums inside of the run, as that is done on the device.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import StackedRecordings
+from rotflex_jax.fit.inference import RecordingSlopes, curvature, nats_that_count
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
 from rotflex_jax.mechanism.assembly import rest_state, whole_state
 from rotflex_jax.mechanism.sensitivities import (
@@ -33,103 +34,9 @@ from rotflex_jax.mechanism.sensitivities import (
     accumulate_outputs,
     outputs_with_sensitivities,
 )
-from rotflex_jax.optimise.damped_least_squares import NormalEquations
-from rotflex_jax.parameters import Transform
+from rotflex_jax.optimise.damped_least_squares import RIDGE, NormalEquations, solution_within
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import spread
-
-
-@dataclasses.dataclass(frozen=True)
-class Coordinates:
-    """What each entry of the flat vector is; hashable, so it can be static.
-
-    Attributes:
-        structure: Mechanism without numbers.
-        local: Indices of parameters that each recording has for itself, known constants among them.
-        recordings: How many recordings, or windows of them, each with a first state.
-        windows_of: Which recording each window is of; empty where none is cut.
-    """
-
-    structure: Mechanism
-    local: tuple[int, ...]
-    recordings: int
-    windows_of: tuple[int, ...] = ()
-
-    @property
-    def owners(self) -> tuple[int, ...]:
-        """For each first state, the recording whose local parameters it goes with."""
-        return self.windows_of or tuple(range(self.recordings))
-
-    @property
-    def owning(self) -> int:
-        """How many recordings have local parameters."""
-        return max(self.owners) + 1
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters."""
-        return len(self.structure.parameter_names)
-
-    @property
-    def states(self) -> int:
-        """Positions and speeds of one first state."""
-        return 2 * len(self.structure.coordinates)
-
-    @property
-    def size(self) -> int:
-        """Length of the flat vector."""
-        return self.parameters + self.owning * len(self.local) + self.recordings * self.states
-
-    def local_index(self, recording: int, parameter: int) -> int:
-        """Index of a recording's own value of a parameter."""
-        return self.parameters + recording * len(self.local) + self.local.index(parameter)
-
-    def state_index(self, recording: int) -> Int[np.ndarray, " s"]:
-        """Indices of a recording's first state."""
-        start = self.parameters + self.owning * len(self.local) + recording * self.states
-        return np.arange(start, start + self.states)
-
-    @property
-    def transform(self) -> Transform:
-        """Unconstrained <-> physical, by the declared bounds."""
-        return Transform.of(self.structure.parameter_specifications)
-
-    def split(self, flat: Float[Array, " F"]) -> tuple[Float[Array, "R P"], Float[Array, "R s"]]:
-        """Physical parameter values and first states of each recording."""
-        P, L, R, each = self.parameters, len(self.local), self.recordings, self.owning
-        z = jnp.broadcast_to(flat[:P], (R, P))
-        own = flat[P : P + each * L].reshape(each, L)
-        if L:
-            z = z.at[:, np.array(self.local)].set(own[np.array(self.owners)])
-        constrain = jax.vmap(self.transform.constrain)
-        return constrain(z), flat[P + each * L :].reshape(R, self.states)
-
-    def values(self, flat: Float[np.ndarray, " F"]) -> Float[np.ndarray, "R P"]:
-        """Physical parameter values of each recording."""
-        return np.asarray(_split(self, jnp.asarray(flat))[0])
-
-    def flatten(
-        self, values: Float[np.ndarray, " P"], x0: Float[np.ndarray, "R s"]
-    ) -> Float[np.ndarray, " F"]:
-        """The flat vector for physical values, the same in every recording, and first states."""
-        z = self.transform.unconstrain(values)
-        own = np.tile(z[list(self.local)], self.owning)
-        return np.concatenate([z, own, np.asarray(x0, float).ravel()])
-
-    def with_constants(
-        self, flat: Float[np.ndarray, " F"], constants: Float[np.ndarray, "R P"]
-    ) -> Float[np.ndarray, " F"]:
-        """The flat vector with the values that recordings know; nan where the common one counts."""
-        flat, z = flat.copy(), self.transform.unconstrain(constants)
-        for r, own in enumerate(self.owners):
-            for i in np.flatnonzero(~np.isnan(constants[r])).tolist():
-                flat[self.local_index(own, i)] = z[r, i]
-        return flat
-
-
-@persistent_jit(static=1)
-def _split(coordinates: Coordinates, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return coordinates.split(flat)
 
 
 def predicted(
@@ -244,125 +151,167 @@ def directions(
 
 
 @dataclasses.dataclass(frozen=True)
-class FreeCoordinates:
-    """Which of the coordinates a fit adjusts, and how they run; hashable, so it can be static.
+class RunLayout:
+    """What runs with slopes are compiled for; hashable, so it can be static.
 
     Attributes:
-        coordinates: All of them.
+        structure: Mechanism without numbers.
         solver: Integration rule.
-        parameters: Indices of the free parameters.
-        first_states: Whether first states are adjusted.
+        states: How many entries of each first state are free.
         mesh: Devices that the recordings are shared out to; None for one device.
     """
 
-    coordinates: Coordinates
+    structure: Mechanism
     solver: Solver
-    parameters: tuple[int, ...]
-    first_states: bool
+    states: int
     mesh: Mesh | None = None
 
-    @functools.cached_property
-    def index_by_recording(self) -> Int[np.ndarray, "R D"]:
-        """Indices in the flat vector of the directions of each recording."""
-        c = self.coordinates
-        owned = lambda r, i: c.local_index(r, i) if i in c.local else i  # noqa: E731
-        rows = [
-            [owned(c.owners[r], i) for i in self.parameters]
-            + (c.state_index(r).tolist() if self.first_states else [])
-            for r in range(c.recordings)
-        ]
-        return np.array(rows)
 
-    @functools.cached_property
-    def index(self) -> Int[np.ndarray, " M"]:
-        """Indices in the flat vector of what is free: common parameters, local ones, states."""
-        return np.unique(self.index_by_recording)
+@persistent_jit(static=1)
+def runs_with_slopes(
+    layout: RunLayout,
+    values: Float[Array, "R P"],
+    slopes: Float[Array, "R P"],
+    free: Int[Array, " K"],
+    x0: Float[Array, "R *W m"],
+    data: StackedRecordings,
+    K: Float[Array, "R n C"],
+    window: Int[Array, "R N"] | None = None,
+) -> tuple[Float[Array, "R N C"], Float[Array, "R N C D"]]:
+    """Outputs, and their slopes by the coordinates of free parameters and then by first states.
 
-    @functools.cached_property
-    def columns(self) -> Int[np.ndarray, "R D"]:
-        """Columns of the directions of each recording among the free coordinates."""
-        return np.searchsorted(self.index, self.index_by_recording)
+    Args:
+        layout: Static.
+        values: Parameter values of each recording.
+        slopes: Derivative of each value by its coordinate; zero where a recording knows the value.
+        free: Indices of the free parameters.
+        x0: First positions and speeds.
+        data: The recordings.
+        K: Gains of the predictor; zero for free runs.
+        window: Window of each sample, where runs start again at each; `x0` is then (R, W, m).
+    """
+    structure = layout.structure
 
-    @functools.cached_property
-    def step_limit(self) -> Float[np.ndarray, " M"]:
-        """Largest step of each: a parameter with a bound by a factor of e, others without limit."""
-        specs = self.coordinates.structure.parameter_specifications
-        most = np.full(len(self.index), np.inf)
-        for column, i in enumerate(self.parameters):
-            if np.isfinite(specs[i].lower) or np.isfinite(specs[i].upper):
-                most[self.columns[:, column]] = LARGEST_STEP
-        return most
+    def one(row: Any) -> tuple[jax.Array, jax.Array]:
+        values, slopes, x0, K, samples = row
+        gates = jnp.ones(len(structure.effects), values.dtype)
+        ways = directions(structure, slopes, free, layout.states)
+        numbers = RunParameters(values, gates, whole_state(structure, x0), K)
+        return outputs_with_sensitivities(structure, layout.solver, numbers, ways, RecordingSamples(*samples))
 
-    def by_recording(
-        self, flat: Float[Array, " F"], gates: Float[Array, " E"], K: Float[Array, "R n C"]
-    ) -> tuple[RunParameters, TangentDirections]:
-        """RunParameters and directions of each recording, along a leading axis."""
-        structure, c = self.coordinates.structure, self.coordinates
-        (values, x0), (slopes, _) = jax.jvp(c.split, (flat,), (jnp.ones_like(flat),))
-        states = c.states if self.first_states else 0
-        ways = jax.vmap(lambda s: directions(structure, s, jnp.array(self.parameters), states))(slopes)
-        return RunParameters(
-            values, jnp.broadcast_to(gates, (len(values), *gates.shape)), whole_state(structure, x0), K
-        ), ways
+    samples = tuple(data) if window is None else (*data, window)
+    rows = (values, slopes, x0, K, samples)
+    return spread(lambda rows: jax.lax.map(one, rows), layout.mesh)(rows)
 
 
-class RunInputs(NamedTuple):
-    """What the runs of one minimisation have in common.
+def channel_scale(
+    costs: Float[np.ndarray, " C"], samples: int, floor: Float[np.ndarray, " C"]
+) -> Float[np.ndarray, " C"]:
+    """Root mean square error of each channel, no less than a floor.
+
+    Args:
+        costs: Half the sum of squared errors of each channel.
+        samples: How many there are.
+        floor: Least scale.
+    """
+    return np.maximum(np.sqrt(2 * costs / samples), floor)
+
+
+@dataclasses.dataclass(frozen=True)
+class LikelihoodEquations:
+    """Negative log-likelihood of errors, constants left out, and its quadratic model at one point.
+
+    First states meet only the samples of their own window. They are eliminated from each step by their exact
+    least-squares answer, without damping as long as the step of the parameters has little; so a shift of a
+    parameter that first states can follow is not held back by them.
 
     Attributes:
-        gates: One factor per effect.
-        data: The recordings.
-        K: Gains of the predictor.
-        scale: Size of the error of each channel.
+        cost: Negative log-likelihood [nat].
+        scale: Of each channel.
+        gradient: By the M coordinates.
+        H: `J'J` of the scaled errors.
+        inner: Which coordinates are eliminated.
+        lower: Room of each coordinate downwards to a bound, zero or less.
+        upper: Room upwards.
+        parts: Scaled errors and slopes of each window.
     """
 
-    gates: Float[Any, " E"]
-    data: StackedRecordings
-    K: Float[Any, "R n C"]
-    scale: Float[Any, " C"]
+    cost: float
+    scale: Float[np.ndarray, " C"]
+    gradient: Float[np.ndarray, " M"]
+    H: Float[np.ndarray, "M M"]
+    inner: Bool[np.ndarray, " M"]
+    lower: Float[np.ndarray, " M"]
+    upper: Float[np.ndarray, " M"]
+    parts: Sequence[RecordingSlopes]
+
+    @functools.cached_property
+    def nats_that_count(self) -> float:
+        """Nats that say as much as one would if the errors were white."""
+        return nats_that_count(self.parts, self.H)
+
+    def promised(self) -> float:
+        """By how much the quadratic model falls to its minimum within the bounds [nat]."""
+        step, _ = self.step(0.0, None)
+        return self.predicted_decrease(step) if np.isfinite(step).all() else np.inf
+
+    def step(self, damping: Any, limit: Any) -> tuple[Float[np.ndarray, " M"], bool]:
+        """Damped step within limits and bounds, and whether a limit (not a bound) holds it short."""
+        if not (np.isfinite(self.H).all() and np.isfinite(self.gradient).all()):
+            return np.full(len(self.gradient), np.nan), False
+        size = np.sqrt(np.maximum(np.diag(self.H), 1e-12 * max(np.diag(self.H).max(initial=0.0), 1e-300)))
+        A, b = self.H / np.outer(size, size), -self.gradient / size
+        i, o = np.flatnonzero(self.inner), np.flatnonzero(~self.inner)
+        A = A + RIDGE * np.eye(len(b))
+        own = A[np.ix_(i, i)] + damping**2 / (1 + damping) * np.eye(len(i))
+        solved = (
+            np.linalg.solve(own, np.column_stack([A[np.ix_(i, o)], b[i]]))
+            if len(i)
+            else np.zeros((0, len(o) + 1))
+        )
+        left = A[np.ix_(o, o)] - A[np.ix_(o, i)] @ solved[:, :-1]
+        right = b[o] - A[np.ix_(o, i)] @ solved[:, -1]
+        left = left + np.diag(damping * np.maximum(np.diag(left), 1e-12))
+        most = np.full(len(o), np.inf) if limit is None else np.asarray(limit)[o]
+        low, high = np.maximum(self.lower[o], -most), np.minimum(self.upper[o], most)
+        x, short = solution_within(left, right, low * size[o], high * size[o])
+        at_limit = short & (np.where(x < 0, low, high) * size[o] == x) & (np.abs(x) >= most * size[o])
+        step = np.zeros(len(b))
+        step[o], step[i] = x, solved[:, -1] - solved[:, :-1] @ x
+        return step / size, bool(at_limit.any())
+
+    def predicted_decrease(self, step: Float[np.ndarray, " M"]) -> float:
+        """By how much the quadratic model falls along a step [nat]."""
+        return float(-(self.gradient @ step + step @ self.H @ step / 2))
 
 
-@persistent_jit(static=1)
-def summed_equations(free: FreeCoordinates, flat: Float[Array, " F"], inputs: RunInputs) -> NormalEquations:
-    """Normal equations of all recordings, by the M free coordinates; the cost of each channel apart."""
+def likelihood_equations(
+    coordinates: FitCoordinates,
+    e: Float[np.ndarray, "R N C"],
+    J: Float[np.ndarray, "R N C D"],
+    samples: int,
+    floor: Float[np.ndarray, " C"],
+    room: tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]],
+) -> LikelihoodEquations:
+    """Likelihood and its quadratic model from errors and slopes.
 
-    def one(
-        numbers: RunParameters, ways: TangentDirections, samples: RecordingSamples, scale: jax.Array
-    ) -> NormalEquations:
-        structure = free.coordinates.structure
-        return normal_equations(structure, free.solver, numbers, ways, samples, scale)
-
-    found = _each_recording(one, free, flat, inputs)
-    M, columns = len(free.index), jnp.asarray(free.columns)
-    g = jnp.zeros(M, flat.dtype).at[columns].add(found.gradient)
-    H = jnp.zeros((M, M), flat.dtype).at[columns[:, :, None], columns[:, None, :]].add(found.H)
-    return NormalEquations(jnp.sum(found.costs, axis=0), g, H)
-
-
-@persistent_jit(static=1)
-def residuals_and_slopes(
-    free: FreeCoordinates, flat: Float[Array, " F"], inputs: RunInputs
-) -> tuple[Float[Array, "R N C"], Float[Array, "R N C D"]]:
-    """Scaled errors and their slopes by the directions of each recording."""
-
-    def one(
-        numbers: RunParameters, ways: TangentDirections, samples: RecordingSamples, scale: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        y_hat, J = outputs_with_sensitivities(free.coordinates.structure, free.solver, numbers, ways, samples)
-        seen = samples.seen[:, None] > 0
-        e = jnp.where(seen, (samples.y - y_hat) / scale[None], 0.0)
-        return e, jnp.where(seen[..., None], -J / scale[None, :, None], 0.0)
-
-    return _each_recording(one, free, flat, inputs)
-
-
-def _each_recording(
-    one: Callable[..., Any], free: FreeCoordinates, flat: jax.Array, inputs: RunInputs
-) -> Any:
-    """`one` of the numbers, directions, samples and scale of each recording, along a leading axis."""
-
-    def every(rows: Any, scale: jax.Array) -> Any:
-        return jax.lax.map(lambda r: one(r[0], r[1], RecordingSamples(*r[2]), scale), rows)
-
-    rows = (*free.by_recording(flat, inputs.gates, inputs.K), tuple(inputs.data))
-    return spread(every, free.mesh)(rows, inputs.scale)
+    Args:
+        coordinates: What moves.
+        e: Errors, zero where a sample does not count.
+        J: Slopes along the directions of each window.
+        samples: How many samples count.
+        floor: Least scale of each channel.
+        room: How far each coordinate may go down and up.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        costs = np.einsum("rnc,rnc->c", e, e) / 2
+        scale = channel_scale(costs, samples, floor)
+        cost = float(np.sum(samples * (np.log(scale) - 0.5) + costs / scale**2))
+        parts = coordinates.parts(e / scale, J / scale[:, None])
+        H, g = curvature(parts, coordinates.size), np.zeros(coordinates.size)
+        for part in parts:
+            g[part.columns] += part.J.reshape(-1, len(part.columns)).T @ part.e.ravel()
+    inner = np.arange(coordinates.size) >= coordinates.shared
+    for r in range(len(e)):
+        inner[coordinates.local_columns(r)] = False
+    return LikelihoodEquations(cost, scale, g, H, inner, *room, parts)

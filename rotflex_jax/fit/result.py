@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
-from rotflex_jax.text.markup import card, picture, table
+from rotflex_jax.text.markup import card, paragraph, picture, table
 from rotflex_jax.text.numbers import plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import bars
 
@@ -29,10 +30,11 @@ class Fit:
         covariance: Of the F free parameters [declared units], in the order of `free_names`.
         free_names: Full names of the free parameters.
         steps: Iterations that led here.
-        history: Half the squared error after each minimisation that led here.
+        history: Negative log-likelihood after each minimisation that led here, constants left out [nat].
         weakest: Direction of the free parameters (in shares of their values) that the data determine least.
         local: Parameter that each recording has for itself -> its estimates, in the order of the
             recordings; `parameters` has the mean.
+        remarks: Parameters at a bound, or far beyond what the recordings reach, each with a sentence.
     """
 
     model: Model
@@ -46,6 +48,7 @@ class Fit:
     history: tuple[float, ...] = ()
     weakest: dict[str, float] = dataclasses.field(default_factory=dict)
     local: dict[str, tuple[Estimate, ...]] = dataclasses.field(default_factory=dict)
+    remarks: tuple[Remark, ...] = ()
 
     def model_of(self, recording: int) -> Model:
         """The model with the local parameters of one of the fitted recordings, by its number."""
@@ -84,6 +87,7 @@ class Fit:
             f"Fit: {self.status} after {self.steps} steps, cost {plain_number(self.cost, 4)} nat",
             table(("channel", "unit", "rms residual"), residuals, words=2),
             table(("parameter", "unit", "", "value", "95 %"), estimates, words=3),
+            *(paragraph(remark.sentence) for remark in self.remarks),
             picture(
                 bars(widths, "half of the 95 % interval, share of the value [%]"),
                 "Width of the interval of each free parameter.",
@@ -93,4 +97,5 @@ class Fit:
     def __str__(self) -> str:
         lines = [f"Fit: {self.status} after {self.steps} steps, cost {self.cost:.1f}"]
         lines += [f"  residual {c}: {s:.3g} rms" for c, s in self.noise.items()]
-        return "\n".join(lines + [f"  {e}" for e in self.parameters])
+        lines += [f"  {e}" for e in self.parameters]
+        return "\n".join(lines + [f"  {remark.sentence}" for remark in self.remarks])

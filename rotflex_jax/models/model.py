@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float, Int, Real
 
 from rotflex_jax.checks import number, shown
 from rotflex_jax.effects.base import Actuation, Effect
@@ -229,13 +229,7 @@ class Model:
         starts, length = window_starts(recording, seconds)
         pick = starts[:, None] + np.arange(length)[None, :]
         inside = np.minimum(pick, len(u) - 1)
-        m = recording.n_init
-        head, moving = inside[:, :m], 2 * len(self.mechanism.coordinates)
-        hidden = None
-        if len(rest_state(self.mechanism.structure, np.float64)) > moving:
-            states = self._run(recording, self._start(recording))[0]
-            hidden = states[starts, moving:]
-        x0 = inner._starts(u[head], y[head], recording.Ts, hidden)
+        x0 = self.states_at(recording, starts)
         with double_precision():
             run = _free_many(
                 inner.mechanism.structure,
@@ -250,6 +244,35 @@ class Model:
         for window, start, end in zip(answers, starts, [*starts[1:], len(u)], strict=True):
             out[start:end] = window[: end - start]
         return out
+
+    def states_at(
+        self,
+        recording: Recording,
+        begins: Int[np.ndarray, " W"],
+        moving: Float[np.ndarray, "W m"] | None = None,
+    ) -> Float[np.ndarray, "W n"]:
+        """States in which free runs start again at some samples of a recording.
+
+        Positions and speeds are estimated on the first `n_init` samples from each on. States that no sensor
+        measures come from a free run over the whole recording, where it starts again not only at its start.
+
+        Args:
+            recording: It has at least `n_init` samples from each on.
+            begins: First samples.
+            moving: Positions and speeds, where they are known.
+        """
+        if moving is None and not begins.any():
+            return self._start(recording)[None]
+        y = self.measured(recording).astype(float)
+        v, inner = self._behind_actuation(recording)
+        head, m = begins[:, None] + np.arange(recording.n_init), 2 * len(self.mechanism.coordinates)
+        hidden, rest = None, rest_state(self.mechanism.structure, np.float64)[m:]
+        if len(rest):
+            left = self._run(recording, self._start(recording))[0][begins, m:]
+            hidden = np.where(np.isfinite(left), left, rest)
+        if moving is None:
+            return inner._starts(v[head], y[head], recording.Ts, hidden)
+        return moving if hidden is None else np.concatenate([moving, hidden], axis=1)
 
     def predict(
         self,

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Real, Shaped
+from jaxtyping import Bool, Real, Shaped
 
 SHORT = 1e-3
 """Damping above which a step is held short and says nothing of what is left to gain."""
@@ -134,6 +134,38 @@ def bounded_solution(
         while state[2]:
             state = solve_again(state)
     return state[0] / size, xp.any(state[1], axis=-1)
+
+
+def solution_within(
+    A: Real[np.ndarray, "n n"],
+    b: Real[np.ndarray, " n"],
+    low: Real[np.ndarray, " n"],
+    high: Real[np.ndarray, " n"],
+) -> tuple[Real[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """The `x` with the least `x'A x / 2 - b'x` and `low <= x <= high`, and which entries are at an end.
+
+    Entries beyond an end are held there and the others solved for again; one that would then rather come
+    back is let go, once.
+
+    Args:
+        A: Positive definite.
+        b: Right-hand side.
+        low: Least value of each entry, zero or less.
+        high: Largest value, zero or more.
+    """
+    held, x = np.zeros(len(b), bool), np.zeros(len(b))
+    released = held.copy()
+    for _ in range(2 * len(b) + 1):
+        free = ~held
+        x[free] = np.linalg.solve(A[np.ix_(free, free)], b[free] - A[np.ix_(free, held)] @ x[held])
+        over = free & ((x < low) | (x > high))
+        x = np.clip(x, low, high)
+        back = held & ~released & np.where(x <= low, b - A @ x > 0, b - A @ x < 0)
+        if not (over | back).any():
+            break
+        # Those that come back do so when nothing else goes out, for they are judged with all others solved.
+        held, released = (held | over, released) if over.any() else (held & ~back, released | back)
+    return x, held
 
 
 @runtime_checkable
@@ -297,6 +329,7 @@ def minimise_together(
     limit: Callable[[int], Any] | None = None,
     costs: Callable[[list[Any]], Sequence[float]] | None = None,
     move: Callable[[Any, Any], Any] = np.add,
+    unit: Callable[[Any], float] | None = None,
     max_steps: int = 60,
     report: Callable[[Sequence[Progress]], None] | None = None,
 ) -> list[Minimum]:
@@ -309,15 +342,29 @@ def minimise_together(
         limit: Largest step along each coordinate of problem i; None for no limits.
         costs: Costs at points, where these are cheaper than equations; the equations' own if None.
         move: The point that a step leads to.
+        unit: From equations, what `enough` and `least_progress` count in, 1 or more; asked for after each
+            window of evaluations, and again before a minimisation ends by it.
         max_steps: Most steps that are tried of each.
         report: Called after each round.
     """
     points, first = list(starts), list(linearise(list(starts)))
     equations = list(first)
     progress = [begin(np.float64(e.cost), rules) for e in equations]
+    units = [1.0] * len(points)
 
     def runs(i: int) -> bool:
         return bool(progress[i].status == Status.RUNNING) and bool(progress[i].evaluations < max_steps)
+
+    def counted(i: int) -> Rules:
+        least, enough = rules.least_progress * units[i], rules.enough * units[i]
+        return rules._replace(enough=enough, least_progress=least)
+
+    def ends_too_early(i: int) -> bool:
+        """Whether a minimisation ended in a unit that is smaller by now; it is renewed."""
+        if units[i] == 1.0 or progress[i].status != Status.CONVERGED or unit is None:
+            return False
+        before, units[i] = units[i], float(unit(equations[i]))
+        return units[i] < 0.5 * before and bool(progress[i].damping <= rules.largest)
 
     while True:
         trials: dict[int, Any] = {}
@@ -325,7 +372,10 @@ def minimise_together(
             step, limited = equations[i].step(float(progress[i].damping), limit and limit(i))
             finite = bool(np.isfinite(step).all())
             predicted = equations[i].predicted_decrease(step) if finite else np.nan
-            progress[i] = before_trial(progress[i], finite, limited, predicted, rules)
+            progress[i] = before_trial(progress[i], finite, limited, predicted, counted(i))
+            if ends_too_early(i):
+                again = progress[i]._replace(status=np.asarray(int(Status.RUNNING)))
+                progress[i] = before_trial(again, finite, limited, predicted, counted(i))
             if runs(i):
                 trials[i] = move(points[i], step)
         if not trials:
@@ -335,12 +385,16 @@ def minimise_together(
         found = costs(tried) if costs else [e.cost for e in made]
         accepted = []
         for k, i in enumerate(trials):
-            progress[i], better = after_trial(progress[i], np.float64(found[k]), rules)
+            progress[i], better = after_trial(progress[i], np.float64(found[k]), counted(i))
             if better:
                 points[i] = tried[k]
                 accepted.append(i)
                 if made:
                     equations[i] = made[k]
+            if ends_too_early(i):
+                progress[i] = progress[i]._replace(status=np.asarray(int(Status.RUNNING)))
+            elif unit is not None and runs(i) and progress[i].evaluations % rules.window == 0:
+                units[i] = float(unit(equations[i]))
         # Where only costs were evaluated, equations are made if another step follows.
         follow = [i for i in accepted if runs(i)] if costs else []
         if follow:
@@ -362,6 +416,7 @@ def minimise(
     limit: Any = None,
     cost: Callable[[Any], float] | None = None,
     move: Callable[[Any, Any], Any] = np.add,
+    unit: Callable[[Any], float] | None = None,
     max_steps: int = 60,
     report: Callable[[Progress], None] | None = None,
 ) -> Minimum:
@@ -379,6 +434,7 @@ def minimise(
         limit=None if limit is None else lambda _: limit,
         costs=None if cost is None else lambda points: [cost(x) for x in points],
         move=move,
+        unit=unit,
         max_steps=max_steps,
         report=None if report is None else lambda progress: report(progress[0]),
     )[0]

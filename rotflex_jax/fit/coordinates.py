@@ -1,4 +1,4 @@
-"""What a fit of a hypothesis adjusts, and the block structure of its least-squares problem.
+"""What a fit adjusts, and the block structure of its least-squares problem.
 
 The coordinates are the parameters that all recordings share, then for each recording its own parameters and
 the first states of its windows. A first state acts within its window alone and an own parameter within its
@@ -6,15 +6,36 @@ recording, so that products and projections are formed block by block.
 """
 
 import dataclasses
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.windows import Windows
+from rotflex_jax.fit.inference import RecordingSlopes
+from rotflex_jax.fit.windows import Windows
 
 # A direction of which no more than this share is left after a projection has none of its own.
 RANK_TOLERANCE = 1e-10
+
+
+class Point(Protocol):
+    """Numbers that a fit moves: a dataclass with at least these fields."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def free(self) -> tuple[int, ...]: ...  # noqa: D102 - parameters that all recordings share
+    @property
+    def local(self) -> tuple[int, ...]: ...  # noqa: D102 - those that each recording has for itself
+    @property
+    def z(self) -> Float[np.ndarray, " P"]: ...  # noqa: D102 - unconstrained values of all parameters
+    @property
+    def local_z(self) -> Float[np.ndarray, "R L"]: ...  # noqa: D102 - of the recordings' own
+    @property
+    def x0(self) -> Float[np.ndarray, "R W m"]: ...  # noqa: D102 - first states of the windows
+
+
+PointType = TypeVar("PointType", bound=Point)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +55,8 @@ class FitCoordinates:
     windows: Windows
 
     @classmethod
-    def of(cls, h: Hypothesis, windows: Windows) -> "FitCoordinates":
-        """Those of a hypothesis."""
+    def of(cls, h: Point, windows: Windows) -> "FitCoordinates":
+        """Those of a hypothesis, or of another point."""
         return cls(len(h.free), len(h.local), h.x0.shape[-1], windows)
 
     @property
@@ -82,14 +103,22 @@ class FitCoordinates:
                 g[columns] += J @ w[r, samples].ravel()
         return H, g
 
-    def moved(self, h: Hypothesis, step: Float[np.ndarray, " M"]) -> Hypothesis:
-        """The hypothesis after a step in these coordinates."""
+    def parts(self, e: Float[np.ndarray, "R N C"], J: Float[np.ndarray, "R N C D"]) -> list[RecordingSlopes]:
+        """Errors and slopes window by window, with their columns."""
+        return [
+            RecordingSlopes(J[r, samples], e[r, samples], self.columns(r, k))
+            for r in range(len(e))
+            for k, samples in self.windows.of(r)
+        ]
+
+    def moved(self, h: PointType, step: Float[np.ndarray, " M"]) -> PointType:
+        """The point after a step in these coordinates."""
         z, local_z, x0 = h.z.copy(), h.local_z.copy(), h.x0.copy()
         z[list(h.free[: self.shared])] += step[: self.shared]
         for r, count in enumerate(self.windows.counts):
             local_z[r] += step[self.local_columns(r)]
             for k in range(count):
-                x0[r, k] += step[self.state_columns(r, k)]
+                x0[r, k, : self.states] += step[self.state_columns(r, k)]
         return dataclasses.replace(h, z=z, local_z=local_z, x0=x0)
 
     def step_limit(self, largest: float) -> Float[np.ndarray, " M"]:
