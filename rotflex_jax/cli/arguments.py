@@ -130,6 +130,15 @@ SimulationFile = Annotated[
     Path | None, typer.Option(metavar="CSV", help="Write what was measured and simulated.")
 ]
 
+SimulationReport = Annotated[
+    Path | None,
+    typer.Option(
+        "--report",
+        metavar="FOLDER",
+        help="Write a page here: measured and simulated, errors, residual tests, frequency response.",
+    ),
+]
+
 # rotflex export
 ExportedModel = Annotated[
     str,

@@ -3,17 +3,23 @@
 import dataclasses
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.linear import output_units
+from rotflex_jax.models.comparison import compare_plot
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
+from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import card, picture, table
 from rotflex_jax.text.numbers import plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import bars
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +73,15 @@ class Fit:
         from rotflex_jax.models.model_json import Saved, save  # the layer above, on request
 
         return save(Saved(self.model, self.parameters, self.covariance, self.free_names), path)
+
+    def plot(self, recording: Recording, seconds: float | None = None) -> "Figure":
+        """Measured against simulated outputs, with errors and the fit in per cent; a notebook shows it.
+
+        Args:
+            recording: What was measured, best one that was not fitted.
+            seconds: Runs start again so often [s]; one free run over all of it unless given.
+        """
+        return compare_plot(recording, self, seconds=seconds)
 
     def _repr_html_(self) -> str:
         """How the fit ended, its residuals, and every parameter with unit and interval."""

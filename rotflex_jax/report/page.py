@@ -54,6 +54,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "headings": channel_headings(discovery),
         "noise": noise_row(discovery),
         "at_noise": f"{NEAR_FLOOR:g}",
+        "tests": _test_lines(explanation),
         "pictures": by_section(pictures(discovery, explanation).values()),
         "places": _places(discovery.where),
         "torques": _latent_lines(latent) if latent else [],
@@ -115,6 +116,15 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         "score": plain_number(added.score),
         "falls": ", ".join(falls),
     }
+
+
+def _test_lines(explanation: Explanation) -> list[str]:
+    """What the tests of the last model's residuals say, in words."""
+    tests = explanation.tests.residuals if explanation.tests else {}
+    if not tests:
+        return []
+    name, last = list(tests.items())[-1]
+    return [f"{name.capitalize()}, {line}" for line in last.sentences()]
 
 
 def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
