@@ -90,6 +90,13 @@ def in_the_room() -> rf.Recording:
     return rf.Recording(u=demo.u, y=demo.y @ np.array([[1.0, 1.0], [0.0, 1.0]]), Ts=demo.Ts)
 
 
+def swapped() -> rf.Recording:
+    """The demo recording with its columns in the wrong order, from a table."""
+    demo = rf.data.demo_recording()
+    named = {"t": demo.t, "voltage": demo.u, "theta": demo.y[:, 1], "alpha": demo.y[:, 0]}
+    return rf.load(pd.DataFrame(named))
+
+
 def doubted(recording: rf.Recording) -> None:
     """A warning, which is no refusal, as one."""
     raise rf.InputError(next(str(f) for f in recording.findings if f.severity == "warning"))
@@ -120,6 +127,8 @@ RAISED: dict[str, Callable[[], object]] = {
     "degrees by unit": lambda: rf.load(lines(lambda rows: [rows[0], "s,V,deg,deg", *rows[1:]])),
     "two names in one": lambda: rf.load(file(), outputs="theta,alpha"),
     "in the room": lambda: doubted(in_the_room()),
+    "counts": lambda: rf.load(file(theta=np.round(4096 / 6.28 * GOOD["theta"]))),
+    "swapped": swapped,
     "milliseconds by name": lambda: rf.load(file(t=None, t_ms=1000 * GOOD["t"]), time="t_ms"),
     "no time": lambda: rf.load(file(t=None)),
     "no header": lambda: rf.load(lines(lambda rows: rows[1:])),

@@ -48,20 +48,17 @@ def data_fetch(
             print(path)
 
 
+@given.reads_files
 def check(
     files: given.Files,
     joint: given.JointName = "paper",
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Say what is in a recording and what is wrong with it; takes seconds."""
     given.check_distinct(files, [])
     model = by_name.model(joint)
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    model, columns = columns.of(model)
     from rotflex_jax.fit.signs import check_signs
 
     for file in files:

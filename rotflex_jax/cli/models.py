@@ -8,6 +8,7 @@ from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 
 
+@given.reads_files
 def simulate(
     file: given.OneFile,
     joint: given.JointName = "paper",
@@ -16,12 +17,8 @@ def simulate(
     save: given.SimulationFile = None,
     save_model: given.ModelFile = None,
     report: given.SimulationReport = None,
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Simulate a recording in free run and compare with what was measured."""
     given.check_distinct([file], fit or [])
@@ -29,7 +26,7 @@ def simulate(
         given.check_writable(json_file=target)
     given.check_writable(folder=report)
     model = by_name.model(joint, add or ())
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    model, columns = columns.of(model)
     recording = columns.load(file)
     train = [columns.load(other) for other in fit or []]
     terminal.print_findings([recording, *train])
