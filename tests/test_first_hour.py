@@ -244,6 +244,47 @@ def test_a_smooth_input_on_the_command_line(run, tmp_path) -> None:  # noqa: F81
     assert_one_sentence(err, "held or smooth")
 
 
+# Public data by name
+
+
+def test_a_public_joint_is_searched_by_its_name(run, measured, monkeypatch) -> None:  # noqa: F811
+    recordings = measured("rotflex")
+    calls: list = []
+
+    def search(model, train, validation, **options):
+        calls.append((model, train, validation))
+        raise InputError("Enough.")
+
+    monkeypatch.setattr(rf, "discover", search)
+    assert run("discover", "rotflex")[0] == 2
+    ((model, train, validation),) = calls
+    assert model.mechanism == rf.joints.quanser_2010()
+    assert validation == []  # the two validate each other
+    assert [r.source for r in train] == [r.source for r in recordings]
+    assert np.array_equal(train[1].y, recordings[1].y)
+    run("discover", "rotflex", "--joint", "paper:stiffness=1.2", "--split", "0.6")
+    assert calls[1][0].mechanism == rf.joints.paper(stiffness=1.2)
+    assert len(calls[1][1]) == len(calls[1][2]) == 2
+    status, out, _ = run("check", "rotflex")
+    assert status == 0
+    assert out.count("those of quanser_2010") == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (("emps",), "not searched by its name"),
+        (("rotflex", "--degrees"), "leave that option out"),
+        (("rotflex", "rotflex"), "twice"),
+    ],
+)
+def test_what_is_no_search_by_name_is_refused(line, said, run, measured) -> None:  # noqa: F811
+    measured("rotflex")
+    status, _, err = run("discover", *line)
+    assert status == 2
+    assert_one_sentence(err, said)
+
+
 # MATLAB and spreadsheets
 
 

@@ -113,15 +113,14 @@ def discover(
     given.check_distinct(files, [*(held_out or []), *(test or [])])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
-    model, columns = columns.of(by_name.model(joint))
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers)
         return
-    if len(files) > 1 and not held_out and split is None:
-        train, validation = [columns.load(file) for file in files], []
-    else:
-        train, validation = columns.load_parts(files, held_out or [], share)
-    no_say = [columns.load(file) for file in test or []]
+    train, validation = columns.load_all(files), columns.load_all(held_out or [])
+    if not validation and (len(train) == 1 or split is not None):
+        train, validation = map(list, zip(*(recording.split(share) for recording in train), strict=True))
+    no_say = columns.load_all(test or [])
     _discover(
         model, train, validation, report, json_file, save_model, test=no_say, calibrate_seconds=calibrate
     )
@@ -148,7 +147,7 @@ def compare(
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."
         )
-    model, columns = columns.of(by_name.model(joint))
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
     names = methods if methods is None else methods.split(",")
     from rotflex_jax.compare import QUICK
     from rotflex_jax.compare.method import selected_methods

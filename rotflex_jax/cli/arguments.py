@@ -24,7 +24,10 @@ EXPORT_FORMS = ("c", "latex", "text", "statespace")
 
 Files = Annotated[
     list[Path],
-    typer.Argument(metavar="FILE...", help="Recordings: .csv, .tsv, .xlsx, .mat, .npz, .parquet."),
+    typer.Argument(
+        metavar="FILE...",
+        help="Recordings: .csv, .tsv, .xlsx, .mat, .npz, .parquet; or rotflex, the public data set.",
+    ),
 ]
 JointName = Annotated[
     str,
@@ -314,7 +317,7 @@ class Columns:
             raise InputError(
                 f"{recording.source}: the input {recording.input_name!r} is in {recording.input_unit}, but "
                 f"the model is driven in {driven}; name the column of that with --input, give a model with "
-                "such an input (--model FILE.py:NAME, for a current one with CurrentMotor), or "
+                "such an input (--model FILE.py:NAME, for a current one with CurrentDrive), or "
                 "--accept units."
             )
         return recording
@@ -341,13 +344,30 @@ class Columns:
             "resample": _period(self.resample),
         }
 
+    def load_all(self, files: Sequence[Path]) -> "list[Recording]":
+        """The recordings in files, and those of public data sets that are named in the place of a file."""
+        found: list[Recording] = []
+        for file in files:
+            if public_name(file) is None:
+                found.append(self.load(file))
+                continue
+            if dataclasses.replace(self, mechanism=None, intersample="held", accept=None) != Columns():
+                raise InputError(
+                    f"{file} is a public data set whose columns and units are known, but an option says how "
+                    "to read it; leave that option out."
+                )
+            from rotflex_jax.data.datasets import load_dataset
+
+            found += load_dataset(str(file))
+        return found
+
     def load_parts(
         self, files: Sequence[Path], held_out: Sequence[Path], share: float
     ) -> "tuple[list[Recording], list[Recording]]":
         """Recordings to fit and held-out ones: files of their own, or the end of each file."""
-        train = [self.load(file) for file in files]
+        train = self.load_all(files)
         if held_out:
-            return train, [self.load(file) for file in held_out]
+            return train, self.load_all(held_out)
         parts = [recording.split(share) for recording in train]
         return [a for a, _ in parts], [b for _, b in parts]
 
@@ -432,6 +452,31 @@ def as_options(sentence: str) -> str:
     sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
     sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
     return re.sub(r"Argument `(\w+)`", lambda m: "--" + m[1].replace("_", "-"), sentence)
+
+
+def public_name(file: Path) -> str | None:
+    """The name of a public data set that is given in the place of a file; None where there is such a file."""
+    from rotflex_jax.data.registry import DATASETS
+
+    name = str(file)
+    if name not in DATASETS or file.exists():
+        return None
+    if not DATASETS[name].joint:
+        raise InputError(
+            f"The data set {name} has recordings of several machines, or some that are kept for an official "
+            f"test, and is not searched by its name; see rf.data.load_dataset({name!r}) and the page of "
+            "public machines, or name its files."
+        )
+    return name
+
+
+def joint_for(files: Sequence[Path], joint: str) -> str:
+    """The joint that was given, or that of the public data set where all files are its name."""
+    from rotflex_jax.data.registry import DATASETS
+
+    names = {public_name(file) for file in files}
+    name = names.pop() if len(names) == 1 else None
+    return DATASETS[name].joint if name is not None and joint == "paper" else joint
 
 
 def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:
