@@ -18,6 +18,7 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.cli import app, terminal
 from rotflex_jax.data.datasets import DATASETS
+from rotflex_jax.discover.assessment import assess
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.models.model import Model
@@ -332,6 +333,7 @@ class FakeSearch:
             where=[SimpleNamespace(statement="78 % of the error follows reversals")],
             to_dict=lambda: {"schema": 1, "verdict": "found"},
             report=self.report,
+            assessment=assess({"theta": 0.2}, {"theta": 0.1}, {"theta": 5e-4}, 0.0, 600),
         )
 
     @staticmethod

@@ -1,5 +1,8 @@
 """What stopped or misled a newcomer with a file of an own drive: each stumble as a test, by both doors."""
 
+import dataclasses
+from typing import ClassVar
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +12,11 @@ from test_cli import assert_one_sentence, run  # noqa: F401 - a fixture
 import rotflex_jax as rf
 from rotflex_jax.data.datasets import demo_recording
 from rotflex_jax.data.tables import name_and_unit
+from rotflex_jax.discover.supermodel import build
+from rotflex_jax.effects import CATALOG, Force
+from rotflex_jax.effects.base import Scale
 from rotflex_jax.errors import InputError
+from rotflex_jax.parameters import parameter
 
 RECORDING = demo_recording().slice(0, 3000)
 T, U = RECORDING.t, RECORDING.u
@@ -283,6 +290,69 @@ def test_what_is_no_search_by_name_is_refused(line, said, run, measured) -> None
     status, _, err = run("discover", *line)
     assert status == 2
     assert_one_sentence(err, said)
+
+
+# Effects of one's own
+
+
+@dataclasses.dataclass(frozen=True)
+class Power(Force):
+    """tau = -stiffness position^order"""
+
+    name: ClassVar[str] = "test_power"
+    title: ClassVar[str] = "spring of a power"
+    equation: ClassVar[str] = "tau = -stiffness * position^order"
+    amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)
+    given: ClassVar[object] = [[{"stiffness": 1, "offset": 0.0}]]
+
+    stiffness: float = parameter(1.0, unit="N m/rad^3")
+    offset: float = parameter(0.0, unit="rad", lower=-1.0)
+    order: int = 3  # chosen, not fitted
+
+    def force(self, position, speed, voltage):
+        return -self.stiffness * (position - self.offset) ** self.order
+
+    @classmethod
+    def probes(cls, scale):
+        return cls.given
+
+
+SCALE = Scale(voltage=5.0, speed=3.0, position=0.3, torque=0.1)
+
+
+@pytest.mark.parametrize(
+    ("probes", "said"),
+    [
+        ([[{"stiffness": 0.1}]], "A probe of Power lacks offset, but needs .* stiffness, offset"),
+        ([[{"stiffness": 0.1, "offset": 0.0, "width": 1.0}]], "has width too"),
+        ([{"stiffness": 0.1, "offset": 0.0}], "list of shapes, each a list"),
+        ([["stiffness"]], "must name its parameters"),
+        ([[{"stiffness": "large", "offset": 0.0}]], "stiffness='large', but needs a finite number"),
+        ([[{"stiffness": np.nan, "offset": 0.0}]], "finite number"),
+    ],
+)
+def test_a_wrong_probe_is_told_in_a_sentence(probes, said, monkeypatch) -> None:
+    monkeypatch.setattr(Power, "given", probes)
+    with pytest.raises(InputError, match=said):
+        Power.probe_values(SCALE)
+    # The search asks by the same door.
+    monkeypatch.setitem(CATALOG, Power.name, Power)
+    scales = dict.fromkeys(("hub", "arm", "joint"), SCALE)
+    with pytest.raises(InputError, match=said):
+        build(rf.joints.paper(), [(Power, "joint")], scales)
+
+
+def test_a_right_probe_is_taken_and_whole_numbers_are_numbers() -> None:
+    assert Power.probe_values(SCALE) == (((1.0, 0.0),),)
+
+
+def test_a_whole_number_that_is_chosen_is_a_plain_field(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(CATALOG, Power.name, Power)
+    model = rf.Model(rf.joints.paper() + Power(at="joint", stiffness=40.0, order=5))
+    assert "joint.test_power.order" not in model.mechanism.parameter_names
+    model.save(tmp_path / "model.json")
+    assert rf.Model.load(tmp_path / "model.json") == model
+    assert Power(at="joint", order=5).force(2.0, 0.0, 0.0) == -32.0
 
 
 # MATLAB and spreadsheets

@@ -379,7 +379,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     rounds = _rounds(state, stages, pairs)
     listed = [s for s, _ in state.ranking]
-    verdict, sentence = end_state(rounds, stages[-1], floor, listed, held_back)
+    verdict, sentence = end_state(stages[0], rounds, stages[-1], floor, listed, held_back)
     return Discovery(
         verdict=verdict,
         sentence=sentence,

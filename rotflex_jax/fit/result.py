@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,6 +69,12 @@ class Fit:
             f"{', '.join(e.name for e in self.parameters)}; use one of these names."
         )
 
+    @property
+    def ending(self) -> str:
+        """How the fit ended and after how many steps, each said once."""
+        counted = re.search(r"\bafter \d+ steps\b", self.status)
+        return self.status if counted else f"{self.status} after {self.steps} steps"
+
     def save(self, path: str | Path) -> Path:
         """Write the model as JSON, with estimates and their covariance; `Model.load` reads the model."""
         from rotflex_jax.models.model_json import Saved, save  # the layer above, on request
@@ -96,7 +103,7 @@ class Fit:
             width = 100 * 1.96 * e.std / abs(e.value) if e.free and e.value else math.nan
             widths.append((e.name, width, f"± {width:.2g} %"))
         return card(
-            f"Fit: {self.status} after {self.steps} steps, cost {plain_number(self.cost, 4)} nat",
+            f"Fit: {self.ending}, cost {plain_number(self.cost, 4)} nat",
             table(("channel", "unit", "rms residual"), residuals, words=2),
             table(("parameter", "unit", "", "value", "95 %"), estimates, words=3),
             picture(
@@ -106,6 +113,6 @@ class Fit:
         )
 
     def __str__(self) -> str:
-        lines = [f"Fit: {self.status} after {self.steps} steps, cost {self.cost:.1f}"]
+        lines = [f"Fit: {self.ending}, cost {self.cost:.1f}"]
         lines += [f"  residual {c}: {s:.3g} rms" for c, s in self.noise.items()]
         return "\n".join(lines + [f"  {e}" for e in self.parameters])

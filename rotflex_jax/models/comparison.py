@@ -84,7 +84,7 @@ def default_labels(simulators: Sequence[Any]) -> tuple[str, ...]:
     >>> from rotflex_jax.effects import Coulomb
     >>> from rotflex_jax.joints import paper
     >>> default_labels([Model(paper())]), default_labels([Model(paper()), Model(paper() + Coulomb(at="hub"))])
-    (('simulated',), ('model 1', '+ coulomb at hub'))
+    (('simulated',), ('model 1', '+ Coulomb friction at hub'))
     """
     if len(simulators) == 1:
         return ("simulated",)

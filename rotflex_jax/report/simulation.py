@@ -134,7 +134,7 @@ def _content(simulation: Simulation) -> dict[str, Any]:
     return {
         "source": simulation.recording.source,
         "rows": rows,
-        "fitted": f"fitted before: {fit.status} after {fit.steps} steps" if fit else "taken as given",
+        "fitted": f"fitted before: {fit.ending}" if fit else "taken as given",
         "estimates": estimates,
         "runs": [p.on_page for p in _run_pictures(simulation)],
         "tests": simulation.residuals.sentences() if simulation.residuals else [],
