@@ -13,7 +13,7 @@ from rotflex_jax.discover.assessment import NATS_PER_SAMPLE, Grade, assess, grad
 from rotflex_jax.discover.end_state import end_state
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.labels import effect_label, sentence, with_titles
+from rotflex_jax.effects.labels import effect_label, effect_phrase, sentence, with_titles
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.parameters import Estimate, Specification
 from rotflex_jax.report.page import render, tone
@@ -111,6 +111,15 @@ def test_names_of_effects_are_nouns_of_the_field(monkeypatch) -> None:
     assert with_titles("coulomb_asymmetric at the hub, lag at input") == (
         "asymmetric Coulomb friction at the hub, input lag"
     )
+    # What has been named stays as it is, and an ordinary word is no name.
+    for text in (
+        "Cubic spring at the joint and Coulomb friction at the hub.",
+        "The spring at the joint hardens.",
+    ):
+        assert sentence(text) == with_titles(text) == text
+    for kind in CATALOG.values():
+        label = effect_phrase(kind.name, kind.ports[0])
+        assert with_titles(label) == label, label
     assert sentence("Coulomb friction at the hub explains it") == "Coulomb friction at the hub explains it."
     titles = [kind.title for kind in CATALOG.values()]
     assert len(set(titles)) == len(titles)

@@ -37,10 +37,17 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
     """
     console = Console(stderr=True, highlight=False)
     if not console.is_terminal:
-        yield lambda step: console.print(step, markup=False, soft_wrap=True)
+        yield lambda step: console.print(_named(step), markup=False, soft_wrap=True)
         return
     with console.status(title) as status:
-        yield lambda step: status.update(escape(step))
+        yield lambda step: status.update(escape(_named(step)))
+
+
+def _named(step: str) -> str:
+    """A line of progress with effects as they are called everywhere else."""
+    from rotflex_jax.effects.labels import with_titles  # long after `--help` was answered
+
+    return with_titles(step)
 
 
 def _errors(errors: Mapping[str, float], units: Mapping[str, str]) -> list[str]:

@@ -41,15 +41,22 @@ def effect_title(effect: str) -> str:
     return known.title if known else effect.replace("_", " ")
 
 
+# What may stand before a name in a list of effects; after any other word, "spring" or "delay" is that word.
+_BEFORE_A_NAME = re.compile(r"(?:^|[^\w\s]\s*|\b(?:and|or|from|refitting|scoring)\s)$")
+
+
 def with_titles(text: str) -> str:
     """A text in which effects are named by their nouns, in the place of the names that scripts use.
 
     >>> with_titles("+ coulomb at hub"), with_titles("lugre at the hub and delay at the input")
     ('+ Coulomb friction at hub', 'LuGre friction at the hub and input delay')
+    >>> with_titles("cubic spring at the joint"), with_titles("the spring at the joint hardens")
+    ('cubic spring at the joint', 'the spring at the joint hardens')
     """
 
     def noun(found: re.Match[str]) -> str:
-        return _placed(found[1], found[3], found[2] or "")
+        listed = "_" in found[1] or _BEFORE_A_NAME.search(text[: found.start()])
+        return _placed(found[1], found[3], found[2] or "") if listed else found[0]
 
     names = "|".join(sorted(map(re.escape, CATALOG), key=len, reverse=True))
     return re.sub(rf"\b({names}) at (the )?(\w+)", noun, text)
