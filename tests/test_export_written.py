@@ -86,7 +86,7 @@ def test_memory_has_its_slope_and_friction_is_named():
     ratio = linear.A[2:4, 4] / by_hand()[0][2:4, 1]
     np.testing.assert_allclose(ratio, 0.02 / 1.61, rtol=1e-12)
     assert [d.split(" at ")[0] for d in linear.dropped] == [
-        "constant (Coulomb) friction",
+        "Coulomb friction",
         "delay of the input",
     ]
 
