@@ -45,7 +45,7 @@ MEMORY = 1_500_000_000
 MAX_BYTES = 300_000_000
 """Limit that the reader is given [bytes]."""
 
-ALL_FAULTS = ("short", "constant_input", "constant", "saturated", "units")
+ALL_FAULTS = ("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped")
 """Faults of the signals are accepted, so that what is read gets as far as it can."""
 
 
@@ -117,6 +117,20 @@ def hdf5_seeds() -> list[bytes]:
                 group["soft"] = h5py.SoftLink("/theta")
         found.append(b"MATLAB 7.3 MAT-file".ljust(512) + out.getvalue()[512:])
     return found
+
+
+def xlsx_seeds() -> list[bytes]:
+    """Two sheets, the first one empty; with a line of units."""
+    import openpyxl
+
+    book = openpyxl.Workbook()
+    sheet = book.create_sheet("log")
+    sheet.append(list(columns()))
+    sheet.append(["s", "V", "rad", "rad"])
+    for row in zip(*columns().values(), strict=True):
+        sheet.append([float(x) for x in row])
+    book.save(out := io.BytesIO())
+    return [out.getvalue()]
 
 
 def parquet_seeds() -> list[bytes]:
@@ -334,6 +348,7 @@ FORMATS = {
     "mat": Format(".mat", mat_seeds, mutated_mat),
     "hdf5": Format(".mat", hdf5_seeds),
     "parquet": Format(".parquet", parquet_seeds),
+    "xlsx": Format(".xlsx", xlsx_seeds, mutated_npz),
     "model": Format(".json", model_seeds, text=True),
     "fleet": Format(".row", fleet_seeds, text=True),
     "command": Format(".line", command_seeds, mutated_command),

@@ -37,6 +37,7 @@ from .mechanism import (
     linearise as linearise,
     simulate as simulate,
 )
+from .models.comparison import compare_plot as compare_plot
 from .models.model import Model as Model
 from .models.series import Series as Series
 from .notebook import explore as explore, live as live

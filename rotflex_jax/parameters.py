@@ -180,4 +180,8 @@ class Estimate:
         if not self.free:
             return f"{self.name} = {self.value:.6g} {self.unit} (held)"
         low, high = self.ci95
+        if math.isnan(low) or math.isnan(high):
+            return (
+                f"{self.name} = {self.value:.6g} {self.unit}  (no interval: {self.note or 'not determined'})"
+            )
         return f"{self.name} = {self.value:.6g} {self.unit}  [{low:.4g}, {high:.4g}]"

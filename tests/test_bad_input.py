@@ -229,9 +229,9 @@ FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "missing": ("run.csv", lambda path: None, "does not exist"),
     "folder": ("run.csv", lambda path: path.mkdir(), "is a folder, but a recording is one file"),
     "ending": (
-        "run.xlsx",
+        "run.ods",
         lambda path: path.write_text("x"),
-        r"has the ending \.xlsx, but .*\.csv",
+        r"has the ending \.ods, but .*\.csv",
     ),
     "no ending": ("run", lambda path: path.write_text("x"), r"has the ending \(none\)"),
     "huge": ("run.csv", huge, r"has 2.1 GB, .* accept=\('huge',\)"),

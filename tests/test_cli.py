@@ -18,6 +18,7 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.cli import app, terminal
 from rotflex_jax.data.datasets import DATASETS
+from rotflex_jax.discover.assessment import assess
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.models.model import Model
@@ -281,7 +282,8 @@ def test_check_tells_what_is_in_a_file_and_refuses_a_wrong_sign(run, recorded, t
     status, _, err = run("check", write(tmp_path / "turned.csv", DEMO * [1, 1, 1, -1]))
     assert status == 2
     assert_one_sentence(err, "turned.csv", "negate the column of alpha")
-    status, out, _ = run("check", write(tmp_path / "room.csv", DEMO_WHOLE @ IN_THE_ROOM))
+    room = write(tmp_path / "room.csv", DEMO_WHOLE @ IN_THE_ROOM)
+    status, out, _ = run("check", room, "--accept", "absolute")
     assert status == 0 and "warning: Channel 'alpha' follows 'theta' one to one" in out
     assert "little for a search" not in out
 
@@ -331,6 +333,7 @@ class FakeSearch:
             where=[SimpleNamespace(statement="78 % of the error follows reversals")],
             to_dict=lambda: {"schema": 1, "verdict": "found"},
             report=self.report,
+            assessment=assess({"theta": 0.2}, {"theta": 0.1}, {"theta": 5e-4}, 0.0, 600),
         )
 
     @staticmethod

@@ -260,7 +260,7 @@ def test_discovered_chooses_within_the_training_data(monkeypatch: pytest.MonkeyP
     assert last.start + last.duration == pytest.approx(boundary)
     assert table.test[0].start == pytest.approx(boundary)
     row = table["discovered"]
-    assert (row.note, row.parameters) == ("added coulomb at hub", 6)
+    assert (row.note, row.parameters) == ("added Coulomb friction at hub", 6)
     assert row.rmse["theta"] < 1.1 * table.noise_floor["theta"]
 
 

@@ -69,8 +69,8 @@ def test_a_discovery_shows_verdict_rounds_errors_and_doubts() -> None:
     text = read(found._repr_html_())
     for expected in (
         "Found, but not distinguished from others",
-        "coulomb at hub",
-        "cannot distinguish it from stribeck at hub",
+        "Coulomb friction at hub",
+        "cannot distinguish it from Stribeck friction at the hub",
         "τ = −stiffness · position³",
         "78 % of the theta error",
         "sensor noise",
@@ -153,7 +153,7 @@ def test_the_staircase_grows_while_a_search_runs() -> None:
         follow(milestone(label, ["theta", "alpha"], units, np.array(errors), floor))
         follow("refitting")  # too soon after a milestone to be drawn
     assert len(handle.shown) == 2 and "<search>" in read(handle.shown[-1])
-    assert follow.labels == ["as it is", "+ dead zone at input"]
+    assert follow.labels == ["as it is", "+ input dead zone"]
     np.testing.assert_allclose(follow.errors["theta [deg]"], np.rad2deg([0.02, 0.002]))
 
 

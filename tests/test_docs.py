@@ -90,6 +90,13 @@ def in_the_room() -> rf.Recording:
     return rf.Recording(u=demo.u, y=demo.y @ np.array([[1.0, 1.0], [0.0, 1.0]]), Ts=demo.Ts)
 
 
+def swapped() -> rf.Recording:
+    """The demo recording with its columns in the wrong order, from a table."""
+    demo = rf.data.demo_recording()
+    named = {"t": demo.t, "voltage": demo.u, "theta": demo.y[:, 1], "alpha": demo.y[:, 0]}
+    return rf.load(pd.DataFrame(named))
+
+
 def doubted(recording: rf.Recording) -> None:
     """A warning, which is no refusal, as one."""
     raise rf.InputError(next(str(f) for f in recording.findings if f.severity == "warning"))
@@ -120,6 +127,8 @@ RAISED: dict[str, Callable[[], object]] = {
     "degrees by unit": lambda: rf.load(lines(lambda rows: [rows[0], "s,V,deg,deg", *rows[1:]])),
     "two names in one": lambda: rf.load(file(), outputs="theta,alpha"),
     "in the room": lambda: doubted(in_the_room()),
+    "counts": lambda: rf.load(file(theta=np.round(4096 / 6.28 * GOOD["theta"]))),
+    "swapped": swapped,
     "milliseconds by name": lambda: rf.load(file(t=None, t_ms=1000 * GOOD["t"]), time="t_ms"),
     "no time": lambda: rf.load(file(t=None)),
     "no header": lambda: rf.load(lines(lambda rows: rows[1:])),
@@ -217,7 +226,7 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
 
 
 def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
-    from rotflex_jax.discover import end_state, result, selection
+    from rotflex_jax.discover import assessment, result, selection
 
     text = (DOCS / "method.md").read_text()
     rows = dict(re.findall(r"\| ([\d.]+) \| `selection\.(\w+)` \|", text))
@@ -226,7 +235,7 @@ def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
     }
     assert len(rows) == 4
     assert f"within {result.NEAR_FLOOR:g} times the noise" in text
-    assert f"less than {end_state.NATS_PER_SAMPLE:g} nat" in text
+    assert f"less than {assessment.NATS_PER_SAMPLE:g} nat" in text
     assert selection.SEPARATE_Z == 2.0 and "less than two standard deviations" in text
 
 

@@ -14,7 +14,7 @@ from rotflex_jax.notebook.explorer import Explorer
 
 pytest.importorskip("ipywidgets")
 
-FRICTION, SPRING = "coulomb at hub", "cubic spring at joint"
+FRICTION, SPRING = "Coulomb friction at hub", "cubic spring at joint"
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def explorer(truth: rf.Mechanism, recording: rf.Recording) -> Explorer:
 
 def test_it_begins_with_the_model_as_given(explorer: Explorer) -> None:
     assert explorer.switches[FRICTION].value and not explorer.switches[SPRING].value
-    assert "joint spring" not in " ".join(explorer.switches) and "viscous at hub" in explorer.switches
+    assert "joint spring" not in " ".join(explorer.switches) and "viscous damping at hub" in explorer.switches
     assert explorer.errors == explorer.given
     # The truth is as good as the sensor, whose noise is 5e-4 rad: a candidate that is off changes nothing.
     assert max(explorer.errors.values()) < 1.5e-3

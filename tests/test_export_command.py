@@ -99,7 +99,7 @@ def test_other_forms(run, saved):
     assert r"\mathit{level}" in run("export", saved, "--to", "latex")[1]
     linear = json.loads(run("export", saved, "--to", "statespace", "--Ts", "0.002")[1])
     assert linear["Ts"] == 0.002 and np.array(linear["A"]).shape == (4, 4)
-    assert linear["dropped"] == ["constant (Coulomb) friction at hub has no slope at rest"]
+    assert linear["dropped"] == ["Coulomb friction at hub has no slope at rest"]
 
 
 def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):

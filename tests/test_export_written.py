@@ -86,8 +86,8 @@ def test_memory_has_its_slope_and_friction_is_named():
     ratio = linear.A[2:4, 4] / by_hand()[0][2:4, 1]
     np.testing.assert_allclose(ratio, 0.02 / 1.61, rtol=1e-12)
     assert [d.split(" at ")[0] for d in linear.dropped] == [
-        "constant (Coulomb) friction",
-        "delay of the input",
+        "Coulomb friction",
+        "input delay",
     ]
 
 
@@ -153,7 +153,7 @@ def test_matrices_and_numbers_are_in_text_and_latex():
     assert r"$0.0312$ $\mathrm{N\,m}$" in tex and r"gear\_ratio" in tex
     for opening, closing in (("{", "}"), (r"\[", r"\]"), (r"\begin", r"\end")):
         assert tex.count(opening) == tex.count(closing)
-    assert plain.index("delay of the input") < plain.index("Coulomb")  # in the order of the signal
+    assert plain.index("input delay") < plain.index("Coulomb")  # in the order of the signal
 
 
 def test_what_is_switched_off_is_not_written():

@@ -297,16 +297,16 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page) -> None:
 def test_what_a_reader_must_learn_is_there(page, discovery) -> None:
     text = read(page).text
     assert Verdict.AMBIGUOUS.shown.headline in text
-    assert "Coulomb at hub and cubic spring at joint explain the recording." in text
+    assert "Coulomb friction at hub and cubic spring at joint explain the recording." in text
     assert "The hub meets a constant friction torque of 0.03 N m." in text
     assert "τ = −stiffness · position³" in text
-    assert "these recordings cannot distinguish it from stribeck at hub" in text
+    assert "these recordings cannot distinguish it from Stribeck friction at the hub" in text
     assert "0.03000 N m" in text
     assert "0.02980 … 0.03020" in text
     assert "40.00 N m/rad³" in text
     assert "theta [deg]" in text
     # 0.05 sin: 0.0354 rad rms is 2.03 deg, 71 times the noise of 5e-4.
-    assert re.search(r"baseline 2\.0\d × 7[01]", text)
+    assert re.search(r"baseline 2\.0\d × 7[01]\.\d\d", text)
     assert "78 % of the theta error lies within 80 ms after the hub reverses" in text
     assert "Not excited means" in text
     assert "1 of 5 candidates" in text

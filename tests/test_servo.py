@@ -335,7 +335,7 @@ def test_the_command_line_reads_a_goal_in_radians(tmp_path, capsys, servo_record
     r = servo_recordings[2]
     log = np.column_stack([r.t, r.u, r.y[:, 0]])
     np.savetxt(tmp_path / "log.csv", log, delimiter=",", header="t,goal,theta", comments="")
-    columns = Columns("goal", None, False, None, None, None, mechanism=xl330_pendulum())
+    columns = Columns(input="goal", mechanism=xl330_pendulum())
     read = columns.load(tmp_path / "log.csv")
     assert (read.input_name, read.input_unit, read.units) == ("goal", "rad", ("rad",))
     with pytest.raises(SystemExit) as left:

@@ -10,9 +10,9 @@ from rotflex_jax.batch import storage
 from rotflex_jax.batch.result import Fleet, RecordingRow
 from rotflex_jax.discover.result import NEAR_FLOOR
 from rotflex_jax.discover.verdict import Verdict
-from rotflex_jax.effects.labels import effect_label, effect_title
+from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.text.colours import FAINT, FINAL, MUTED
-from rotflex_jax.text.numbers import plain_number, ratio, readable, together
+from rotflex_jax.text.numbers import multiple, plain_number, ratio, readable, together
 from rotflex_jax.text.plotting import FigureRegistry, blank, by_section, legend_above, plain_ticks
 from rotflex_jax.text.templates import fill_template
 
@@ -143,7 +143,7 @@ def _summary(fleet: Fleet) -> str:
         return ", ".join(said) + "."
     (effect, port), (alone, among) = often
     count = f"{alone + among} of {len(fleet.rows)}"
-    return f"{', '.join(said)}. Most often: {effect_title(effect)} at {port}, in {count}."
+    return f"{', '.join(said)}. Most often: {effect_label(effect, port)}, in {count}."
 
 
 def _row(row: RecordingRow, fleet: Fleet) -> dict[str, Any]:
@@ -155,7 +155,7 @@ def _row(row: RecordingRow, fleet: Fleet) -> dict[str, Any]:
             {
                 "before": plain_number(None if before is None else readable(before, unit)[0]),
                 "after": plain_number(None if after is None else readable(after, unit)[0]),
-                "times": plain_number(times, 2),
+                "times": multiple(times) or "–",
                 "ok": times < NEAR_FLOOR,
             }
         )

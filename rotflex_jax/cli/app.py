@@ -91,6 +91,7 @@ def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.Jso
     _discover(by_name.joint("paper"), [train], [test], report, json_file)
 
 
+@given.reads_files
 def discover(
     files: given.Files,
     joint: given.JointName = "paper",
@@ -98,18 +99,14 @@ def discover(
     test: given.Test = None,
     split: given.Share = None,
     calibrate: given.Calibrate = 2.0,
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
     save_model: given.ModelFile = None,
     each: given.Each = False,
     scheduler: given.Scheduler = None,
     workers: given.Workers = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Find the effects that the model lacks, with evidence on data the fit never saw.
 
@@ -121,21 +118,20 @@ def discover(
     given.check_distinct(files, [*(held_out or []), *(test or [])])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
-    model, options = by_name.model(joint), (degrees, Ts, time_column, accept)
-    columns = given.Columns(input_column, output_columns, *options, model.mechanism)
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers)
         return
-    if len(files) > 1 and not held_out and split is None:
-        train, validation = [columns.load(file) for file in files], []
-    else:
-        train, validation = columns.load_parts(files, held_out or [], share)
-    no_say = [columns.load(file) for file in test or []]
+    train, validation = columns.load_all(files), columns.load_all(held_out or [])
+    if not validation and (len(train) == 1 or split is not None):
+        train, validation = map(list, zip(*(recording.split(share) for recording in train), strict=True))
+    no_say = columns.load_all(test or [])
     _discover(
         model, train, validation, report, json_file, save_model, test=no_say, calibrate_seconds=calibrate
     )
 
 
+@given.reads_files
 def compare(
     files: given.Files,
     methods: given.Methods = None,
@@ -143,14 +139,10 @@ def compare(
     joint: given.JointName = "paper",
     held_out: given.HeldOut = None,
     split: given.Share = None,
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Compare methods on the same data by their free runs over held-out data."""
     share = given.check_split(split, held_out or [])
@@ -160,13 +152,12 @@ def compare(
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."
         )
-    mechanism, names = by_name.joint(joint), methods if methods is None else methods.split(",")
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
+    names = methods if methods is None else methods.split(",")
     from rotflex_jax.compare import QUICK
     from rotflex_jax.compare.method import selected_methods
 
     wanted = selected_methods(QUICK if quick else names)  # an unknown one is refused before any file is read
-    options = (degrees, Ts, time_column, accept)
-    columns = given.Columns(input_column, output_columns, *options, mechanism)
     train, test = columns.load_parts(files, held_out or [], share)
     terminal.print_findings([*train, *test])
     from rotflex_jax.runtime.xla import enable_fast_start
@@ -175,7 +166,7 @@ def compare(
     import rotflex_jax as rf
 
     with terminal.progress("Comparing") as step:
-        result = rf.compare(train, wanted, mechanism=mechanism, test=test, progress=step)
+        result = rf.compare(train, wanted, mechanism=model, test=test, progress=step)
     with _each_by_itself() as attempt:
         attempt(lambda: _give(result, terminal.print_comparison, json_file))
         attempt(lambda: _report(result, report, json_file))

@@ -48,24 +48,21 @@ def data_fetch(
             terminal.message(str(path))
 
 
+@given.reads_files
 def check(
     files: given.Files,
     joint: given.JointName = "paper",
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Say what is in a recording and what is wrong with it; takes seconds."""
     given.check_distinct(files, [])
+    joint = given.joint_for(files, joint)
     model = by_name.model(joint)
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    model, columns = columns.of(model)
     from rotflex_jax.fit.signs import check_signs
 
-    for file in files:
-        recording = columns.load(file)
+    for name, recording in ((str(file), r) for file in files for r in columns.load_all([file])):
         terminal.print_recording(recording)
         if recording.duration < SHORTEST_FOR_SEARCH:
             terminal.message(
@@ -75,5 +72,5 @@ def check(
         try:
             check_signs(model, [recording])
         except InputError as error:
-            raise InputError(f"{file}: {error}") from None
+            raise InputError(f"{name}: {error}") from None
         terminal.message(f"The signs of {' and '.join(model.mechanism.channels)} are those of {joint}.")

@@ -15,6 +15,7 @@ from rotflex_jax.text.numbers import digits
 FIGURE_ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 
 
+@given.reads_files
 def experiment(
     fit: given.AmbiguousFiles,
     between: given.Between,
@@ -28,13 +29,9 @@ def experiment(
     add: given.FoundBefore = None,
     save: given.InputFile = None,
     plot: given.PlotFile = None,
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
     json_file: given.JsonFile = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Design the input that distinguishes two effects which a recording cannot."""
     given.check_distinct(fit, [])
@@ -48,7 +45,7 @@ def experiment(
     if given.STDOUT in (save, plot):
         raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
     model = by_name.model(joint, add or ())
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    model, columns = columns.of(model)
     first, second = (by_name.effect(text) for text in between)
     if (first.name, first.at) == (second.name, second.at):
         raise InputError(f"--between was given {between[0]} twice, but needs two effects; name another.")

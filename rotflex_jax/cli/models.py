@@ -8,6 +8,7 @@ from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 
 
+@given.reads_files
 def simulate(
     file: given.OneFile,
     joint: given.JointName = "paper",
@@ -15,19 +16,17 @@ def simulate(
     fit: given.FittedBefore = None,
     save: given.SimulationFile = None,
     save_model: given.ModelFile = None,
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
+    report: given.SimulationReport = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Simulate a recording in free run and compare with what was measured."""
     given.check_distinct([file], fit or [])
     for target in (save, save_model):
         given.check_writable(json_file=target)
+    given.check_writable(folder=report)
     model = by_name.model(joint, add or ())
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept, model.mechanism)
+    model, columns = columns.of(model)
     recording = columns.load(file)
     train = [columns.load(other) for other in fit or []]
     terminal.print_findings([recording, *train])
@@ -38,6 +37,7 @@ def simulate(
     from rotflex_jax.export import Saved, save as save_to
 
     saved = Saved(model, Ts=recording.Ts, n_init=recording.n_init)
+    fitted = None
     if train:
         with terminal.progress("Fitting"):
             fitted = rf.fit(model, train)
@@ -55,6 +55,12 @@ def simulate(
         terminal.save_simulation(save, recording, dict(zip(units, y_hat.T, strict=True)))
     if save_model is not None:
         save_to(saved, save_model)
+    if report is not None:
+        from rotflex_jax.report.simulation import tested, write_simulation
+
+        with terminal.progress("Writing the report"):
+            page = write_simulation(tested(recording, model, y_hat, fitted), report)
+        terminal.message(f"Report: {page}")
 
 
 def export(

@@ -10,6 +10,7 @@ from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 
 
+@given.reads_files
 def reproduce(
     out: given.PageFolder = Path("rotflex-reproduce"),
     data: given.PaperData = None,
@@ -21,13 +22,9 @@ def reproduce(
     joint: given.JointName = "paper",
     held_out: given.HeldOut = None,
     split: given.Share = None,
-    input_column: given.InputColumn = None,
-    output_columns: given.OutputColumns = None,
-    degrees: given.Degrees = False,
-    Ts: given.SamplingPeriod = None,
-    time_column: given.TimeColumn = None,
-    accept: given.Accept = None,
     json_file: given.JsonFile = None,
+    *,
+    columns: given.Columns,
 ) -> None:
     """Run the experiment of the paper this started from: its figures, its model, and better ones."""
     from rotflex_jax.reproduce.settings import Settings
@@ -37,10 +34,13 @@ def reproduce(
         return
     named = {"scenario": scenario, "seed": seed, "grey_box": grey_box or None}
     settings = Settings().replace(_pairs(changes or []) | {k: v for k, v in named.items() if v is not None})
+    if columns.intersample != "held":
+        raise InputError(
+            "--intersample was given, but the experiment of the paper holds its input; leave it out."
+        )
     share = given.check_split(split, held_out or [])
     given.check_writable(json_file=json_file, folder=out)
     mechanism = by_name.joint(joint)
-    columns = given.Columns(input_column, output_columns, degrees, Ts, time_column, accept)
     parts = _recordings(columns, data or [], held_out or [], share)
     if parts and joint == "paper" and data == ["rotflex"]:
         mechanism = by_name.joint("quanser_2002")  # the laboratory's own constants

@@ -54,10 +54,17 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
     """
     console = SafeConsole(stderr=True, highlight=False)
     if not console.is_terminal:
-        yield lambda step: console.print(step, markup=False, soft_wrap=True)
+        yield lambda step: console.print(_named(step), markup=False, soft_wrap=True)
         return
     with console.status(title) as status:
-        yield lambda step: status.update(cell(step))
+        yield lambda step: status.update(cell(_named(step)))
+
+
+def _named(step: str) -> str:
+    """A line of progress with effects as they are called everywhere else."""
+    from rotflex_jax.effects.labels import with_titles  # long after `--help` was answered
+
+    return with_titles(step)
 
 
 def _errors(errors: Mapping[str, float], units: Mapping[str, str]) -> list[str]:
@@ -91,11 +98,13 @@ def estimate_line(name: str, estimate: Any) -> str:
 def print_discovery(result: Any) -> None:
     """Verdict, rounds, errors on validation and test data, and where the model failed."""
     from rotflex_jax.discover.tables import error_lists, status_sentence
+    from rotflex_jax.effects.labels import effect_label, with_titles
 
     console = output()
     units = {name: unit_of(result.validation[0], name) for name in result.baseline.held_out_rmse}
     console.print(result.verdict.label.upper(), style="bold", markup=False)
-    console.print(result.sentence, markup=False)
+    console.print(with_titles(result.sentence), markup=False)
+    console.print(f"What decided: {result.assessment.criterion}.", markup=False)
     for count, added in enumerate(result.rounds, start=1):
         console.print(f"\nRound {count}: {added.sentence}", markup=False)
         if added.equation:
@@ -103,7 +112,7 @@ def print_discovery(result: Any) -> None:
         for name, estimate in added.parameters.items():
             console.print(f"  {estimate_line(name, estimate)}", markup=False)
         console.print(f"  {status_sentence(added)}", markup=False)
-    names = ["baseline", *(f"+ {added.effect} at {added.port}" for added in result.rounds)]
+    names = ["baseline", *(f"+ {effect_label(added.effect, added.port)}" for added in result.rounds)]
     floor, seconds = ("noise floor of the sensor", result.noise_floor), digits(result.baseline.window_seconds)
     for title, note, errors in error_lists(result):
         console.print(f"\n{title}", style="bold", markup=False)

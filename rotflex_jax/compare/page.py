@@ -6,7 +6,7 @@ from typing import Any
 
 from rotflex_jax.compare.figures import FIGURES, line_styles
 from rotflex_jax.compare.table import Comparison, Row
-from rotflex_jax.text.numbers import plain_number, readable, together
+from rotflex_jax.text.numbers import multiple, plain_number, readable, together
 from rotflex_jax.text.plotting import by_section
 from rotflex_jax.text.templates import as_json, fill_template, write_files
 
@@ -68,9 +68,7 @@ def _summary(comparison: Comparison) -> str:
     for c, u in units.items():
         value, read = readable(best.rmse[c], u)
         floor = comparison.noise_floor.get(c, 0.0)
-        times = (
-            f", {plain_number(best.rmse[c] / floor, 2)} times the noise of the sensor" if floor > 0 else ""
-        )
+        times = f", {multiple(best.rmse[c] / floor)} times the noise of the sensor" if floor > 0 else ""
         said.append(f"{c} {plain_number(value)} {read}{times}")
     others = [row.method for row in comparison.best_of_each_family[1:]]
     tail = f" Best of the other families: {', '.join(others)}." if others else ""

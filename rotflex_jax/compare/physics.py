@@ -11,6 +11,7 @@ from rotflex_jax.compare.method import Fitted, Progress
 from rotflex_jax.discover import discover
 from rotflex_jax.discover.learned_torque import learn_torque
 from rotflex_jax.discover.likelihood import MAX_PROCESS_NOISE_SHARE
+from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.fit import fit
 from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports
 from rotflex_jax.models.model import Model
@@ -102,7 +103,7 @@ class Discovered:
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Discover on parts of the training recordings, then fit to all of each."""
         result = discover(model, *split_for_validation(train, self.share), progress=say)
-        found = ", ".join(f"{r.effect} at {r.port}" for r in result.rounds)
+        found = ", ".join(effect_label(r.effect, r.port) for r in result.rounds)
         note = f"added {found}" if found else f"added nothing ({result.verdict.replace('_', ' ')})"
         return fit_mechanism(result.model, train, say, note=note)
 

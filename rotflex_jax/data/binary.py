@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from rotflex_jax.data.matlab import variables_of_mat
+from rotflex_jax.data.matlab import MatlabObject, variables_of_mat
 from rotflex_jax.data.parquet import columns_of_parquet
 from rotflex_jax.data.tables import MAX_BYTES, Table, check_size, distinct, unreadable
 from rotflex_jax.errors import InputError, optional
@@ -36,7 +36,18 @@ def table_from_mat(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     with path.open("rb") as file:
         is_hdf5 = b"\x89HDF\r\n\x1a\n" in file.read(1024)  # MATLAB 7.3 puts 512 bytes in front
     values = _read_hdf5(path, max_bytes) if is_hdf5 else read_mat(path, max_bytes)
-    return Table(path.name, dict(_flat(values)))
+    return Table(path.name, dict(_flat(values)), objects=dict(_objects(values)))
+
+
+def _objects(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Objects of MATLAB by dotted name, with their classes."""
+    found: list[tuple[str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, MatlabObject):
+            found.append((prefix + key, value.kind))
+        elif isinstance(value, Mapping):
+            found += _objects(value, f"{prefix}{key}.")
+    return found
 
 
 DEEPEST_GROUP = 50
@@ -107,6 +118,12 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Shaped
         if isinstance(value, Mapping):
             found += _flat(value, f"{name}.")
             continue
+        if isinstance(value, MatlabObject):
+            continue
+        parts = _parts(value)
+        if parts is not None:  # an array of structures or of cells, each with leaves of its own
+            found += _flat(parts, name)
+            continue
         try:
             array = np.asarray(value)
         except ValueError:  # cells of different length
@@ -120,6 +137,16 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Shaped
         elif array.ndim <= 2 and array.size:
             found.append((name, array.ravel()))
     return found
+
+
+def _parts(value: Any) -> dict[str, Any] | None:
+    """Members of an array of structures, or of cells that hold arrays, by index; None for anything else."""
+    if isinstance(value, np.ndarray) and value.dtype == object and value.ndim == 1:
+        value = list(value)
+    if not isinstance(value, list):
+        return None
+    nested = [isinstance(v, Mapping | list) or (isinstance(v, np.ndarray) and v.ndim > 0) for v in value]
+    return {f"[{k}]": v for k, v in enumerate(value) if nested[k]} if any(nested) else None
 
 
 def table_from_npz(path: Path, max_bytes: int = MAX_BYTES) -> Table:

@@ -17,11 +17,20 @@ import numpy as np
 from jaxtyping import Real
 
 from rotflex_jax.data.binary import table_from_frame, table_from_mat, table_from_npz, table_from_parquet
-from rotflex_jax.data.tables import MAX_BYTES, Table, check_size, table_from_text, unreadable
+from rotflex_jax.data.resampling import resampled
+from rotflex_jax.data.spreadsheet import table_from_xlsx
+from rotflex_jax.data.tables import (
+    MAX_BYTES,
+    Table,
+    check_size,
+    name_and_unit,
+    table_from_text,
+    unreadable,
+)
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.listing import listed
-from rotflex_jax.recording.quality import Finding, acceptable
+from rotflex_jax.recording.quality import Finding, acceptable, whole_numbers
 from rotflex_jax.recording.samples import even_spacing, finite, real_numbers, sampling_period
 from rotflex_jax.text.files import write_file
 
@@ -32,6 +41,7 @@ READERS: dict[str, Callable[[Path, int], Table]] = {
     ".mat": table_from_mat,
     ".npz": table_from_npz,
     ".parquet": table_from_parquet,
+    ".xlsx": table_from_xlsx,
 }
 
 
@@ -171,6 +181,23 @@ def _first(source: Any, names: Sequence[str]) -> Any:
     return next((v for n in names if (v := getattr(source, n, None)) is not None), None)
 
 
+OTHER_NAMES = {"t": ("time",), "theta": ("θ",), "alpha": ("α",)}
+"""What the columns of the joint may be called as well."""
+
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+"""Unit of a time -> seconds."""
+
+TIME_WORDS = {
+    "sec": "s",
+    "second": "s",
+    "seconds": "s",
+    "msec": "ms",
+    "milliseconds": "ms",
+    "µs": "us",
+    "μs": "us",
+}
+"""Other ways to write them."""
+
 ANGLE_UNITS = {
     "rad": {"rad", "rads", "radian", "radians"},
     "deg": {"deg", "degs", "degree", "degrees", "°"},
@@ -188,16 +215,19 @@ def load(
     accept: str | Sequence[str] = (),
     units: Mapping[str, str] | None = None,
     max_bytes: int = MAX_BYTES,
+    counts: float | Mapping[str, float] | None = None,
+    arm_absolute: bool = False,
+    time_unit: str | None = None,
+    resample: float | str | None = None,
 ) -> Recording:
-    """Reads a recording and checks it; nothing is repaired.
+    """Reads a recording and checks it; nothing is repaired unless it is asked for by name.
 
-    Text (.csv, .tsv, .txt; any delimiter), MATLAB (.mat of any version), NumPy (.npz), Parquet, or
-    a pandas DataFrame. Columns `t,voltage,theta,alpha` in seconds, volts and radians unless other
-    names are given. In .mat and .npz, a matrix `log` gives the columns `log[0]`, `log[1]`, and a
+    Text (.csv, .tsv, .txt; any delimiter), MATLAB (.mat of any version), NumPy (.npz), Parquet,
+    spreadsheets (.xlsx), or a pandas DataFrame. Columns `t,voltage,theta,alpha` in seconds, volts and
+    radians unless other names are given; capitals and a unit behind the name, as in `Theta [deg]`, are
+    understood. In .mat and .npz, a matrix `log` gives the columns `log[0]`, `log[1]`, and a
     structure `log` with a field `u` the column `log.u`. An object that has `u`, `y` and `sampling_time`,
     such as those of `nonlinear_benchmarks`, is taken as it is, with the channels named in `outputs`.
-
-    Not for unevenly sampled data: resample them first.
 
     Args:
         source: path, DataFrame, or an object with `u` and `y`.
@@ -209,6 +239,12 @@ def load(
         accept: faults to accept by name, such as `saturated`; see `Recording`.
         units: channel to unit, where it is not rad; the column of the input to its unit, where that is not V.
         max_bytes: largest size of the file, and of what it unpacks to [bytes].
+        counts: counts of one turn, where the outputs are the counts of an encoder; or a mapping of channel to
+            counts, the others being angles.
+        arm_absolute: whether alpha is the angle of the arm in the room, from which theta is then subtracted.
+        time_unit: of the time, "s", "ms" or "us"; what the header says, else seconds.
+        resample: sampling period to have [s], or "auto" for the usual one, where times are uneven: the
+            input is held, outputs follow straight lines, and a finding says what was done.
 
     Returns:
         The recording.
@@ -223,52 +259,69 @@ def load(
     Recording(100 samples, 2 s at 50 Hz, voltage [V] to theta [rad], DataFrame)
     >>> load(frame, input="volts", outputs="theta", units={"volts": "rad"})
     Recording(100 samples, 2 s at 50 Hz, volts [rad] to theta [rad], DataFrame)
+    >>> turned = pd.DataFrame({"Time [ms]": 20 * k, "Voltage [V]": np.sin(k), "Theta [deg]": np.cos(k)})
+    >>> load(turned, outputs="theta").y[0]
+    array([0.01745329])
     """
     accepted = acceptable(accept)
     if is_foreign(source):
         names = list(outputs) if isinstance(outputs, Mapping) else outputs
         return from_foreign(source, names, units, Ts, accepted)
     table = read_table(source, sys.maxsize if "huge" in accepted else max_bytes)
-    u_name = "voltage" if input is None else input
-    chosen = _outputs(outputs)
+    u_name = table.find("voltage" if input is None else input)
+    chosen = {
+        channel: table.find(name, *OTHER_NAMES.get(name, ())) for channel, name in _outputs(outputs).items()
+    }
     if u_name in chosen.values():
         raise InputError(
             f"{table.label}: the column {u_name!r} was given as input and as output, but it can be "
             "only one; correct input= or outputs=."
         )
-    stamps = [] if Ts is not None and time is None else [(time or "t", "time=")]
+    clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
+    stamps = [] if Ts is not None and time is None else [(clock, "time=")]
     table.check([(u_name, "input="), *((name, "outputs=") for name in chosen.values()), *stamps])
     u = _column(table, u_name, "input=", {"mv": "volts"})
+    per_turn = _counts(counts, tuple(chosen), degrees)
     y = {}
     for channel, name in chosen.items():
-        y[channel] = _column(table, name, "outputs=", {})
-        _check_angle_unit(table, name, degrees)
-        if len(y[channel]) != len(u):
+        values = _column(table, name, "outputs=", {})
+        y[channel] = _angle(table, channel, name, values, degrees, per_turn.get(channel), accepted)
+        if len(values) != len(u):
             raise InputError(
                 f"{table.label}: {u_name!r} has {len(u)} samples and {name!r} has "
-                f"{len(y[channel])}, but they must be measured together; cut both to the same ones."
+                f"{len(values)}, but they must be measured together; cut both to the same ones."
             )
-    start, period = _timing(table, time, Ts, len(u), "units" in accepted)
+    if arm_absolute:
+        y = _deflection(y)
+    remarks: list[Finding] = []
     together = np.column_stack(list(y.values()))
+    if resample is None:
+        start, period = _timing(table, clock, time, Ts, time_unit, len(u), "units" in accepted)
+    else:
+        t = _stamps(table, clock, Ts, time_unit, len(u), "units" in accepted)
+        at = f"{table.label}: the time {clock!r}", table.where, table.first
+        start, period, u, together, told = resampled(t, u, together, resample, *at)
+        remarks.append(told)
     try:
-        other = (units or {}).get(u_name)
+        other = (units or {}).get(u_name) or _input_unit(table, u_name)
         recording = Recording(
             u=u,
-            input_name="voltage" if other is None else u_name,
+            input_name="voltage" if other is None else name_and_unit(u_name)[0],
             input_unit=other or "V",
-            y=np.deg2rad(together) if degrees else together,
+            y=together,
             Ts=period,
             channels=tuple(y),
             units=tuple((units or {}).get(channel, "rad") for channel in y),
             source=table.label,
             start=start,
             accept=accepted,
+            remarks=remarks,
         )
     except InputError as error:
         raise InputError(f"{table.label}: {error}") from error
     for finding in recording.findings:
-        # Arrays come from a program that knows its units; the units of a file are less certain.
-        if finding.kind == "units" and "units" not in accepted:
+        # Arrays come from a program that knows what they are; the columns of a file are less certain.
+        if finding.kind in ("units", "absolute", "swapped") and finding.kind not in accepted:
             raise InputError(f"{table.label}: {finding.message}")
     if table.cut:  # said of the file, not of parts of the recording
         cut = Finding("cut", [*table.columns][-1], table.cut, "note")
@@ -322,7 +375,7 @@ def _column(table: Table, name: str, argument: str, wrong: Mapping[str, str]) ->
     for unit in _words(table, name) & set(wrong):
         raise InputError(
             f"{label} is in {unit} by its {_unit_source(name, unit)}, but {wrong[unit]} are needed; "
-            f"convert and rename it{', or leave it out and give Ts=' if unit == 'ms' else ''}."
+            + ("pass time_unit='ms'." if unit == "ms" else "convert and rename it.")
         )
     numbers = real_numbers(values, label, table.where, table.first)
     finite(numbers, label, table.where, table.first)
@@ -339,6 +392,77 @@ def _unit_source(name: str, unit: str) -> str:
     return "name" if unit in name.lower() else "line of units"
 
 
+def _input_unit(table: Table, name: str) -> str | None:
+    """The unit of the input where the file says that it is another than volts."""
+    unit = name_and_unit(name)[1] or table.units.get(name, "").strip(" []()")
+    if not unit and "current" in _words(table, name):
+        return "A"
+    return None if unit.lower() in ("", "v", "volt", "volts", "-", "–", "1") else unit
+
+
+def _counts(counts: Any, channels: Sequence[str], degrees: bool) -> dict[str, float]:
+    """Channel -> counts of one turn."""
+    if counts is None:
+        return {}
+    each: dict[str, Any] = dict(counts) if isinstance(counts, Mapping) else dict.fromkeys(channels, counts)
+    if degrees and not isinstance(counts, Mapping):
+        raise InputError(
+            f"Arguments counts={counts} and degrees=True were both given, but a column holds one of the two; "
+            "give one, or the counts of the channels that have them, such as counts={'theta': 4096}."
+        )
+    for channel, value in each.items():
+        if channel not in channels:
+            raise InputError(
+                f"Argument `counts` names the channel {channel!r}, but the recording has "
+                f"{', '.join(channels)}; name one of these."
+            )
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value < 1e12:
+            raise InputError(
+                f"Argument `counts` must be the counts of one turn, a number from 1 on, but is {value!r}; "
+                "give for instance 4096, four times the lines of an encoder that is counted at every edge."
+            )
+    return {channel: float(value) for channel, value in each.items()}
+
+
+def _angle(
+    table: Table,
+    channel: str,
+    name: str,
+    values: Real[np.ndarray, " N"],
+    degrees: bool,
+    counts: float | None,
+    accepted: Sequence[str],
+) -> Real[np.ndarray, " N"]:
+    """An output in radians: from counts, from degrees, or as it is."""
+    if counts is not None:
+        return values * (2 * np.pi / counts)
+    behind = set(re.split(r"[^a-z°]+", name_and_unit(name)[1].lower()))
+    if behind & ANGLE_UNITS["deg"]:  # the header says so, right behind the name
+        degrees = True
+    else:
+        _check_angle_unit(table, name, degrees)
+    if degrees and whole_numbers(values) and "units" not in accepted:
+        # Of a joint, in degrees: no encoder is so coarse, and no arm bends so far.
+        most = 90.0 if channel == "alpha" else 1000.0
+        if np.ptp(values) > most:
+            raise InputError(
+                f"{table.label}: column {name!r} holds whole numbers from {values.min():g} to "
+                f"{values.max():g}, as the counts of an encoder are, but degrees=True was given; give the "
+                "counts of one turn in its place, counts=4096 for instance, or accept=('units',)."
+            )
+    return np.deg2rad(values) if degrees else values
+
+
+def _deflection(y: dict[str, Real[np.ndarray, " N"]]) -> dict[str, Real[np.ndarray, " N"]]:
+    """The arm's angle in the room as its deflection from the hub."""
+    if not {"theta", "alpha"} <= set(y):
+        raise InputError(
+            f"Argument arm_absolute=True needs the channels theta and alpha, but the outputs are "
+            f"{', '.join(y)}; leave it out, or name both."
+        )
+    return {channel: x - y["theta"] if channel == "alpha" else x for channel, x in y.items()}
+
+
 def _check_angle_unit(table: Table, name: str, degrees: bool) -> None:
     given, other = ("deg", "rad") if degrees else ("rad", "deg")
     words = _words(table, name)
@@ -350,32 +474,57 @@ def _check_angle_unit(table: Table, name: str, degrees: bool) -> None:
         )
 
 
+def _stamps(
+    table: Table, name: str, Ts: float | None, time_unit: str | None, samples: int, any_unit: bool
+) -> Real[np.ndarray, " N"]:
+    """The times of all samples [s]."""
+    if time_unit is not None and time_unit not in TIME_UNITS:
+        raise InputError(
+            f"Argument `time_unit` must be one of {', '.join(TIME_UNITS)}, but is {time_unit!r}; give "
+            "for instance time_unit='ms'."
+        )
+    if Ts is not None and name not in table.columns:
+        raise InputError(
+            f"Argument `resample` needs the times of the samples, but Ts={Ts:g} was given and {table.label} "
+            "has no column of them; leave `resample` out, or name the column with time=."
+        )
+    behind = name_and_unit(name)[1].lower()
+    unit = time_unit or TIME_WORDS.get(behind, behind if behind in TIME_UNITS else None)
+    t = _column(table, name, "time=", {} if any_unit or unit else {"ms": "seconds"})
+    if len(t) != samples:
+        raise InputError(
+            f"{table.label}: the time {name!r} has {len(t)} stamps for {samples} samples, but each sample "
+            "needs one; name the right column with time=."
+        )
+    return t.astype(float) * TIME_UNITS[unit] if unit and unit != "s" else t.astype(float)
+
+
 def _timing(
-    table: Table, time: str | None, Ts: float | None, samples: int, any_unit: bool
+    table: Table,
+    name: str,
+    time: str | None,
+    Ts: float | None,
+    time_unit: str | None,
+    samples: int,
+    any_unit: bool,
 ) -> tuple[float, float]:
     """Time of the first sample and sampling period [s], from the column, the argument or both."""
     if Ts is not None:
         Ts = sampling_period(Ts)
-    if time is None and "t" not in table.columns:
+    if time is None and name not in table.columns:
         if Ts is None:
             table.column("t", "time=, or give the sampling period with Ts=")
         return 0.0, float(Ts or 0.0)
-    name = "t" if time is None else time
-    t = _column(table, name, "time=", {} if any_unit else {"ms": "seconds"})
+    t = _stamps(table, name, Ts, time_unit, samples, any_unit)
     label = f"{table.label}: the time {name!r}"
-    if len(t) != samples:
-        raise InputError(
-            f"{label} has {len(t)} stamps for {samples} samples, but each sample needs one; "
-            "name the right column with time=."
-        )
-    measured = even_spacing(t.astype(float), label, table.where, table.first)
+    measured = even_spacing(t, label, table.where, table.first)
     if Ts is not None and abs(measured - Ts) > 0.01 * Ts:
         raise InputError(
             f"{label} advances by {measured:g} s, but Ts={Ts:g} was given; leave Ts out, or correct it."
         )
-    if measured >= 0.5 and not any_unit:
+    if measured >= 0.5 and not any_unit and time_unit is None:
         raise InputError(
             f"{label} advances by {measured:g} per sample, too slow for a joint: it looks like "
-            "milliseconds; divide it by 1000, or pass accept=('units',)."
+            "milliseconds; pass time_unit='ms', or time_unit='s' if these are seconds."
         )
     return float(t[0]), measured

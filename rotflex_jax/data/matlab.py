@@ -25,9 +25,22 @@ MOST_PARTS = 1_000_000
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_OPAQUE = 17  # class of an object
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15  # types of elements
 _CELL, _STRUCT, _OBJECT, _CHAR, _FIRST_NUMBER, _LAST_NUMBER = 1, 2, 3, 4, 6, 15  # classes of arrays
 _VERSION_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
+
+
+@dataclass(frozen=True)
+class MatlabObject:
+    """Stands for an object whose insides only MATLAB knows, such as a timeseries.
+
+    Args:
+        kind: its class.
+    """
+
+    kind: str
+
 
 SKIPPED = object()
 """Stands for what is no signal: sparse matrices, objects, functions."""
@@ -148,7 +161,7 @@ class _Elements:
             raise ValueError("a variable lacks its flags")
         kind, is_complex = int(flags[0]) & 0xFF, bool(flags[0] & 0x800)
         if not (kind in (_CELL, _STRUCT, _OBJECT, _CHAR) or _FIRST_NUMBER <= kind <= _LAST_NUMBER):
-            return "", SKIPPED
+            return self.object(at, end) if kind == _OPAQUE else ("", SKIPPED)
         sizes, at = self.numbers(at, end, (_INT32, _UINT32))
         shape = [int(n) for n in sizes]
         if not 2 <= len(shape) <= 32 or min(shape) < 0:
@@ -171,6 +184,12 @@ class _Elements:
         if len(values) != math.prod(shape):
             raise ValueError(f"the variable {name!r} of shape {tuple(shape)} has {len(values)} numbers")
         return name, _squeezed(values, shape)
+
+    def object(self, at: int, end: int) -> tuple[str, Any]:
+        """Name and class of an object."""
+        name, at = self.text(at, end)
+        _, at = self.text(at, end)  # the system it belongs to
+        return name, MatlabObject(self.text(at, end)[0])
 
     def parts_of(self, at: int, end: int, count: int, depth: int) -> list[Any]:
         """So many arrays, one behind the other."""

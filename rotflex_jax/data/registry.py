@@ -63,6 +63,8 @@ class PublicDataset:
         source: who made it.
         files: where they are.
         reader: file to Recording, or to several.
+        joint: preset of `rotflex_jax.joints` to begin with, where all recordings are of one machine that has
+            one, and none is kept for a protocol's test.
     """
 
     name: str
@@ -72,6 +74,7 @@ class PublicDataset:
     source: str
     files: tuple[PublicFile, ...]
     reader: Callable[[Path], Any]
+    joint: str = ""
 
 
 def _files(
@@ -149,6 +152,7 @@ DATASETS = {
                 },
             ),
             reader=load_rotflex,
+            joint="quanser_2010",
         ),
         PublicDataset(
             name="emps",

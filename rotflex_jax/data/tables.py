@@ -1,6 +1,7 @@
 """Tables of named columns, and delimited text as a table."""
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,7 @@ class Table:
         first: number of the first row.
         units: by name, where the file has a line of them.
         cut: what may be missing at the end, in a sentence; empty where nothing is.
+        objects: by name, the class of what only the program that wrote the file can read.
     """
 
     label: str
@@ -30,6 +32,27 @@ class Table:
     first: int = 1
     units: Mapping[str, str] = field(default_factory=dict)
     cut: str = ""
+    objects: Mapping[str, str] = field(default_factory=dict)
+
+    def find(self, name: str, *others: str) -> str:
+        """The column that is meant by a name: that one, or one in other capitals or with a unit behind it.
+
+        Args:
+            name: what is wanted.
+            others: what it may be called as well.
+
+        Returns:
+            The name of the column, or `name` where there is none, or more than one.
+
+        >>> table = Table("run.csv", {"Time [s]": np.zeros(1), "Theta (deg)": np.zeros(1)})
+        >>> table.find("theta"), table.find("t", "time"), table.find("alpha")
+        ('Theta (deg)', 'Time [s]', 'alpha')
+        """
+        if not isinstance(name, str) or name in self.columns:
+            return name
+        wanted = {other.casefold() for other in (name, *others)}
+        like = [column for column in self.columns if name_and_unit(column)[0].casefold() in wanted]
+        return like[0] if len(like) == 1 else name
 
     def column(self, name: str, what: str) -> Shaped[np.ndarray, " N"]:
         """One column.
@@ -67,7 +90,23 @@ class Table:
         longer = [key for key, values in self.columns.items() if len(values) > 1]
         there = longer or list(self.columns)  # settings of one value are not worth offering
         names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
+        objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
+        if objects:
+            then += f"; objects that only MATLAB reads are left out, {objects}: save their .Time and .Data"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
+
+
+_UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[(]\s*([^\[\]()]*[^\W\d][^\[\]()]*?|°)\s*[\])]")
+
+
+def name_and_unit(column: str) -> tuple[str, str]:
+    """The name of a column and the unit in brackets behind it.
+
+    >>> name_and_unit("Theta [deg]"), name_and_unit("log[0]"), name_and_unit("u")
+    (('Theta', 'deg'), ('log[0]', ''), ('u', ''))
+    """
+    found = _UNIT_BEHIND.fullmatch(column.strip())
+    return (found[1], found[2]) if found else (column.strip(), "")
 
 
 def distinct(names: Sequence[str], label: str) -> Sequence[str]:

@@ -8,6 +8,7 @@ from typing import Any
 from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.discover.latent_comparison import LatentTorqueComparison, compare_latent_torques
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult, learn_torque
+from rotflex_jax.discover.model_tests import model_tests
 from rotflex_jax.discover.proposal import proposed
 from rotflex_jax.discover.result import NEXT, SearchResult
 from rotflex_jax.discover.tables import (
@@ -70,7 +71,7 @@ class Discovery(SearchResult):
                 torque = self.learned_torque(max(gains, key=lambda port: gains[port]))
             except InputError:  # no sensor tells how that port moves
                 torque = None
-        return Explanation(latent, torque, remaining_failures(self))
+        return Explanation(latent, torque, remaining_failures(self), model_tests(self))
 
     def save(self, path: str | Path) -> Path:
         """Write the final model as JSON, with its estimates; `Model.load` reads the model."""

@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 
-from rotflex_jax.discover.result import NEAR_FLOOR, Round, Stage
+from rotflex_jax.discover.assessment import assess, in_noise
+from rotflex_jax.discover.result import Round, Stage
 from rotflex_jax.discover.score_test import Score
 from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.recording import Recording
-
-# The model explains the recordings if process torques gain no more than this per measured value [nat],
-# and short held-out runs come as near to the sensor noise as `NEAR_FLOOR` says.
-NATS_PER_SAMPLE = 0.07
 
 
 def end_state(
+    baseline: Stage,
     rounds: Sequence[Round],
     final: Stage,
     floor: dict[str, float],
@@ -22,34 +21,34 @@ def end_state(
     """The verdict, and a sentence that gives its reason.
 
     Args:
+        baseline: Stage before any was added.
         rounds: What was added.
         final: Stage after the last round.
         floor: Standard deviation of the sensor noise per channel.
         ranking: Scores of the baseline.
         test: Held-out recordings.
     """
-    ratios = {c: final.held_out_rmse_windows[c] / floor[c] for c in floor}
-    samples = sum(r.N for r in test) * len(floor)
-    near = all(ratio < NEAR_FLOOR for ratio in ratios.values())
-    explained = near and final.process_noise_nats < NATS_PER_SAMPLE * samples
+    errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
+    end = assess(*errors, floor, final.process_noise_nats, sum(r.N for r in test))
     seconds = final.window_seconds
-    left = ", ".join(f"{c} {_times(r)}" for c, r in ratios.items())
-    reached = f"the held-out error over {seconds:g} s is {left} times the sensor noise"
-    names = " and ".join(f"{r.effect.replace('_', ' ')} at the {r.port}" for r in rounds)
+    reached = f"the held-out error over {seconds:g} s is {in_noise(end.remaining)} times the sensor noise"
+    names = " and ".join(effect_phrase(r.effect, r.port) for r in rounds)
+    share = f"; {end.explained_text}" if rounds and end.explained_text else ""
     explain, others = "explain", "some of them from others (listed with each)"
     if len(rounds) == 1:
         explain, others = "explains", "this from others (listed with it)"
     visible = [s for s in ranking if s.excited]
     invisible = len(ranking) - len(visible)
-    if not explained:
+    if not end.is_explained:
         found = f"{names} found, but something" if rounds else "Something"
-        return Verdict.UNEXPLAINED, f"{found} remains that no candidate explains: {reached}."
+        why = "" if not end.at_noise else f"; {end.criterion}"
+        return Verdict.UNEXPLAINED, f"{found} remains that no candidate explains: {reached}{why}{share}."
     if any(r.equivalent for r in rounds):
         return Verdict.AMBIGUOUS, (
-            f"{names} {explain} the recording, but it cannot distinguish {others}: {reached}."
+            f"{names} {explain} the recording, but it cannot distinguish {others}: {reached}{share}."
         )
     if rounds:
-        return Verdict.FOUND, f"{names} {explain} the recording: {reached}."
+        return Verdict.FOUND, f"{names} {explain} the recording: {reached}{share}."
     if ranking and invisible > len(ranking) / 2:
         return Verdict.NOT_EXCITED, (
             f"Nothing was found, but {invisible} of {len(ranking)} candidates could not have shown in this "
@@ -57,8 +56,3 @@ def end_state(
         )
     hidden = f"; {invisible} of {len(ranking)} candidates could not have shown" if invisible else ""
     return Verdict.NOTHING_MISSING, f"Nothing is missing: {reached}{hidden}."
-
-
-def _times(ratio: float) -> str:
-    """A ratio in two decimals, or where those mean nothing, in three digits."""
-    return f"{ratio:.2f}" if ratio < 100 else f"{ratio:.3g}"

@@ -7,6 +7,7 @@ import numpy as np
 from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.localise import locate
+from rotflex_jax.discover.model_tests import ModelTests
 from rotflex_jax.discover.result import SearchResult, Where
 from rotflex_jax.discover.verdict import Verdict
 
@@ -19,11 +20,13 @@ class Explanation:
         latent: Torques that the baseline and the final model lack; None where they were not computed.
         learned: A torque learned for what is left; None where none was asked for or none can be learned.
         remaining: Where the final model still fails; empty unless effects were found and something is left.
+        tests: Tests of the residuals, and frequency responses; None where they were not computed.
     """
 
     latent: LatentTorqueComparison | None = None
     learned: LearnedTorqueResult | None = None
     remaining: tuple[Where, ...] = ()
+    tests: ModelTests | None = None
 
 
 def remaining_failures(found: SearchResult) -> tuple[Where, ...]:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.effects.labels import with_titles
 from rotflex_jax.text.numbers import as_read
 
 
@@ -45,12 +46,13 @@ def milestone(
 
     >>> line = milestone("+ coulomb at hub", ["theta"], {"theta": "rad"}, np.array([0.01]), np.array([5e-4]))
     >>> line, line.errors
-    ('+ coulomb at hub: held-out error theta 0.573 deg', {'theta': 0.01})
+    ('+ Coulomb friction at hub: short runs from fitted first states leave theta 0.573 deg', {'theta': 0.01})
     """
     read = {c: as_read(1.0, units[c]) for c in channels}
     by_name = dict(zip(channels, (float(e) for e in errors), strict=True))
+    label = with_titles(label)
     listed = ", ".join(f"{c} {read[c][0] * e:.3g} {read[c][1]}" for c, e in by_name.items())
-    line = Milestone(f"{label}: held-out error {listed}")
+    line = Milestone(f"{label}: short runs from fitted first states leave {listed}")
     line.label, line.errors = label, by_name
     line.floor = dict(zip(channels, (float(f) for f in floor), strict=True))
     line.units = {c: unit for c, (_, unit) in read.items()}

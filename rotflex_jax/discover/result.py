@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.discover.assessment import NEAR_FLOOR as NEAR_FLOOR, Assessment, assess
 from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.effects.labels import effect_phrase, with_titles
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.models.model import Model
@@ -135,9 +137,9 @@ class Round:
     @property
     def doubt(self) -> str:
         """Why the effect may stand in for something else, in words; empty where nothing speaks for that."""
-        alike = " or ".join(f"{effect} at {port}" for effect, port in self.equivalent)
+        alike = " or ".join(effect_phrase(*place) for place in self.equivalent)
         reasons = [f"these recordings cannot distinguish it from {alike}"] if alike else []
-        return "; ".join([*reasons, *self.doubts])
+        return with_titles("; ".join([*reasons, *self.doubts]))
 
     @property
     def status(self) -> str:
@@ -252,8 +254,6 @@ def plain(values: dict[str, float]) -> dict[str, float | None]:
 
 # Name of the file beside a report that holds the input to play next.
 NEXT = "next_experiment.csv"
-# An error of at most this times the sensor noise counts as having reached it.
-NEAR_FLOOR = 1.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,15 +307,28 @@ class SearchResult:
         """Baseline, then one stage per round."""
         return (self.baseline, *(r.stage for r in self.rounds))
 
+    @property
+    def assessment(self) -> Assessment:
+        """What is explained, what remains in units of the noise, and which criterion decided."""
+        errors = self.baseline.held_out_rmse_windows, self.final.held_out_rmse_windows
+        samples = sum(r.N for r in self.validation)
+        return assess(*errors, self.noise_floor, self.final.process_noise_nats, samples)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types, schema 1."""
+        first = self.validation[0]
         return {
             "schema": 1,
             "verdict": self.verdict.value,
             "sentence": self.sentence,
+            "assessment": self.assessment.to_dict(),
+            "units": dict(zip(first.channels, first.units, strict=True)),
             "baseline": self.baseline.errors(),
             "noise_floor": plain(self.noise_floor),
             "rounds": [r.to_dict() for r in self.rounds],
+            "parameters": {
+                e.name: {**e.to_dict(), "free": e.free, "note": e.note} for e in self.final.estimates
+            },
             "ranking": [r.to_dict() for r in self.ranking],
             "where": [w.to_dict() for w in self.where],
             "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,

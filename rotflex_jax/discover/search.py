@@ -403,7 +403,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
     rounds = _rounds(state, stages, pairs, remarks)
     listed = [s for s, _ in state.ranking]
-    verdict, sentence = end_state(rounds, stages[-1], floor, listed, held_back)
+    verdict, sentence = end_state(stages[0], rounds, stages[-1], floor, listed, held_back)
     return Discovery(
         verdict=verdict,
         sentence=sentence,

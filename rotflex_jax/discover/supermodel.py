@@ -284,9 +284,7 @@ def build(
         if location in present or location in calibrations or not baseline.accepts(cls, port):
             continue
         names = tuple(cls.declared())
-        probes = tuple(
-            tuple(tuple(float(p[n]) for n in names) for p in group) for group in cls.probes(scales[port])
-        )
+        probes = cls.probe_values(scales[port])
         if not probes:
             continue
         mechanism = mechanism + cls(at=port, **dict(zip(names, probes[0][0], strict=True)))

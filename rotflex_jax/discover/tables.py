@@ -1,21 +1,26 @@
 """What a card, a terminal and a report list of a search: errors, parameters, outcomes, labels."""
 
 import dataclasses
-import math
 from enum import StrEnum
 
-from rotflex_jax.discover.result import NEAR_FLOOR, Ranked, Round, RunErrors, SearchResult, Stage
+from rotflex_jax.discover.assessment import Grade, grade
+from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, Stage
 from rotflex_jax.effects.labels import effect_label
-from rotflex_jax.text.numbers import plain_number, ratio, readable, unit_text, value_and_interval
+from rotflex_jax.text.numbers import multiple, plain_number, ratio, readable, unit_text, value_and_interval
 
 
 @dataclasses.dataclass(frozen=True)
 class ErrorCell:
-    """One error: the number, its multiple of the noise, and whether it has reached the noise."""
+    """One error: the number, its multiple of the noise, and how far from the noise it is."""
 
     value: str
     multiple: str
-    reached: bool
+    grade: Grade | None
+
+    @property
+    def reached(self) -> bool:
+        """Whether it has reached the noise."""
+        return self.grade is Grade.NOISE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,8 +116,7 @@ def status_sentence(added: Round) -> str:
 
 def _cell(value: float, unit: str, floor: float | None) -> ErrorCell:
     times = ratio(value, floor)
-    text = "" if math.isnan(times) else f"{times:.2f}" if times < 10 else f"{times:.0f}"
-    return ErrorCell(plain_number(readable(value, unit)[0]), text, times < NEAR_FLOOR)
+    return ErrorCell(plain_number(readable(value, unit)[0]), multiple(times), grade(times))
 
 
 def noise_row(discovery: SearchResult) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ class DeadZone(Actuation):
     """
 
     name: ClassVar[str] = "dead_zone"
-    title: ClassVar[str] = "dead zone of the input"
+    title: ClassVar[str] = "input dead zone"
     equation: ClassVar[str] = "v -> v - positive if v > positive, v + negative if v < -negative, 0 between"
     amplitudes: ClassVar[tuple[str, ...]] = ("positive", "negative")
     searched: ClassVar[tuple[str, ...]] = ("input",)
@@ -73,7 +73,7 @@ class Saturation(Actuation):
     """
 
     name: ClassVar[str] = "saturation"
-    title: ClassVar[str] = "saturation of the input"
+    title: ClassVar[str] = "input saturation"
     equation: ClassVar[str] = "v -> min(max(v, -limit), limit)"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 0
@@ -114,7 +114,7 @@ class AmplifierSaturation(Actuation):
     """
 
     name: ClassVar[str] = "amplifier_saturation"
-    title: ClassVar[str] = "amplifier that saturates gradually"
+    title: ClassVar[str] = "gradual amplifier saturation"
     equation: ClassVar[str] = "v -> limit * tanh(v / limit)"
     # A recording hardly distinguishes it from the hard limit, which is searched.
     searched: ClassVar[tuple[str, ...]] = ()
@@ -154,7 +154,7 @@ class VoltageOffset(Actuation):
     """
 
     name: ClassVar[str] = "voltage_offset"
-    title: ClassVar[str] = "constant offset of the voltage"
+    title: ClassVar[str] = "voltage offset"
     equation: ClassVar[str] = "v -> v + offset"
     amplitudes: ClassVar[tuple[str, ...]] = ("offset",)
     searched: ClassVar[tuple[str, ...]] = ("input",)
@@ -198,7 +198,7 @@ class VoltageDrift(Actuation):
     """
 
     name: ClassVar[str] = "voltage_drift"
-    title: ClassVar[str] = "offset of the voltage that drifts"
+    title: ClassVar[str] = "drifting voltage offset"
     equation: ClassVar[str] = "v -> v + rate * t"
     amplitudes: ClassVar[tuple[str, ...]] = ("rate",)
     searched: ClassVar[tuple[str, ...]] = ("input",)
@@ -241,7 +241,7 @@ class Delay(Actuation):
     """
 
     name: ClassVar[str] = "delay"
-    title: ClassVar[str] = "delay of the input"
+    title: ClassVar[str] = "input delay"
     equation: ClassVar[str] = "v(t) = u(t - time)"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 3
@@ -290,7 +290,7 @@ class Lag(Actuation):
     """
 
     name: ClassVar[str] = "lag"
-    title: ClassVar[str] = "first-order lag of the input"
+    title: ClassVar[str] = "input lag"
     equation: ClassVar[str] = "time * dv/dt = u - v"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 4

@@ -30,7 +30,7 @@ class Gravity(Force):
     """
 
     name: ClassVar[str] = "gravity"
-    title: ClassVar[str] = "weight of an unbalanced mass"
+    title: ClassVar[str] = "gravity torque"
     equation: ClassVar[str] = "tau = -(sine * sin(position) + cosine * cos(position))"
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm")
     amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")
@@ -82,7 +82,7 @@ class Cogging(Force):
     """
 
     name: ClassVar[str] = "cogging"
-    title: ClassVar[str] = "torque that repeats with the angle (cogging)"
+    title: ClassVar[str] = "cogging torque"
     equation: ClassVar[str] = "tau = -(sine * sin(periods * position) + cosine * cos(periods * position))"
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm")
     amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")

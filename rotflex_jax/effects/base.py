@@ -12,7 +12,7 @@ import abc
 import dataclasses
 import math
 import numbers
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
@@ -199,6 +199,43 @@ class Effect(abc.ABC):
             one direction of the test per set. None for what a model has from the start.
         """
         return []
+
+    @classmethod
+    def probe_values(cls, scale: Scale) -> tuple[tuple[tuple[float, ...], ...], ...]:
+        """What `probes` gives, checked, as values in the order of `declared`.
+
+        Raises:
+            InputError: It is no list of lists of mappings, or a mapping has not just the declared parameters,
+                each with a finite number.
+        """
+        given, names = cls.probes(scale), tuple(cls.declared())
+        right = "[[{" + ", ".join(f"{n!r}: 0.1" for n in names) + "}]], a list of shapes, each a list of sets"
+        if not isinstance(given, Sequence) or not all(isinstance(group, Sequence) for group in given):
+            raise InputError(
+                f"The probes of {cls.__name__} must be a list of shapes, each a list of parameter sets, but "
+                f"are {given!r:.80}; write for instance {right}."
+            )
+        for probe in (p for group in given for p in group):
+            if not isinstance(probe, Mapping):
+                raise InputError(
+                    f"A probe of {cls.__name__} is {probe!r:.80}, but must name its parameters; write for "
+                    f"instance {right}."
+                )
+            missing = [n for n in names if n not in probe]
+            unknown = [str(n) for n in probe if n not in names]
+            if missing or unknown:
+                what = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(unknown)} too"
+                raise InputError(
+                    f"A probe of {cls.__name__} {what}, but needs a value for each of its parameters "
+                    f"{', '.join(names)} and for nothing else; correct its method `probes`."
+                )
+            for name, value in probe.items():
+                if not isinstance(value, numbers.Real) or not math.isfinite(float(value)):
+                    raise InputError(
+                        f"A probe of {cls.__name__} has {name}={value!r}, but needs a finite number; correct "
+                        "its method `probes`."
+                    )
+        return tuple(tuple(tuple(float(p[n]) for n in names) for p in group) for group in given)
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:

@@ -77,7 +77,7 @@ class ViscousAsymmetric(Force):
     """
 
     name: ClassVar[str] = "viscous_asymmetric"
-    title: ClassVar[str] = "damping, unequal in the two directions"
+    title: ClassVar[str] = "asymmetric damping"
     equation: ClassVar[str] = "tau = -asymmetry * |speed|"
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint", "axis")
     amplitudes: ClassVar[tuple[str, ...]] = ("asymmetry",)
@@ -122,7 +122,7 @@ class QuadraticDrag(Force):
     """
 
     name: ClassVar[str] = "quadratic_drag"
-    title: ClassVar[str] = "quadratic (air) drag"
+    title: ClassVar[str] = "quadratic drag"
     equation: ClassVar[str] = "tau = -coefficient * speed * |speed|"
     amplitudes: ClassVar[tuple[str, ...]] = ("coefficient",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")

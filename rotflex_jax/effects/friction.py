@@ -26,7 +26,7 @@ class Coulomb(DryFriction):
     """
 
     name: ClassVar[str] = "coulomb"
-    title: ClassVar[str] = "constant (Coulomb) friction"
+    title: ClassVar[str] = "Coulomb friction"
     equation: ClassVar[str] = "tau = -level * sign(speed), holds while |tau| <= level"
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
@@ -70,7 +70,7 @@ class CoulombAsymmetric(DryFriction):
     """
 
     name: ClassVar[str] = "coulomb_asymmetric"
-    title: ClassVar[str] = "constant friction, unequal in the two directions"
+    title: ClassVar[str] = "asymmetric Coulomb friction"
     equation: ClassVar[str] = (
         "tau = -forward if speed > 0, +backward if speed < 0, holds while -forward <= tau <= backward"
     )
@@ -122,7 +122,7 @@ class Stribeck(DryFriction):
     """
 
     name: ClassVar[str] = "stribeck"
-    title: ClassVar[str] = "friction that is larger near standstill (Stribeck)"
+    title: ClassVar[str] = "Stribeck friction"
     equation: ClassVar[str] = (
         "tau = -(level + excess * exp(-(v / speed)^2)) * sign(v), holds while |tau| <= level + excess"
     )
@@ -184,7 +184,7 @@ class LoadFriction(DryFriction):
     """
 
     name: ClassVar[str] = "load_friction"
-    title: ClassVar[str] = "friction of a gear that grows with its load"
+    title: ClassVar[str] = "load-dependent friction"
     equation: ClassVar[str] = (
         "tau = -(level + share * |load|) * sign(speed), share = driving if load * speed > 0, driven "
         "otherwise, load torque through the gear"

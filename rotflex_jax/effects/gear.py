@@ -33,7 +33,7 @@ class Backlash(Gear):
     """
 
     name: ClassVar[str] = "backlash"
-    title: ClassVar[str] = "play of the gear"
+    title: ClassVar[str] = "backlash"
     equation: ClassVar[str] = (
         "|r| <= gap, torque passes only at |r| = gap, r angle of the rotor against the port, rotor inertia = "
         "share * inertia"
@@ -99,7 +99,7 @@ class ElasticBacklash(Gear):
     """
 
     name: ClassVar[str] = "elastic_backlash"
-    title: ClassVar[str] = "play of a gear with elastic teeth"
+    title: ClassVar[str] = "backlash with elastic teeth"
     equation: ClassVar[str] = (
         "tau = max(0, stiffness * depth + damping * depth') * sign(r), depth = |r| - gap > 0, r angle of the "
         "rotor against the port, rotor inertia = share * inertia"

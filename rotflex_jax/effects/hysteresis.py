@@ -29,7 +29,7 @@ class Dahl(Memory):
     """
 
     name: ClassVar[str] = "dahl"
-    title: ClassVar[str] = "friction with presliding (Dahl)"
+    title: ClassVar[str] = "Dahl friction"
     equation: ClassVar[str] = "dz/dt = speed / presliding * (1 - z * sign(speed)), tau = -level * z"
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
@@ -93,7 +93,7 @@ class LuGre(Memory):
     """
 
     name: ClassVar[str] = "lugre"
-    title: ClassVar[str] = "friction with presliding and breakaway (LuGre)"
+    title: ClassVar[str] = "LuGre friction"
     equation: ClassVar[str] = (
         "g = 1 + rise * exp(-(speed/slow)**2), dz/dt = (speed - |speed| * z / g) / presliding, "
         "tau = -(level * z + damping * presliding * dz/dt)"
@@ -160,7 +160,7 @@ class BoucWen(Memory):
     """
 
     name: ClassVar[str] = "bouc_wen"
-    title: ClassVar[str] = "hysteresis (Bouc-Wen)"
+    title: ClassVar[str] = "Bouc-Wen hysteresis"
     equation: ClassVar[str] = (
         "dz/dt = (speed - beta * |speed| * z - (1 - beta) * speed * |z|) / width, tau = -level * z"
     )

@@ -67,7 +67,7 @@ class SecondMode(Linear):
     """
 
     name: ClassVar[str] = "second_mode"
-    title: ClassVar[str] = "one more mode of vibration"
+    title: ClassVar[str] = "second vibration mode"
     equation: ClassVar[str] = (
         "r'' + 2 * damping * W * (r' - speed) + W**2 * (r - position) = 0, W = 2 * pi * frequency, "
         "tau = -inertia * r''"

@@ -1,4 +1,4 @@
-"""Effects as people read them: short labels, titles, and sentences that mention them."""
+"""Effects as people read them: the noun of the field and where it acts, and sentences that mention them."""
 
 import re
 
@@ -7,37 +7,73 @@ from rotflex_jax.text.numbers import together
 
 
 def effect_label(effect: str, port: str) -> str:
-    """An effect and its port, short; a sensor error is one of its channel.
+    """An effect and its port, short; a sensor error is one of its channel, and the input is one.
 
     >>> effect_label("cubic_spring", "joint"), effect_label("sensor_bias", "alpha")
     ('cubic spring at joint', 'sensor bias of alpha')
+    >>> effect_label("delay", "input")
+    'input delay'
     """
-    return f"{effect.replace('_', ' ')} {'of' if effect in _sensing() else 'at'} {port}"
+    return _placed(effect, port, "")
 
 
-def _sensing() -> list[str]:
-    return [name for name, effect in CATALOG.items() if effect.acts_on == "channel"]
+def effect_phrase(effect: str, port: str) -> str:
+    """The same within a sentence.
+
+    >>> effect_phrase("coulomb", "hub"), effect_phrase("sensor_bias", "alpha")
+    ('Coulomb friction at the hub', 'sensor bias of alpha')
+    """
+    return _placed(effect, port, "the ")
+
+
+def _placed(effect: str, port: str, article: str) -> str:
+    known, title = CATALOG.get(effect), effect_title(effect)
+    if known is not None and known.acts_on == "input" and port == "input":
+        return title
+    if known is not None and known.acts_on == "channel":
+        return f"{title} of {port}"
+    return f"{title} at {article}{port}"
 
 
 def effect_title(effect: str) -> str:
-    """What an effect is, in words; its name where the catalogue lacks it."""
+    """What an effect is, as a noun; its name where the catalogue lacks it."""
     known = CATALOG.get(effect)
     return known.title if known else effect.replace("_", " ")
 
 
+# What may stand before a name in a list of effects; after any other word, "spring" or "delay" is that word.
+_BEFORE_A_NAME = re.compile(r"(?:^|[^\w\s]\s*|\b(?:and|or|from|refitting|scoring)\s)$")
+
+
+def with_titles(text: str) -> str:
+    """A text in which effects are named by their nouns, in the place of the names that scripts use.
+
+    >>> with_titles("+ coulomb at hub"), with_titles("lugre at the hub and delay at the input")
+    ('+ Coulomb friction at hub', 'LuGre friction at the hub and input delay')
+    >>> with_titles("cubic spring at the joint"), with_titles("the spring at the joint hardens")
+    ('cubic spring at the joint', 'the spring at the joint hardens')
+    """
+
+    def noun(found: re.Match[str]) -> str:
+        listed = "_" in found[1] or _BEFORE_A_NAME.search(text[: found.start()])
+        return _placed(found[1], found[3], found[2] or "") if listed else found[0]
+
+    names = "|".join(sorted(map(re.escape, CATALOG), key=len, reverse=True))
+    return re.sub(rf"\b({names}) at (the )?(\w+)", noun, text)
+
+
 def sentence(text: str) -> str:
-    """A text as a sentence in print: capital letter, full stop, names and units kept together.
+    """A text as a sentence in print: capital letter, full stop, nouns of effects, units kept together.
 
     >>> sentence("cubic_spring explains it")
     'Cubic spring explains it.'
     >>> sentence("sensor_bias at the alpha explains it")
     'Sensor bias of alpha explains it.'
     """
-    text = text.strip()
+    text = with_titles(text.strip())
     for name in CATALOG:
-        text = re.sub(rf"\b{name}\b", name.replace("_", " "), text)
-    for name in _sensing():
-        text = text.replace(f"{name.replace('_', ' ')} at the ", f"{name.replace('_', ' ')} of ")
+        if "_" in name:
+            text = re.sub(rf"\b{name}\b", effect_title(name), text)
     if text and text[-1] not in ".!?":
         text += "."
     return together(text[:1].upper() + text[1:])

@@ -136,7 +136,7 @@ class Heating(Memory):
     """
 
     name: ClassVar[str] = "heating"
-    title: ClassVar[str] = "motor that warms up"
+    title: ClassVar[str] = "motor heating"
     equation: ClassVar[str] = (
         "dz/dt = m**2 / (1 + rate * z) - z / time, tau = -rate * z / (1 + rate * z) * m, "
         "m torque of the cold motor"

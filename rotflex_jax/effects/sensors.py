@@ -28,7 +28,7 @@ class SensorGain(Sensing):
     """
 
     name: ClassVar[str] = "sensor_gain"
-    title: ClassVar[str] = "sensor out of calibration"
+    title: ClassVar[str] = "sensor gain error"
     equation: ClassVar[str] = "y = (1 + error) * value"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("error",)
@@ -71,7 +71,7 @@ class SensorBias(Sensing):
     """
 
     name: ClassVar[str] = "sensor_bias"
-    title: ClassVar[str] = "constant error of a sensor"
+    title: ClassVar[str] = "sensor bias"
     equation: ClassVar[str] = "y = value + bias"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("bias",)
@@ -115,7 +115,7 @@ class SensorCubic(Sensing):
     """
 
     name: ClassVar[str] = "sensor_cubic"
-    title: ClassVar[str] = "sensor that is not straight"
+    title: ClassVar[str] = "nonlinear sensor"
     equation: ClassVar[str] = "y = value + cubic * value**3"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("cubic",)
@@ -162,7 +162,7 @@ class Rectifier(Sensing):
     """
 
     name: ClassVar[str] = "rectifier"
-    title: ClassVar[str] = "sensor with another gain below zero (rectifier)"
+    title: ClassVar[str] = "rectifying sensor"
     equation: ClassVar[str] = "y = value if value > 0, (1 - loss) * value otherwise"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("loss",)
@@ -207,7 +207,7 @@ class EccentricEncoder(Sensing):
     """
 
     name: ClassVar[str] = "eccentric_encoder"
-    title: ClassVar[str] = "encoder out of centre"
+    title: ClassVar[str] = "eccentric encoder"
     equation: ClassVar[str] = "y = value + cosine * cos(value) + sine * sin(value)"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("cosine", "sine")
@@ -263,7 +263,7 @@ class CrossTalk(Sensing):
     """
 
     name: ClassVar[str] = "cross_talk"
-    title: ClassVar[str] = "share of another sensor in a reading (cross-talk)"
+    title: ClassVar[str] = "sensor cross-talk"
     equation: ClassVar[str] = "y = value + share * other"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     amplitudes: ClassVar[tuple[str, ...]] = ("share",)
@@ -309,7 +309,7 @@ class ChannelDelay(Sensing):
     """
 
     name: ClassVar[str] = "channel_delay"
-    title: ClassVar[str] = "delay of one sensor"
+    title: ClassVar[str] = "sensor delay"
     equation: ClassVar[str] = "y(t) = value(t - time)"
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     searched: ClassVar[tuple[str, ...]] = ("theta", "alpha")

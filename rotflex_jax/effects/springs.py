@@ -64,7 +64,7 @@ class CubicSpring(Force):
     """
 
     name: ClassVar[str] = "cubic_spring"
-    title: ClassVar[str] = "cubic spring (hardening or softening)"
+    title: ClassVar[str] = "cubic spring"
     equation: ClassVar[str] = "tau = -stiffness * position^3"
     ports: ClassVar[tuple[str, ...]] = ("joint",)
     amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)
@@ -109,7 +109,7 @@ class QuadraticSpring(Force):
     """
 
     name: ClassVar[str] = "quadratic_spring"
-    title: ClassVar[str] = "spring that is stiffer to one side"
+    title: ClassVar[str] = "asymmetric spring"
     equation: ClassVar[str] = "tau = -stiffness * position^2"
     ports: ClassVar[tuple[str, ...]] = ("joint",)
     amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)
@@ -157,7 +157,7 @@ class JointPlay(Force):
     """
 
     name: ClassVar[str] = "joint_play"
-    title: ClassVar[str] = "play of the spring"
+    title: ClassVar[str] = "spring play"
     equation: ClassVar[str] = "tau = stiffness * min(max(position, -play), play), beside the spring"
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
     amplitudes: ClassVar[tuple[str, ...]] = ("play",)

@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -10,11 +12,16 @@ from jaxtyping import Float
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.mechanism.linear import output_units
+from rotflex_jax.models.comparison import compare_plot
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
+from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import card, paragraph, picture, table
 from rotflex_jax.text.numbers import plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import bars
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +72,26 @@ class Fit:
             f"{', '.join(e.name for e in self.parameters)}; use one of these names."
         )
 
+    @property
+    def ending(self) -> str:
+        """How the fit ended and after how many steps, each said once."""
+        counted = re.search(r"\bafter \d+ steps\b", self.status)
+        return self.status if counted else f"{self.status} after {self.steps} steps"
+
     def save(self, path: str | Path) -> Path:
         """Write the model as JSON, with estimates and their covariance; `Model.load` reads the model."""
         from rotflex_jax.models.model_json import Saved, save  # the layer above, on request
 
         return save(Saved(self.model, self.parameters, self.covariance, self.free_names), path)
+
+    def plot(self, recording: Recording, seconds: float | None = None) -> "Figure":
+        """Measured against simulated outputs, with errors and the fit in per cent; a notebook shows it.
+
+        Args:
+            recording: What was measured, best one that was not fitted.
+            seconds: Runs start again so often [s]; one free run over all of it unless given.
+        """
+        return compare_plot(recording, self, seconds=seconds)
 
     def _repr_html_(self) -> str:
         """How the fit ended, its residuals, and every parameter with unit and interval."""
@@ -84,7 +106,7 @@ class Fit:
             width = 100 * 1.96 * e.std / abs(e.value) if e.free and e.value else math.nan
             widths.append((e.name, width, f"± {width:.2g} %"))
         return card(
-            f"Fit: {self.status} after {self.steps} steps, cost {plain_number(self.cost, 4)} nat",
+            f"Fit: {self.ending}, cost {plain_number(self.cost, 4)} nat",
             table(("channel", "unit", "rms residual"), residuals, words=2),
             table(("parameter", "unit", "", "value", "95 %"), estimates, words=3),
             *(paragraph(remark.sentence) for remark in self.remarks),
@@ -95,7 +117,7 @@ class Fit:
         )
 
     def __str__(self) -> str:
-        lines = [f"Fit: {self.status} after {self.steps} steps, cost {self.cost:.1f}"]
+        lines = [f"Fit: {self.ending}, cost {self.cost:.1f}"]
         lines += [f"  residual {c}: {s:.3g} rms" for c, s in self.noise.items()]
         lines += [f"  {e}" for e in self.parameters]
         return "\n".join(lines + [f"  {remark.sentence}" for remark in self.remarks])

@@ -42,7 +42,7 @@ class Live:
         """Show a line of progress."""
         new = isinstance(line, Milestone)
         if isinstance(line, Milestone):
-            self.labels.append(line.label.replace("_", " "))
+            self.labels.append(line.label)
             for channel, unit in line.units.items():
                 name, factor = f"{channel} [{unit}]", line.factors[channel]
                 self.errors.setdefault(name, []).append(factor * line.errors[channel])

@@ -183,7 +183,7 @@ def is_absolute(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) 
     return True
 
 
-ACCEPTABLE = ("short", "constant_input", "constant", "saturated", "units", "huge")
+ACCEPTABLE = ("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped", "huge")
 """Faults that a user can accept by name; all others have no sensible reading."""
 
 SHORTEST_RECORDING = 50
@@ -245,8 +245,8 @@ def inspect(
         step = resolution[name]
         found += [_quantised(name, unit, step), _cut_off(x, u, Ts, name, unit, step)]
         if unit == "rad":
-            found.append(_like_degrees(x, u, Ts, name, units[0]))
-    found.append(_absolute_angle(y, names[1:]))
+            found.append(_like_counts(x, name) or _like_degrees(x, u, Ts, name, units[0]))
+    found += [_absolute_angle(y, names[1:]), _swapped(y, names[1:])]
     accepted = {("error", kind): "warning" for kind in accept}
     return tuple(
         replace(finding, severity=accepted.get((finding.severity, finding.kind), finding.severity))
@@ -348,6 +348,30 @@ def _like_degrees(
     return Finding("units", name, message, "warning")
 
 
+MOST_WHOLE = 20
+"""Span beyond which whole numbers are no angle in radians."""
+
+
+def whole_numbers(x: Float[np.ndarray, " N"]) -> bool:
+    """Whether a signal takes whole numbers only, over more than an angle in radians spans.
+
+    >>> k = np.arange(100.0)
+    >>> whole_numbers(k), whole_numbers(0.5 * k), whole_numbers(k % 5)
+    (True, False, False)
+    """
+    return bool(np.ptp(x) >= MOST_WHOLE and np.all(x == np.round(x)))
+
+
+def _like_counts(x: Float[np.ndarray, " N"], name: str) -> Finding | None:
+    if not whole_numbers(x):
+        return None
+    message = (
+        f"Channel {name!r} holds whole numbers from {x.min():g} to {x.max():g}, as the counts of an encoder "
+        "are: give the counts of one turn, counts=4096 for instance, or degrees=True for whole degrees."
+    )
+    return Finding("units", name, message, "warning")
+
+
 def _absolute_angle(y: Float[np.ndarray, "N C"], names: Sequence[str]) -> Finding | None:
     if not {"theta", "alpha"} <= set(names):
         return None
@@ -355,9 +379,53 @@ def _absolute_angle(y: Float[np.ndarray, "N C"], names: Sequence[str]) -> Findin
         return None
     message = (
         "Channel 'alpha' follows 'theta' one to one in slow motion, as the angle of the arm in the room "
-        "does and a deflection never: if it is that angle, subtract theta."
+        "does and a deflection never: if it is that angle, pass arm_absolute=True, which subtracts theta; "
+        "accept=('absolute',) if it is the deflection."
     )
     return Finding("absolute", "alpha", message, "warning")
+
+
+SWAPPED_RATIO = 3.0
+"""How many times the hub's motion a deflection cannot be in slow motion."""
+
+
+def is_swapped(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) -> bool:
+    """Whether alpha moves far more than theta in slow motion, in each of two bands, as the hub does.
+
+    Args:
+        theta: what is given as the angle of the hub [rad].
+        alpha: what is given as the deflection of the arm [rad].
+
+    >>> t = np.linspace(0, 10, 5000)
+    >>> theta, alpha = np.cos(t) + 0.3 * np.sin(3 * t), 0.02 * np.cos(t) + 0.5 * np.sin(20 * t)
+    >>> is_swapped(theta, alpha), is_swapped(alpha, theta)
+    (False, True)
+    """
+    if len(theta) < 2 * SLOW_BANDS[-1][1]:
+        return False
+    window = np.blackman(len(theta))
+    hub, arm = (np.fft.rfft(window * (x - window @ x / window.sum())) for x in (theta, alpha))
+    for start, stop, _ in SLOW_BANDS:
+        own = float(np.linalg.norm(arm[start:stop]))
+        if own <= 10 * LEAST_SLOW_SHARE * np.linalg.norm(arm):
+            return False
+        if own <= SWAPPED_RATIO * float(np.linalg.norm(hub[start:stop])):
+            return False
+    return True
+
+
+def _swapped(y: Float[np.ndarray, "N C"], names: Sequence[str]) -> Finding | None:
+    if not {"theta", "alpha"} <= set(names):
+        return None
+    theta, alpha = (y[:, names.index(name)] for name in ("theta", "alpha"))
+    if _still(theta) or _still(alpha) or not is_swapped(theta, alpha):
+        return None
+    message = (
+        f"Channel 'alpha' moves {np.ptp(alpha) / np.ptp(theta):.3g} times as far as 'theta', in slow motion "
+        "too, as the hub does and a deflection never: the two look swapped; give the column of the hub "
+        "first with outputs=, or accept=('swapped',)."
+    )
+    return Finding("swapped", "alpha", message, "warning")
 
 
 def _cut_off(

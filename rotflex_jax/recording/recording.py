@@ -53,6 +53,7 @@ class Recording:
         resolution: quantisation step by channel, where it is known; found from the data otherwise.
         continues: the recording that ended where this one starts, if any; a part of a recording knows the
             part before it. States that no sensor shows (a warm motor) continue from there.
+        remarks: findings on where it comes from, such as rows that were lost, which its parts keep.
         constants: what is known of the machine in this recording and may be otherwise in another, such as the
             gain that a servo was set to: full name of a parameter to its value. A model simulates this
             recording with it, and a fit holds it; what a model has not is no concern of it.
@@ -83,6 +84,7 @@ class Recording:
     resolution: Mapping[str, float | None]
     continues: "Recording | None"
     constants: Mapping[str, float]
+    remarks: tuple[Finding, ...]
 
     def __init__(
         self,
@@ -100,6 +102,7 @@ class Recording:
         resolution: Mapping[str, float | None] | None = None,
         continues: "Recording | None" = None,
         constants: Mapping[str, float] | None = None,
+        remarks: Sequence[Finding] = (),
     ) -> None:
         u, y = aligned(real_numbers(u, "Argument `u`"), real_numbers(y, "Argument `y`"))
         Ts = sampling_period(Ts)
@@ -134,6 +137,7 @@ class Recording:
             },
             "continues": continues,
             "constants": known_constants(constants),
+            "remarks": tuple(remarks),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -145,7 +149,8 @@ class Recording:
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the quality of the data."""
         names, units = (self.input_name, *self.channels), (self.input_unit, *self.units)
-        return quality.inspect(self.u, self.y, self.Ts, names, units, self.resolution, self.accept)
+        found = quality.inspect(self.u, self.y, self.Ts, names, units, self.resolution, self.accept)
+        return (*self.remarks, *found)
 
     @property
     def N(self) -> int:

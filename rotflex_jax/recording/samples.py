@@ -180,7 +180,7 @@ def even_spacing(t: Real[np.ndarray, " N"], label: str, where: str = "sample", f
         raise InputError(
             f"{label} is jittery: an interval of {steps[worst]:g} s {place(worst)} at a sampling "
             f"period of {period:g} s is off by {100 * abs(steps[worst] / period - 1):.2g} %, more "
-            "than 1 %; resample on a uniform grid, or write the time with more digits."
+            "than 1 %; pass resample='auto' for a uniform grid, or write the time with more digits."
         )
     mean = float(t[-1] - t[0]) / (len(t) - 1)
     # Written times are rounded; the plain number within their error is the one that was set.

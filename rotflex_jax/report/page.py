@@ -7,10 +7,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from rotflex_jax.discover.assessment import FAR_FLOOR, NEAR_FLOOR, Grade, grade, percent
 from rotflex_jax.discover.explanation import Explanation
 from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
-from rotflex_jax.discover.result import NEAR_FLOOR, Ranked, SearchResult, Where
+from rotflex_jax.discover.result import Ranked, SearchResult, Where
 from rotflex_jax.discover.tables import (
     Outcome,
     channel_headings,
@@ -29,7 +30,15 @@ from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.text.colours import stage_colours
-from rotflex_jax.text.numbers import equation, plain_number, ratio, readable, together, value_and_interval
+from rotflex_jax.text.numbers import (
+    equation,
+    multiple,
+    plain_number,
+    ratio,
+    readable,
+    together,
+    value_and_interval,
+)
 from rotflex_jax.text.plotting import by_section
 from rotflex_jax.text.templates import as_json, fill_template, write_files
 
@@ -41,7 +50,8 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
     labels, colours = stage_labels(discovery), stage_colours(len(discovery.stages))
     latent, learned, remaining = explanation.latent, explanation.learned, explanation.remaining
     return {
-        "tone": discovery.verdict.shown.tone,
+        "tone": tone(discovery),
+        "criterion": discovery.assessment.criterion,
         "headline": discovery.verdict.shown.headline,
         "summary": sentence(discovery.sentence),
         "seconds": f"{discovery.baseline.window_seconds:g}",
@@ -54,6 +64,8 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "headings": channel_headings(discovery),
         "noise": noise_row(discovery),
         "at_noise": f"{NEAR_FLOOR:g}",
+        "far": f"{FAR_FLOOR:g}",
+        "tests": _test_lines(explanation),
         "pictures": by_section(pictures(discovery, explanation).values()),
         "places": _places(discovery.where),
         "torques": _latent_lines(latent) if latent else [],
@@ -80,7 +92,10 @@ def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
         before, read = readable(first[channel], unit)
         after, _ = readable(last[channel], unit)
         times = ratio(last[channel], discovery.noise_floor.get(channel))
-        text = f"{plain_number(times, 2)} × the sensor noise" if times == times else f"error on {data} data"
+        text = f"{multiple(times)} × the sensor noise" if times == times else f"error on {data} data"
+        if discovery.rounds and first[channel] > 0:
+            share = 100 * (1 - (last[channel] / first[channel]) ** 2)
+            text += f" · {percent(share)} of the squared error explained"
         tiles.append(
             {
                 "channel": channel,
@@ -88,10 +103,20 @@ def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
                 "before": plain_number(before) if discovery.rounds else "",
                 "after": f"{plain_number(after)} {read}",
                 "note": text,
-                "reached": "yes" if times < NEAR_FLOOR else "",
+                "tone": TONES[grade(times)],
             }
         )
     return tiles
+
+
+TONES = {None: "muted", Grade.NOISE: "yes", Grade.NEAR: "warn", Grade.FAR: "bad"}
+"""Grade of an error -> class of the style sheet."""
+
+
+def tone(discovery: SearchResult) -> str:
+    """Class of the headline: what is unexplained is bad where much is left, and a warning near the noise."""
+    shown = discovery.verdict.shown.tone
+    return "warn" if shown == "bad" and discovery.assessment.grade is not Grade.FAR else shown
 
 
 def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
@@ -107,7 +132,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         "sentence": sentence(added.sentence),
         "equation": equation(added.equation),
         "parameters": [
-            (name, *value_and_interval(e), together(e.unit), _later(discovery, e), e.note)
+            (name, *_shown(e), together(e.unit), _later(discovery, e), e.note)
             for name, e in added.parameters.items()
         ],
         "gain": plain_number(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
@@ -115,6 +140,23 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         "score": plain_number(added.score),
         "falls": ", ".join(falls),
     }
+
+
+def _test_lines(explanation: Explanation) -> list[str]:
+    """What the tests of the last model's residuals say, in words."""
+    tests = explanation.tests.residuals if explanation.tests else {}
+    if not tests:
+        return []
+    name, last = list(tests.items())[-1]
+    return [f"{name.capitalize()}, {line}" for line in last.sentences()]
+
+
+def _shown(estimate: Estimate) -> tuple[str, str]:
+    """Value and interval, or why there is none."""
+    value, interval = value_and_interval(estimate)
+    if interval:
+        return value, f"95 %: {interval}"
+    return value, "no interval" if estimate.free else "held"
 
 
 def _places(places: Sequence[Where]) -> list[dict[str, Any]]:

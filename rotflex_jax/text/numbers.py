@@ -101,6 +101,17 @@ def ratio(value: float, floor: float | None) -> float:
     return value / floor if floor and floor > 0 else math.nan
 
 
+def multiple(times: float) -> str:
+    """How many times the noise an error is, as it stands in every sentence, tile and table.
+
+    >>> multiple(1.168), multiple(23.456), multiple(228.6)
+    ('1.17', '23.46', '229')
+    """
+    if not math.isfinite(times):
+        return ""
+    return f"{times:.2f}" if times < 100 else f"{times:.0f}" if times < 1e5 else f"{times:.2e}"
+
+
 def as_read(value: float, unit: str) -> tuple[float, str]:
     """A value in the unit that people read: degrees for angles."""
     if unit in ("rad", "rad/s"):

@@ -9,6 +9,7 @@ from rotflex_jax.discover.result import SearchResult
 from rotflex_jax.report.figures.evidence import parameters, ranking, staircase
 from rotflex_jax.report.figures.failure import profiles, residual_map
 from rotflex_jax.report.figures.registry import FIGURES
+from rotflex_jax.report.figures.residuals import residuals, responses
 from rotflex_jax.report.figures.runs import overlay, spectra
 from rotflex_jax.report.figures.torque import latent_over_motion, latent_over_time, learned_torque
 from rotflex_jax.text.plotting import Picture
@@ -23,6 +24,8 @@ __all__ = [
     "profiles",
     "ranking",
     "residual_map",
+    "residuals",
+    "responses",
     "spectra",
     "staircase",
 ]

@@ -1,0 +1,419 @@
+"""What stopped or misled a newcomer with a file of an own drive: each stumble as a test, by both doors."""
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+from test_cli import assert_one_sentence, run  # noqa: F401 - a fixture
+
+import rotflex_jax as rf
+from rotflex_jax.data.datasets import demo_recording
+from rotflex_jax.data.tables import name_and_unit
+from rotflex_jax.discover.supermodel import build
+from rotflex_jax.effects import CATALOG, Force
+from rotflex_jax.effects.base import Scale
+from rotflex_jax.errors import InputError
+from rotflex_jax.parameters import parameter
+
+RECORDING = demo_recording().slice(0, 3000)
+T, U = RECORDING.t, RECORDING.u
+THETA, ALPHA = RECORDING.y.T
+COUNTS = 4096
+
+
+def frame(**changed) -> pd.DataFrame:
+    columns = {"t": T, "voltage": U, "theta": THETA, "alpha": ALPHA} | changed
+    return pd.DataFrame({name: values for name, values in columns.items() if values is not None})
+
+
+def counted(x: np.ndarray, per_turn: float = COUNTS) -> np.ndarray:
+    return np.round(x * per_turn / (2 * np.pi)).astype(int)
+
+
+# Encoder counts
+
+
+def test_counts_become_angles() -> None:
+    table = frame(theta=counted(THETA), alpha=counted(ALPHA, 8192))
+    found = rf.load(table, counts={"theta": COUNTS, "alpha": 8192})
+    assert np.max(np.abs(found.y[:, 0] - THETA)) <= np.pi / COUNTS * 1.001
+    assert np.max(np.abs(found.y[:, 1] - ALPHA)) <= np.pi / 8192 * 1.001
+    assert rf.load(frame(theta=counted(THETA), alpha=counted(ALPHA)), counts=COUNTS).units == ("rad", "rad")
+
+
+def test_counts_are_named_as_counts_and_the_cure_works(run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame(theta=counted(THETA), alpha=counted(ALPHA)).to_csv(file, index=False)
+    status, _, err = run("check", file)
+    assert status == 2
+    assert_one_sentence(err, "counts of an encoder", "--counts 4096")
+    status, out, _ = run("check", file, "--counts", COUNTS)
+    assert status == 0
+    assert "0.0879" in out  # the step of the encoder [deg]
+    # Degrees would scale the angles wrongly, and lead to a wrong answer far above the noise.
+    status, _, err = run("check", file, "--degrees")
+    assert status == 2
+    assert_one_sentence(err, "counts of an encoder", "--counts 4096")
+
+
+def test_whole_degrees_are_no_counts() -> None:
+    whole = np.round(np.rad2deg(RECORDING.y))
+    found = rf.load(frame(theta=whole[:, 0], alpha=whole[:, 1]), degrees=True)
+    assert np.allclose(np.rad2deg(found.y), whole)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"counts": 4096, "degrees": True}, "one of the two"),
+        ({"counts": {"beta": 4096}}, "'beta'.*theta, alpha"),
+        ({"counts": 0}, "counts of one turn"),
+    ],
+)
+def test_wrong_counts_are_refused(given, said) -> None:
+    with pytest.raises(InputError, match=said):
+        rf.load(frame(), **given)
+
+
+@pytest.mark.parametrize("options", [["--counts", "many"], ["--counts", "4096", "--counts", "8192"]])
+def test_wrong_counts_are_refused_on_the_command_line(options, run, tmp_path) -> None:  # noqa: F811
+    frame().to_csv(tmp_path / "run.csv", index=False)
+    status, _, err = run("check", tmp_path / "run.csv", *options)
+    assert status == 2
+    assert_one_sentence(err, "--counts theta=4096")
+
+
+# The arm's angle in the room, and swapped columns
+
+
+def test_the_arms_angle_in_the_room_is_refused_and_the_cure_works(run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame(alpha=THETA + ALPHA).to_csv(file, index=False)
+    with pytest.raises(InputError, match="arm_absolute=True"):
+        rf.load(file)
+    status, _, err = run("check", file)
+    assert status == 2
+    assert_one_sentence(err, "angle of the arm in the room", "--arm-absolute")
+    assert np.allclose(rf.load(file, arm_absolute=True).y, RECORDING.y, atol=1e-9)
+    assert run("check", file, "--arm-absolute")[0] == 0
+    assert rf.load(file, accept="absolute").N == RECORDING.N
+
+
+def test_swapped_channels_are_noticed_and_the_cure_works(run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame(theta=ALPHA, alpha=THETA).to_csv(file, index=False)
+    status, _, err = run("discover", file)
+    assert status == 2
+    assert_one_sentence(err, "look swapped", "--output")
+    found = rf.load(file, outputs=("alpha", "theta"))
+    assert np.allclose(found.y, RECORDING.y)
+
+
+def test_measured_joints_are_not_called_swapped(measured) -> None:
+    for recording in [*measured("rotflex"), *measured("rotary_arm")]:
+        assert not {"swapped", "absolute"} & {f.kind for f in recording.findings}
+
+
+def test_arm_absolute_needs_both_angles() -> None:
+    with pytest.raises(InputError, match="theta and alpha"):
+        rf.load(frame(), outputs="theta", arm_absolute=True)
+
+
+# Time: its unit, its steps
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("s", 1.0)])
+def test_time_has_a_unit(unit, factor, run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame(t=factor * T).to_csv(file, index=False)
+    assert rf.load(file, time_unit=unit).Ts == pytest.approx(RECORDING.Ts)
+    assert run("check", file, "--time-unit", unit)[0] == 0
+
+
+def test_milliseconds_are_refused_with_a_cure_that_works(run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame(t=1e3 * T).to_csv(file, index=False)
+    status, _, err = run("check", file)
+    assert status == 2
+    assert_one_sentence(err, "--time-unit ms")
+    with pytest.raises(InputError, match="one of s, ms, us"):
+        rf.load(file, time_unit="minutes")
+
+
+def uneven(seed: int = 0) -> np.ndarray:
+    jitter = np.random.default_rng(seed).uniform(-0.2, 0.2, len(T))
+    return T + RECORDING.Ts * jitter
+
+
+def test_uneven_times_are_resampled_on_request(run, tmp_path) -> None:  # noqa: F811
+    t = uneven()
+    table = frame(t=t, theta=np.interp(t, T, THETA), alpha=np.interp(t, T, ALPHA))
+    table.to_csv(tmp_path / "run.csv", index=False)
+    with pytest.raises(InputError, match="resample='auto'"):
+        rf.load(tmp_path / "run.csv")
+    status, _, err = run("check", tmp_path / "run.csv")
+    assert status == 2
+    assert_one_sentence(err, "--resample auto")
+    found = rf.load(tmp_path / "run.csv", resample=RECORDING.Ts)
+    assert found.Ts == RECORDING.Ts
+    inside = slice(5, -5)
+    expected = np.interp(found.t, T, THETA)
+    # The error of a line between samples is at most an eighth of the second difference.
+    bound = 0.25 * np.max(np.abs(np.diff(THETA, 2))) + 1e-12
+    assert np.max(np.abs(found.y[inside, 0] - expected[inside])) < bound
+    assert set(found.u) <= set(U)  # held, and so never a value that was not given
+    assert [f.severity for f in found.findings if f.kind == "resampled"] == ["note"]
+    assert "Resampled" in run("check", tmp_path / "run.csv", "--resample", "auto")[1]
+
+
+def test_lost_rows_are_said_and_parts_of_the_recording_still_say_it() -> None:
+    keep = np.ones(len(T), bool)
+    keep[[700, 701, 1500]] = False
+    table = frame()[keep]
+    with pytest.raises(InputError, match="about 2 samples lost"):
+        rf.load(table)
+    found = rf.load(table, resample="auto")
+    assert found.N == RECORDING.N
+    for recording in (found, *found.split(0.7)):
+        said = [f for f in recording.findings if f.kind == "resampled"]
+        assert [f.severity for f in said] == ["warning"]
+        assert "about 3 rows are lost" in said[0].message
+
+
+def test_a_long_gap_is_not_bridged() -> None:
+    with pytest.raises(InputError, match="no resampling should bridge"):
+        rf.load(frame().drop(range(700, 800)), resample="auto")
+    with pytest.raises(InputError, match="must not fall"):
+        rf.load(frame(t=np.r_[T[:100], T[:-100]]), resample="auto")
+
+
+# Headers
+
+
+@pytest.mark.parametrize(
+    ("names", "scale"),
+    [
+        (("Time [s]", "Voltage [V]", "Theta [rad]", "Alpha [rad]"), (1.0, 1.0)),
+        (("Time [ms]", "Voltage (V)", "Theta [deg]", "Alpha [°]"), (1e3, 180 / np.pi)),
+        (("T", "VOLTAGE", "THETA", "ALPHA"), (1.0, 1.0)),
+    ],
+)
+def test_headers_with_units_are_recognised(names, scale, run, tmp_path) -> None:  # noqa: F811
+    table = np.column_stack([scale[0] * T, U, scale[1] * THETA, scale[1] * ALPHA])
+    pd.DataFrame(table, columns=list(names)).to_csv(tmp_path / "run.csv", index=False)
+    found = rf.load(tmp_path / "run.csv")
+    assert found.Ts == pytest.approx(RECORDING.Ts)
+    assert np.allclose(found.y, RECORDING.y)
+    assert (found.input_name, found.input_unit) == ("voltage", "V")
+    assert run("check", tmp_path / "run.csv")[0] == 0
+
+
+def test_two_columns_that_could_be_meant_are_none() -> None:
+    table = frame(theta=None).assign(**{"Theta [rad]": THETA, "THETA": THETA})
+    with pytest.raises(InputError, match="no column 'theta'"):
+        rf.load(table)
+
+
+def test_an_index_is_no_unit() -> None:
+    assert name_and_unit("log[0]") == ("log[0]", "")
+    assert name_and_unit("Speed [rad/s]") == ("Speed", "rad/s")
+
+
+# The input
+
+
+@pytest.mark.parametrize("name", ["Current [A]", "motor_current"])
+def test_a_current_is_no_voltage(name, run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame(voltage=None).assign(**{name: U}).to_csv(file, index=False)
+    found = rf.load(file, input=name)
+    assert (found.input_name, found.input_unit) == (name.split(" [")[0], "A")
+    status, _, err = run("discover", file, "--input", name)
+    assert status == 2
+    assert_one_sentence(err, "is in A, but the model is driven in V")
+
+
+def test_a_smooth_input_on_the_command_line(run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame().to_csv(file, index=False)
+    held, smooth = (run("simulate", file, "--intersample", kind) for kind in ("held", "smooth"))
+    assert held[0] == smooth[0] == 0
+    assert held[1] != smooth[1]
+    solver = rf.Exponential(between="smooth", substeps=4)
+    y_hat = rf.Model(rf.joints.paper(), solver).simulate(RECORDING)
+    fit = rf.metrics.fit_percent(RECORDING, y_hat)
+    assert f"theta {fit['theta']:.1f} %" in smooth[1]
+    status, _, err = run("simulate", file, "--intersample", "linear")
+    assert status == 2
+    assert_one_sentence(err, "held or smooth")
+
+
+# Public data by name
+
+
+def test_a_public_joint_is_searched_by_its_name(run, measured, monkeypatch) -> None:  # noqa: F811
+    recordings = measured("rotflex")
+    calls: list = []
+
+    def search(model, train, validation, **options):
+        calls.append((model, train, validation))
+        raise InputError("Enough.")
+
+    monkeypatch.setattr(rf, "discover", search)
+    assert run("discover", "rotflex")[0] == 2
+    ((model, train, validation),) = calls
+    assert model.mechanism == rf.joints.quanser_2010()
+    assert validation == []  # the two validate each other
+    assert [r.source for r in train] == [r.source for r in recordings]
+    assert np.array_equal(train[1].y, recordings[1].y)
+    run("discover", "rotflex", "--joint", "paper:stiffness=1.2", "--split", "0.6")
+    assert calls[1][0].mechanism == rf.joints.paper(stiffness=1.2)
+    assert len(calls[1][1]) == len(calls[1][2]) == 2
+    status, out, _ = run("check", "rotflex")
+    assert status == 0
+    assert out.count("those of quanser_2010") == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (("emps",), "not searched by its name"),
+        (("rotflex", "--degrees"), "leave that option out"),
+        (("rotflex", "rotflex"), "twice"),
+    ],
+)
+def test_what_is_no_search_by_name_is_refused(line, said, run, measured) -> None:  # noqa: F811
+    measured("rotflex")
+    status, _, err = run("discover", *line)
+    assert status == 2
+    assert_one_sentence(err, said)
+
+
+# Effects of one's own
+
+
+@dataclasses.dataclass(frozen=True)
+class Power(Force):
+    """tau = -stiffness position^order"""
+
+    name: ClassVar[str] = "test_power"
+    title: ClassVar[str] = "spring of a power"
+    equation: ClassVar[str] = "tau = -stiffness * position^order"
+    amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)
+    given: ClassVar[object] = [[{"stiffness": 1, "offset": 0.0}]]
+
+    stiffness: float = parameter(1.0, unit="N m/rad^3")
+    offset: float = parameter(0.0, unit="rad", lower=-1.0)
+    order: int = 3  # chosen, not fitted
+
+    def force(self, position, speed, voltage):
+        return -self.stiffness * (position - self.offset) ** self.order
+
+    @classmethod
+    def probes(cls, scale):
+        return cls.given
+
+
+SCALE = Scale(voltage=5.0, speed=3.0, position=0.3, torque=0.1)
+
+
+@pytest.mark.parametrize(
+    ("probes", "said"),
+    [
+        ([[{"stiffness": 0.1}]], "A probe of Power lacks offset, but needs .* stiffness, offset"),
+        ([[{"stiffness": 0.1, "offset": 0.0, "width": 1.0}]], "has width too"),
+        ([{"stiffness": 0.1, "offset": 0.0}], "list of shapes, each a list"),
+        ([["stiffness"]], "must name its parameters"),
+        ([[{"stiffness": "large", "offset": 0.0}]], "stiffness='large', but needs a finite number"),
+        ([[{"stiffness": np.nan, "offset": 0.0}]], "finite number"),
+    ],
+)
+def test_a_wrong_probe_is_told_in_a_sentence(probes, said, monkeypatch) -> None:
+    monkeypatch.setattr(Power, "given", probes)
+    with pytest.raises(InputError, match=said):
+        Power.probe_values(SCALE)
+    # The search asks by the same door.
+    monkeypatch.setitem(CATALOG, Power.name, Power)
+    scales = dict.fromkeys(("hub", "arm", "joint"), SCALE)
+    with pytest.raises(InputError, match=said):
+        build(rf.joints.paper(), [(Power, "joint")], scales)
+
+
+def test_a_right_probe_is_taken_and_whole_numbers_are_numbers() -> None:
+    assert Power.probe_values(SCALE) == (((1.0, 0.0),),)
+
+
+def test_a_whole_number_that_is_chosen_is_a_plain_field(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(CATALOG, Power.name, Power)
+    model = rf.Model(rf.joints.paper() + Power(at="joint", stiffness=40.0, order=5))
+    assert "joint.test_power.order" not in model.mechanism.parameter_names
+    model.save(tmp_path / "model.json")
+    assert rf.Model.load(tmp_path / "model.json") == model
+    assert Power(at="joint", order=5).force(2.0, 0.0, 0.0) == -32.0
+
+
+# MATLAB and spreadsheets
+
+
+def test_simulinks_structure_with_time_is_listed_to_its_leaves(tmp_path) -> None:
+    signals = np.zeros(3, dtype=[("values", object), ("label", object), ("dimensions", object)])
+    for k, (values, label) in enumerate(((U, "u"), (THETA, "theta"), (ALPHA, "alpha"))):
+        signals[k] = (values[:, None], label, 1.0)
+    scipy.io.savemat(
+        tmp_path / "run.mat", {"out": {"time": T, "signals": signals, "blockName": "bench/Scope"}}
+    )
+    outputs = ("out.signals[1].values", "out.signals[2].values")
+    found = rf.load(tmp_path / "run.mat", time="out.time", input="out.signals[0].values", outputs=outputs)
+    assert np.allclose(found.y, RECORDING.y)
+    with pytest.raises(InputError, match=r"out\.time, out\.signals\[0\]\.values, out\.signals\[1\]\.values"):
+        rf.load(tmp_path / "run.mat")
+
+
+def test_cells_of_signals_are_listed_too(tmp_path) -> None:
+    cells = np.empty(2, dtype=object)
+    cells[:] = [THETA, ALPHA]
+    scipy.io.savemat(tmp_path / "run.mat", {"t": T, "voltage": U, "y": cells})
+    assert np.allclose(rf.load(tmp_path / "run.mat", outputs=("y[0]", "y[1]")).y, RECORDING.y)
+
+
+def test_objects_that_only_matlab_reads_are_named(measured) -> None:
+    # A measured file has an object of class string among its matrices.
+    from rotflex_jax.data.datasets import fetch
+
+    measured("rotflex")
+    with pytest.raises(InputError, match=r"objects that only MATLAB reads .*\(string\): save their"):
+        rf.load(fetch("rotflex")[0])
+
+
+def test_a_spreadsheet_is_read(run, tmp_path) -> None:  # noqa: F811
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    sheet = book.active
+    sheet.append(["Time [ms]", "Voltage [V]", "Theta [deg]", "Alpha [deg]"])
+    for row in zip(1e3 * T, U, np.rad2deg(THETA), np.rad2deg(ALPHA), strict=True):
+        sheet.append([float(x) for x in row])
+    book.save(tmp_path / "run.xlsx")
+    found = rf.load(tmp_path / "run.xlsx")
+    assert np.allclose(found.y, RECORDING.y)
+    assert found.source == "run.xlsx, sheet Sheet"
+    sheet.cell(row=12, column=3, value="n/a")
+    book.save(tmp_path / "bad.xlsx")
+    with pytest.raises(InputError, match=r"'Theta .deg.' holds 'n/a' at row 12"):
+        rf.load(tmp_path / "bad.xlsx")
+    (tmp_path / "broken.xlsx").write_bytes((tmp_path / "run.xlsx").read_bytes()[:2000])
+    with pytest.raises(InputError, match="cannot be read as a spreadsheet"):
+        rf.load(tmp_path / "broken.xlsx")
+    with pytest.raises(InputError, match="more than the"):
+        rf.load(tmp_path / "run.xlsx", max_bytes=50_000)
+
+
+def test_a_spreadsheet_without_its_package_says_which(tmp_path, monkeypatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    (tmp_path / "run.xlsx").write_bytes(b"PK")
+    with pytest.raises(InputError, match="needs the package openpyxl"):
+        rf.load(tmp_path / "run.xlsx")
