@@ -55,6 +55,11 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "forward_regression": (rf.forward_regression, {"basis": SERIES, "recordings": RUN, "channel": "theta"}),
     "simulate": (rf.simulate, {"mechanism": JOINT, "u": U, "Ts": 0.002}),
     "linearise": (rf.linearise, {"mechanism": JOINT}),
+    "keep_programs": (rf.keep_programs, {"folder": True}),
+    "compare_plot": (
+        lambda recording, model, **options: rf.compare_plot(recording, model, **options),
+        {"recording": RUN, "model": JOINT},
+    ),
     "locate": (
         rf.locate,
         {"recording": RUN, "residual": Y, "channels": ("theta", "alpha"), "noise": [1e-3, 1e-3]},
@@ -382,6 +387,10 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("sweep", "band"): [((NAN, 1), "nan to 1 Hz"), (None, "is None")],
     ("pulse", "amplitude"): NO_NUMBER,
     ("pulse", "width"): NO_SECONDS,
+    ("keep_programs", "folder"): [(3, "is 3"), (None, "is None"), (__file__, "is a file")],
+    ("compare_plot", "recording"): [("x", "x|recording"), (None, "None|recording")],
+    ("compare_plot", "model"): [("x", "x|mechanism|model"), (None, "None|mechanism|model")],
+    ("compare_plot", "seconds"): [(NAN, "nan"), (-1, "-1")],
     ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
 }
 
@@ -409,7 +418,7 @@ def test_nonsense_is_refused(
 
 
 def test_every_public_function_is_in_the_table() -> None:
-    settings = {"enable_compilation_cache", "enable_fast_loops", "live"}
+    settings = {"enable_compilation_cache", "enable_fast_loops", "live", "performance"}
     functions = {name for name in rf.__all__ if inspect.isfunction(getattr(rf, name))} - settings
     inputs = set(excitation.INPUTS)
     assert functions | inputs <= {function for function, _ in BAD}

@@ -33,7 +33,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
-from rotflex_jax.runtime.xla import cores, loops_are_fast, start_with_fast_loops
+from rotflex_jax import checks
+from rotflex_jax.errors import InputError
+from rotflex_jax.runtime.xla import FAST_LOOPS_OPTION, cores, loops_are_fast, start_with_fast_loops
 
 _PACKAGE, _SOURCES = __name__.partition(".")[0], sorted(Path(__file__).parents[1].rglob("*.py"))
 # The source as loaded by this process; nothing is stored if a file has changed since about then.
@@ -143,7 +145,17 @@ def keep_programs(folder: str | Path | bool = True) -> None:
 
     Args:
         folder: The folder; True for the usual one in the user's cache, False for none.
+
+    Raises:
+        InputError: Neither a path nor a truth value, or a path to a file.
     """
+    if not isinstance(folder, bool | str | Path):
+        raise InputError(
+            f"Argument `folder` must be a path, True or False, but is {checks.shown(folder)}; give True for "
+            "the usual folder."
+        )
+    if not isinstance(folder, bool) and Path(folder).exists() and not Path(folder).is_dir():
+        raise InputError(f"Argument `folder` must be a folder, but {folder} is a file; give another one.")
     _storage.off = folder is False
     _storage.chosen = None if isinstance(folder, bool) else Path(folder)
 
@@ -220,7 +232,7 @@ def performance() -> Performance:
 def _usual_folder() -> Path:
     import pooch
 
-    return Path(pooch.os_cache("rotflex_jax")) / "programs"
+    return Path(pooch.os_cache("rotflex_jax")) / "compiled" / "programs"  # as the command line has it
 
 
 def release_programs() -> None:
@@ -284,7 +296,8 @@ def _surroundings() -> str:
     """Hash of everything that all programs depend on."""
     values = {n: v for n, v in jax.config.values.items() if "cache" not in n and n not in _SETTINGS}
     parts = (_SOURCE, jax.__version__, metadata.version("jaxlib"), sorted(values.items()), _processor())
-    parts = (*parts, os.environ.get("XLA_FLAGS", ""), loops_are_fast())
+    options = [o for o in os.environ.get("XLA_FLAGS", "").split() if FAST_LOOPS_OPTION not in o]
+    parts = (*parts, options, loops_are_fast())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 

@@ -18,7 +18,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Num
 from threadpoolctl import ThreadpoolController
 
-_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+FAST_LOOPS_OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
 
 def enable_fast_loops(limit: int = 262144) -> bool:
@@ -49,12 +49,12 @@ def enable_fast_loops(limit: int = 262144) -> bool:
         >>> _ = os.environ.pop("XLA_FLAGS") if kept is None else os.environ.update(XLA_FLAGS=kept)
     """
     flags = os.environ.get("XLA_FLAGS", "").strip()
-    if _OPTION in flags:
+    if FAST_LOOPS_OPTION in flags:
         return True
     if flags and not flags.startswith("-"):
         return False
     # XLA merges several --xla_backend_extra_options, so the user's own stay in force.
-    os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={limit}".strip()
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={FAST_LOOPS_OPTION}={limit}".strip()
     return True
 
 
