@@ -23,13 +23,14 @@ def ended(
     """The verdict of a search that ended so near to the noise, with these equivalents of each round."""
     floor = {"theta": 5e-4, "alpha": 2e-3}
     errors = {"theta": 5e-4, "alpha": 2e-3 * ratio}
+    baseline: Any = SimpleNamespace(held_out_rmse_windows={"theta": 5e-2, "alpha": 2e-1})
     final: Any = SimpleNamespace(
         held_out_rmse_windows=errors, process_noise_nats=noise_nats, window_seconds=2.0
     )
     found: Any = [SimpleNamespace(effect="coulomb", port="hub", equivalent=others) for others in rounds]
     ranking: Any = [SimpleNamespace(excited=k < excited) for k in range(candidates)]
     recordings: Any = [SimpleNamespace(N=SAMPLES // 2)] * 2
-    return end_state(found, final, floor, ranking, recordings)[0]
+    return end_state(baseline, found, final, floor, ranking, recordings)[0]
 
 
 @pytest.mark.parametrize(("share", "explained"), [(0.999, True), (1.001, False)])

@@ -1,6 +1,7 @@
 """Programs on disk: found again by another process, and only where nothing they depend on differs."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import subprocess
@@ -20,6 +21,7 @@ import rotflex_jax as rf
 from rotflex_jax.effects import Coulomb, LuGre
 from rotflex_jax.effects.base import Force
 from rotflex_jax.mechanism import Exponential
+from rotflex_jax.mechanism.units import Units
 from rotflex_jax.parameters import parameter
 from rotflex_jax.runtime import persistent_jit
 from rotflex_jax.runtime.persistent_jit import (
@@ -92,8 +94,27 @@ def test_a_damaged_file_is_replaced(folder: Path, damage: str) -> None:
     flipped[len(whole) // 2] ^= 1
     file.write_bytes({"cut": whole[:40], "a bit": bytes(flipped), "empty": b""}.get(damage, b"text" * 100))
     np.testing.assert_array_equal(new()(2.0, x), 2 * x)
-    assert len(traced) == 2 and files(folder) == [file] and file.read_bytes() != whole[:40]
-    np.testing.assert_array_equal(new()(2.0, x), 2 * x)
+    assert len(traced) == 2 and files(folder) == [file]
+    digest, content = file.read_bytes()[:32], file.read_bytes()[32:]
+    assert hashlib.sha256(content).digest() == digest
+
+
+def test_two_machines_with_other_units_have_other_programs() -> None:
+    texts = [static_key(Units("m", "N", 10.0, size)) for size in (1e-3, 2e-3)]
+    assert all(texts) and texts[0] != texts[1]
+
+
+def test_folders_of_somebody_else_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
+    others = [tmp_path / name for name in ("thesis", "photos", "data", "more", "a", "b", "c")]
+    for other in others:
+        other.mkdir()
+    keep_programs(tmp_path)
+    try:
+        new()(2.0, np.ones(1))
+    finally:
+        keep_programs(True)
+    assert all(other.is_dir() for other in others) and len(list(tmp_path.iterdir())) == len(others) + 1
 
 
 def test_what_was_not_used_for_long_is_deleted_first(folder: Path) -> None:
@@ -185,13 +206,13 @@ def test_loops_are_fast_unless_jax_has_started_before(when: str, expected: str) 
 
 
 def test_old_versions_are_deleted(folder: Path) -> None:
-    for age in range(5):
-        old = folder / "programs" / f"version{age}"
+    for age in range(9):
+        old = folder / "programs" / f"{age:032x}"
         old.mkdir(parents=True)
         os.utime(old, (1e9 - age, 1e9 - age))
     new()(2.0, np.ones(1))
     left = {f.name for f in (folder / "programs").iterdir()}
-    assert {"version0", "version1"} < left and len(left) == 3
+    assert {f"{age:032x}" for age in range(5)} < left and len(left) == 6
 
 
 def test_the_text_of_a_structure_identifies_it() -> None:

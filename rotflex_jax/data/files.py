@@ -285,7 +285,17 @@ def load(
     y = {}
     for channel, name in chosen.items():
         values = _column(table, name, "outputs=", {})
-        y[channel] = _angle(table, channel, name, values, degrees, per_turn.get(channel), accepted)
+        per = per_turn.get(channel)
+        unit = (units or {}).get(channel, "rad")
+        if unit.startswith("rad"):
+            y[channel] = _angle(table, channel, name, values, degrees, per, accepted)
+        elif degrees or per is not None:
+            raise InputError(
+                f"{table.label}: column {name!r} was to be converted to rad, but its unit is given as "
+                f"{unit!r}; leave out the unit, or the conversion (degrees, counts)."
+            )
+        else:
+            y[channel] = values
         if len(values) != len(u):
             raise InputError(
                 f"{table.label}: {u_name!r} has {len(u)} samples and {name!r} has "

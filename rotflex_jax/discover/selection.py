@@ -188,7 +188,8 @@ def validate_from_best_states(
         richer = [r for r in candidates if _contained(t, r) and r.log_likelihood > t.log_likelihood]
         if richer:
             best = max(richer, key=lambda r: r.log_likelihood)
-            again = validate(validation, t.hypothesis, best)
+            inner = t.free_run.adapted if t.free_run else None
+            again = validate(validation, t.hypothesis, best, inner)
             again = dataclasses.replace(
                 again, location=t.location, parameter_count=t.parameter_count, free_run=t.free_run
             )

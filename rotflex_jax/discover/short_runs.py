@@ -1,7 +1,8 @@
 """Free runs that start again every few seconds, by the compiled programs of the search.
 
-The same runs as `Model.simulate_windows`, with first states from the first samples of each window, but for
-states that no sensor measures, which are given: a model of its own would be compiled for every candidate.
+As in `Model.simulate_windows`, positions and speeds come from the first samples of each window. States that
+no sensor measures are given here, and come from a run over the whole recording there. A model of its own
+would be compiled for every candidate.
 """
 
 import dataclasses

@@ -219,7 +219,8 @@ class GreyBoxProblem:
             if number:
                 point = self._at_windows(point, stage.windows)
             follows, best = self._follows(stage), None
-            for repetition in range(MOST_REPETITIONS if last and follows else 1):
+            renews = stage.process_noise is not None
+            for repetition in range(MOST_REPETITIONS if last and (follows or renews) else 1):
                 point, K = self._with_shown_states(point, stage), self._gains(point, stage)
                 found = self._minimum(
                     point, stage, K, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE
@@ -231,6 +232,9 @@ class GreyBoxProblem:
                 if follows:
                     # What counts is the run from the states that go with these parameters.
                     point = self._with_shown_states(point, stage)
+                if renews:  # and the prediction with the gain that goes with them
+                    K = self._gains(point, stage)
+                if follows or renews:
                     cost = self.equations(point, stage, K).cost
                 history.append(float(cost))
                 if best is None or cost < best[0]:
@@ -254,7 +258,7 @@ class GreyBoxProblem:
             return status
         return (
             "stopped: no step lowers the cost, though its slopes promise to move parameters by more than "
-            f"{np.sqrt(2 * left):.1f} standard deviations; the cost is rugged here"
+            f"{np.sqrt(2 * left):.1f} standard deviations; the cost has many local minima here"
         )
 
     @functools.cached_property
@@ -624,8 +628,7 @@ def fit(
         window_seconds: Start again every so often [s], each time with a first state of its own: the
             parameters with which free runs of that length are best. Delays and lags go on across windows, and
             memories begin as a run over the whole recording leaves them, as in the errors over windows.
-        max_steps: Most iterations of each minimisation; there are several, each with the scale of the one
-            before.
+        max_steps: Most iterations of each minimisation, of which there are several.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
         devices: Those of this process that several recordings are shared out to; all of them if None, unless

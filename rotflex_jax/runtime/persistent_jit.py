@@ -18,6 +18,7 @@ import hashlib
 import os
 import pickle
 import platform
+import re
 import shutil
 import tempfile
 import threading
@@ -35,14 +36,14 @@ from jax.experimental import serialize_executable
 
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
-from rotflex_jax.runtime.xla import FAST_LOOPS_OPTION, cores, loops_are_fast, start_with_fast_loops
+from rotflex_jax.runtime.xla import FAST_LOOPS_FLAG, cores, loops_are_fast, start_with_fast_loops
 
 _PACKAGE, _SOURCES = __name__.partition(".")[0], sorted(Path(__file__).parents[1].rglob("*.py"))
 # The source as loaded by this process; nothing is stored if a file has changed since about then.
 _LOADED, _ABOUT = time.time(), 10.0
 _SOURCE = hashlib.sha256(b"".join(file.read_bytes() for file in _SOURCES)).hexdigest()
-# Versions of the source whose programs stay on disk, such as working copy, installed, and for comparison.
-_VERSIONS = 3
+# Versions whose programs stay on disk, by source of the package, JAX with its settings, and processor.
+_VERSIONS = 6
 # Settings that a program is traced with and that a context may change.
 _SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
 # Programs on disk: at most so many bytes of one version of the source, checked after so many are written.
@@ -101,12 +102,13 @@ class PersistentJit:
         kinds = tuple(jax.typeof(leaf) for leaf in leaves)
         settings = tuple(getattr(jax.config, s) for s in _SETTINGS)
         key = (known, tree, kinds, settings)
-        if key not in self._held:
+        program = self._held.get(key)
+        if program is None:
             texts = [static_key(x) for x in known]
             lasting = bool(programs_folder()) and all(texts) and _unchanged()
             name = f"{self._name}{texts}{tree}{kinds}{settings}" if lasting else ""
-            self._held[key] = self._made(known, tree, leaves, name)
-        return self._held[key](*leaves)
+            program = self._held[key] = self._made(known, tree, leaves, name)
+        return program(*leaves)
 
     def __len__(self) -> int:
         """How many programs the process holds: one per structure and shapes of the arguments."""
@@ -144,20 +146,20 @@ def keep_programs(folder: str | Path | bool = True) -> None:
     """Choose where compiled programs are kept, for this process.
 
     Args:
-        folder: The folder; True for the usual one in the user's cache, False for none.
+        folder: The folder; True for the usual one, which `programs_folder` names; False for none.
 
     Raises:
         InputError: Neither a path nor a truth value, or a path to a file.
     """
-    if not isinstance(folder, bool | str | Path):
+    if not isinstance(folder, bool | str | Path) or folder == "":
         raise InputError(
             f"Argument `folder` must be a path, True or False, but is {checks.shown(folder)}; give True for "
             "the usual folder."
         )
-    if not isinstance(folder, bool) and Path(folder).exists() and not Path(folder).is_dir():
+    if not isinstance(folder, bool) and (path := Path(folder).expanduser()).exists() and not path.is_dir():
         raise InputError(f"Argument `folder` must be a folder, but {folder} is a file; give another one.")
     _storage.off = folder is False
-    _storage.chosen = None if isinstance(folder, bool) else Path(folder)
+    _storage.chosen = None if isinstance(folder, bool) else Path(folder).expanduser()
 
 
 def programs_folder() -> Path | None:
@@ -169,12 +171,12 @@ def programs_folder() -> Path | None:
         kept.
     """
     start_with_fast_loops()
-    if _storage.off or len(jax.devices()) > 1:
+    if _storage.off or len(jax.devices()) > 1 or jax.default_backend() != "cpu":
         return None
     if _storage.chosen is not None:
         return _storage.chosen
     if named := os.environ.get(FOLDER_VARIABLE):
-        return None if named == "off" else Path(named)
+        return None if named == "off" else Path(named).expanduser()
     values = jax.config.values
     beside = values["jax_compilation_cache_dir"] if values["jax_enable_compilation_cache"] else None
     if beside and "://" not in beside:
@@ -223,8 +225,7 @@ def performance() -> Performance:
     >>> keep_programs(True)
     """
     folder = programs_folder()
-    own = folder / _surroundings() if folder else None
-    sizes = [f.stat().st_size for f in own.iterdir()] if own and own.is_dir() else []
+    sizes = [size for _, size, _ in _stored(folder / _surroundings())] if folder else []
     return Performance(folder, len(sizes), sum(sizes), loops_are_fast(), cores(), jax.default_backend())
 
 
@@ -269,10 +270,14 @@ def _parts(value: Any) -> Iterator[str | None]:
         yield from _parts(tuple(sorted(value)))
     elif not kind.__module__.startswith(f"{_PACKAGE}."):
         yield None
-    else:
+    elif isinstance(value, tuple):  # a named one
         yield f"{kind.__module__}.{kind.__qualname__}"
-        fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
-        yield from _parts(tuple(getattr(value, f.name) for f in fields))
+        yield from _parts(tuple(value))
+    elif dataclasses.is_dataclass(value):
+        yield f"{kind.__module__}.{kind.__qualname__}"
+        yield from _parts(tuple(getattr(value, f.name) for f in dataclasses.fields(value)))
+    else:
+        yield None
 
 
 def _plain() -> bool:
@@ -291,16 +296,16 @@ def _options() -> dict[str, Any]:
     return known
 
 
-@functools.cache
 def _surroundings() -> str:
     """Hash of everything that all programs depend on."""
     values = {n: v for n, v in jax.config.values.items() if "cache" not in n and n not in _SETTINGS}
     parts = (_SOURCE, jax.__version__, metadata.version("jaxlib"), sorted(values.items()), _processor())
-    options = [o for o in os.environ.get("XLA_FLAGS", "").split() if FAST_LOOPS_OPTION not in o]
+    options = [o for o in os.environ.get("XLA_FLAGS", "").split() if o != FAST_LOOPS_FLAG]
     parts = (*parts, options, loops_are_fast())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
+@functools.cache
 def _processor() -> str:
     """What machine code depends on."""
     known = Path("/proc/cpuinfo")
@@ -333,6 +338,7 @@ def _read(file: Path, leaves: list[Any]) -> Any:
         # What JAX had loaded from its own cache, and not compiled, may be stored without its functions.
         jax.block_until_ready(program(*leaves))
         os.utime(file)  # what was used last is deleted last
+        os.utime(file.parent)
         return program
     except Exception:  # missing, or of another version: it is compiled again
         return None
@@ -361,17 +367,27 @@ def _write(program: Any, file: Path) -> None:
 
 def _shrink(folder: Path, most: int) -> None:
     """Deletes the programs that were not used for the longest time, down to so many bytes."""
-    found = sorted(((f.stat().st_mtime, f.stat().st_size, f) for f in folder.iterdir()), reverse=True)
     total = 0
-    for _, size, file in found:
+    for _, size, file in sorted(_stored(folder), reverse=True):
         total += size
         if total > most:
             file.unlink(missing_ok=True)
 
 
+def _stored(folder: Path) -> Iterator[tuple[float, int, Path]]:
+    """When each program in a folder was used last, its size, and its file."""
+    for file in folder.glob("*"):
+        with contextlib.suppress(FileNotFoundError):  # another process has deleted it
+            yield file.stat().st_mtime, file.stat().st_size, file
+
+
 def _clear(folder: Path) -> None:
-    """Deletes the oldest versions, so that with one more there are `_VERSIONS`."""
-    found = sorted(folder.glob("*/"), key=lambda f: f.stat().st_mtime, reverse=True)
+    """Deletes what was used least recently, so that with one more there are programs of `_VERSIONS`.
+
+    A folder that a user chose may hold other things, so that only folders with names like its own count.
+    """
+    own = (f for f in folder.glob("*/") if re.fullmatch("[0-9a-f]{32}", f.name))
+    found = sorted(own, key=lambda f: f.stat().st_mtime, reverse=True)
     for old in found[_VERSIONS - 1 :]:
         shutil.rmtree(old, ignore_errors=True)
 

@@ -7,6 +7,7 @@ with loops over samples compiled into one function each (`start_with_fast_loops`
 import contextlib
 import functools
 import os
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -18,10 +19,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Num
 from threadpoolctl import ThreadpoolController
 
-FAST_LOOPS_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+_OPTION, _LIMIT = "xla_cpu_small_while_loop_byte_threshold", 262144
+FAST_LOOPS_FLAG = f"--xla_backend_extra_options={_OPTION}={_LIMIT}"
+"""What `enable_fast_loops` adds to `XLA_FLAGS` unless it is given another limit."""
 
 
-def enable_fast_loops(limit: int = 262144) -> bool:
+def enable_fast_loops(limit: int = _LIMIT) -> bool:
     """Ask XLA to compile a small loop on the CPU into one function, not one call per operation.
 
     A scan over the samples of a recording spends most of its time starting operations. XLA fuses a
@@ -49,12 +52,12 @@ def enable_fast_loops(limit: int = 262144) -> bool:
         >>> _ = os.environ.pop("XLA_FLAGS") if kept is None else os.environ.update(XLA_FLAGS=kept)
     """
     flags = os.environ.get("XLA_FLAGS", "").strip()
-    if FAST_LOOPS_OPTION in flags:
+    if _OPTION in flags:
         return True
     if flags and not flags.startswith("-"):
         return False
     # XLA merges several --xla_backend_extra_options, so the user's own stay in force.
-    os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={FAST_LOOPS_OPTION}={limit}".strip()
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={limit}".strip()
     return True
 
 
@@ -101,19 +104,25 @@ def enable_fast_start() -> None:
     enable_compilation_cache()
 
 
+_starting = threading.Lock()
+
+
 @functools.cache
 def start_with_fast_loops() -> None:
     """Start XLA as `enable_fast_loops` would, unless it has been started; the environment stays as it was.
 
     XLA reads its options once, when it starts.
     """
-    before = os.environ.get("XLA_FLAGS")
-    if enable_fast_loops():
-        jax.devices()
-    if before is None:
-        os.environ.pop("XLA_FLAGS", None)
-    else:
-        os.environ["XLA_FLAGS"] = before
+    with _starting:
+        before = os.environ.get("XLA_FLAGS")
+        try:
+            if enable_fast_loops():
+                jax.devices()
+        finally:
+            if before is None:
+                os.environ.pop("XLA_FLAGS", None)
+            else:
+                os.environ["XLA_FLAGS"] = before
 
 
 @functools.cache
