@@ -54,7 +54,8 @@ def joint_errors(way: str, stage: int) -> str:
 def joint_effects(way: str) -> list[str]:
     """Effects that a search found, in order, in words."""
     rounds = results("B1.json")["search"][WAYS[way]]["rounds"]
-    return [f"{IN_WORDS.get(r['effect'], r['effect'].replace('_', ' '))} at the {r['port']}" for r in rounds]
+    place = lambda port: f"of {port}" if port in ("theta", "alpha") else f"at the {port}"  # noqa: E731
+    return [f"{IN_WORDS.get(r['effect'], r['effect'].replace('_', ' '))} {place(r['port'])}" for r in rounds]
 
 
 def joint_first(way: str) -> str:

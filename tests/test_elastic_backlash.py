@@ -241,7 +241,7 @@ def test_slopes_are_those_of_central_differences():
 
 def test_c_code_can_be_written():
     text = to_c(Model(plain() + elastic()), Ts)
-    assert "play of a gear with elastic teeth" in text and "NAN" not in text
+    assert "backlash with elastic teeth" in text and "NAN" not in text
 
 
 @pytest.mark.parametrize(

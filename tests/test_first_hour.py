@@ -422,7 +422,7 @@ def test_a_spreadsheet_without_its_package_says_which(tmp_path, monkeypatch) -> 
 def test_a_channel_that_keeps_its_own_unit_is_not_converted(tmp_path) -> None:
     rows = np.column_stack([np.arange(60) * 0.01, np.sin(np.arange(60)), 100 * np.cos(np.arange(60))])
     np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="t [s],u [V],w [deg/s]", comments="")
-    told = {"time": "t", "input": "u", "outputs": ["w"]}
+    told = {"time": "t", "input": "u", "outputs": {"w": "w"}}
     kept = rf.load(tmp_path / "a.csv", **told, units={"w": "deg/s"})
     np.testing.assert_allclose(kept.y[:, 0], rows[:, 2])
     assert kept.units == ("deg/s",)

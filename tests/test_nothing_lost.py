@@ -141,7 +141,7 @@ def test_rounds_are_kept_until_the_search_has_ended(tmp_path: Path) -> None:
     assert found["stopped"] is True
     assert found["stages"] == [
         {"model": "as it is", "held_out_rmse_windows": {"theta": 0.1}},
-        {"model": "+ coulomb at hub", "held_out_rmse_windows": {"theta": 0.05}},
+        {"model": "+ Coulomb friction at hub", "held_out_rmse_windows": {"theta": 0.05}},
     ]
     assert len(said) == 4
     kept.remove()
@@ -207,7 +207,7 @@ def test_stopped_at_any_moment_with_the_rounds_that_were_finished(where: str, tm
     assert last.startswith("rotflex: stopped; ") and "found.stopped.json" in last
     assert [s["model"] for s in json.loads((tmp_path / "found.stopped.json").read_text())["stages"]] == [
         "as it is",
-        "+ coulomb at hub",
+        "+ Coulomb friction at hub",
     ]
     assert (tmp_path / "found.json").read_text() == "of an earlier search"
     assert not (tmp_path / "half.part").exists()

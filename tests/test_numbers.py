@@ -121,7 +121,8 @@ KNOWN = {
     "many_recordings.md": {"3.5": "batch.workers.PROCESS_MEMORY [GB], compared below"},
     "first_look.md": {
         "3.11": "version of Python",
-        **dict.fromkeys(["1.01", "0.7"], "what the demo prints, compared below"),
+        **dict.fromkeys(["1.01", "0.7", "99.82", "99.55"], "what the demo prints, compared below"),
+        "1.5": "limit of what counts as explained, times the noise",
         "0.2": "time that a model may look at, a setting [s]",
         **dict.fromkeys(["0.000", "0.0000", "0.002", "0.31", "0.35", "0.0001", "-0.0002"], "lines of a file"),
     },

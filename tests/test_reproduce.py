@@ -403,7 +403,8 @@ def test_equations_with_friction_take_their_place_in_the_table(monkeypatch: pyte
     assert row.held_out < 1e-4 < linearised(records).held_out / 100
     # Both are thinned out as the record is: the outputs lie on the same samples.
     assert [len(y) for y in row.y_hat] == [r.N for r in records.test] == [len(y) for y in records.linearised]
-    alone = [dataclasses.replace(r, y=r.y[:, 1:], channels=("alpha",), units=("rad",)) for r in (train, test)]
+    one = {"channels": ("alpha",), "units": ("rad",), "resolution": {}}
+    alone = [dataclasses.replace(r, y=r.y[:, 1:], **one) for r in (train, test)]
     lacking = from_measured(Settings(), [alone[0]], [alone[1]], linear_joint(Settings()))
     assert grey_box(lacking, quiet) is None
 

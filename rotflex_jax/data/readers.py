@@ -173,7 +173,7 @@ def load_rotary_arm(path: str | os.PathLike[str]) -> Recording:
         y=np.column_stack([theta, alpha] if flexible else [theta]),
         Ts=even_spacing(t / 1000, f"{file.name}: the time"),
         source=file.name,
-        resolution={"theta": 1e-3, "alpha": 1e-3 / ARM_LENGTH},
+        resolution={"theta": 1e-3, **({"alpha": 1e-3 / ARM_LENGTH} if flexible else {})},
     )
 
 

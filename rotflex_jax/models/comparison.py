@@ -33,7 +33,7 @@ def compare_plot(
         seconds: Runs start again so often [s]; one free run over all of it unless given.
 
     Returns:
-        The figure; `savefig("run.png")` writes it.
+        The figure; its `savefig` writes a file.
 
     Raises:
         InputError: No recording, no model, or something that does not simulate.

@@ -283,7 +283,14 @@ def _decimated(s: Settings, recording: Recording, name: str) -> list[Recording]:
         )
     y = recording.channel(name)[:, None]
     unit = recording.units[recording.channels.index(name)]
-    one = dataclasses.replace(recording, y=y, channels=(name,), units=(unit,), accept=ACCEPTABLE)
+    one = dataclasses.replace(
+        recording,
+        y=y,
+        channels=(name,),
+        units=(unit,),
+        resolution={name: recording.resolution.get(name)},
+        accept=ACCEPTABLE,
+    )
     least = 4 * max(s.memory, round(MEMORY_SECONDS / s.Ts))
     if (one.N - k + 1) // k < least:
         raise InputError(

@@ -13,6 +13,7 @@ machine code: its folder must not be shared with people who are not trusted.
 
 import contextlib
 import dataclasses
+import enum
 import functools
 import hashlib
 import os
@@ -270,14 +271,16 @@ def _parts(value: Any) -> Iterator[str | None]:
         yield from _parts(tuple(sorted(value)))
     elif not kind.__module__.startswith(f"{_PACKAGE}."):
         yield None
+    elif isinstance(value, enum.Enum):
+        yield str(value)
     elif isinstance(value, tuple):  # a named one
         yield f"{kind.__module__}.{kind.__qualname__}"
         yield from _parts(tuple(value))
     elif dataclasses.is_dataclass(value):
         yield f"{kind.__module__}.{kind.__qualname__}"
         yield from _parts(tuple(getattr(value, f.name) for f in dataclasses.fields(value)))
-    else:
-        yield None
+    else:  # an object that holds nothing is known by its class
+        yield None if getattr(value, "__dict__", True) else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _plain() -> bool:
