@@ -25,6 +25,7 @@ def draw():
             "as it is",
             *(
                 f"+ {e}".replace(" at the ", "\nat the ")
+                .replace(" of ", "\nof ")
                 .replace(" friction", "\nfriction")
                 .replace(" hyst", "\nhyst")
                 for e in claims.joint_effects(way)

@@ -74,7 +74,7 @@ class Row:
     Attributes:
         method: Its name.
         title: What it is.
-        family: Kind of method: `physics`, `linear`, `series`, `adaptive`, `sindy` or `other`.
+        family: Kind of method: `physics`, `linear`, `series`, `adaptive`, `sindy`, `learned` or `other`.
         status: `ok`, `diverged` or `failed`.
         reason: Why it failed or diverged; "" where it did not.
         note: What else to know: its order, what it left out or added.

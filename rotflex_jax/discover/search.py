@@ -320,7 +320,7 @@ def _refit(
     ]
     problem = horizons.free_run.problem
     runs = refit_candidates(problem, current.free_run.hypothesis, informed)
-    # The cost of free runs is rugged: the parameters of predictions may lie in a better valley.
+    # The cost of free runs has many local minima: one near the parameters of predictions may be better.
     begun = [(i, as_free_run(problem, h)) for i, h in enumerate(grown)]
     runs = refit_from(problem, runs, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
     validated = [

@@ -62,7 +62,7 @@ ProcessNoise = Mapping[str, float] | None
 # tolerance would stop a long recording many nats short of the optimum. A stage that only leads to the next
 # one may stop earlier.
 LAST_STAGE_TOLERANCE, EARLY_STAGE_TOLERANCE = 1e-3, 1.0
-# A fit also ends where so many steps lower the cost by less than this [nat]: along a curved valley, or
+# A fit also ends where so many steps lower the cost by less than this [nat]: along a curved minimum, or
 # towards a bound.
 PROGRESS_STEPS, LEAST_PROGRESS = 8, 0.1
 # States that the first samples show, or that a run over the whole recording leaves in memories, follow the
@@ -79,7 +79,7 @@ MISSING = 3.0
 SHORTEST_HORIZON, NEXT_HORIZON, LONGEST_SHARE = 2.0, 2.5, 0.75
 # An end is one where the slopes promise no more than this share of a nat for each coordinate.
 RUGGED = 0.5
-# Further starts around the end of a rugged cost, and their distance as a share of each parameter.
+# Further starts around an end, and their distance as a share of each parameter.
 NEARBY_STARTS, NEARBY = 3, 0.3
 # Of two attempts whose costs differ by less, one that converged is better [nat].
 EQUAL_COST = 0.1
@@ -606,12 +606,12 @@ def fit(
     them less. The scale `s` of each channel is the standard deviation of its residuals, at every step of the
     fit.
 
-    Over a long run of a machine that the model does not know wholly the cost is rugged: friction that stops a
-    little earlier shifts all that follows. Where a run of more than a few seconds leaves errors far above the
-    noise, or does not converge, the fit starts a second time with free runs of 2 s, then of 5 s and so on to
-    the whole, and from a few places around the better end; the best of all ends counts. Where a short run or
-    prediction at the start misses most of the motion, or does not converge, the second start is with short
-    predictions, which are easy to match from far away.
+    Over a long run of a machine that the model does not know wholly the cost has many local minima:
+    friction that stops a little earlier shifts all that follows. Where a run of more than a few seconds
+    leaves errors far above the noise, or does not converge, the fit starts a second time with free runs of
+    2 s, then of 5 s and so on to the whole, and from a few places around the better end; the best of all
+    ends counts. Where a short run or prediction at the start misses most of the motion, or does not
+    converge, the second start is with short predictions, which are easy to match from far away.
 
     A fit has converged where steps bring less than a small part of a standard deviation of the parameters;
     errors that go on for many samples make that many nats. Parameters stay within the physical range that

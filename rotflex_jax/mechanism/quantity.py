@@ -1,7 +1,7 @@
 """What an output measures at its port: which time derivative of the position, in which unit.
 
-A quantity that is no linear combination of positions and speeds (an acceleration, a current) needs besides
-its line here only the equation of its reading in `mechanism/simulate.py`.
+A reading that is no linear combination of positions and speeds has a row of zeros here and its equation in
+`mechanism/simulate.py`. An acceleration is more: it depends on the torques, which no reading receives.
 """
 
 import enum
