@@ -187,20 +187,25 @@ WAITS = {
 }
 
 
-@pytest.mark.parametrize("where", WAITS)
-def test_stopped_at_any_moment_with_the_rounds_that_were_finished(where: str, tmp_path: Path) -> None:
-    (tmp_path / "found.json").write_text("of an earlier search")
-    script = SCRIPT.replace("WAIT", WAITS[where])
-    environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run(
+def in_a_process(script: str, folder: Path) -> "subprocess.CompletedProcess[str]":
+    """The script run to its end by a process of its own, in a folder."""
+    environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "XDG_CACHE_HOME": str(folder / "cache")}
+    return subprocess.run(
         [sys.executable, "-c", script],
-        cwd=tmp_path,
+        cwd=folder,
         env=environment,
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
     )
+
+
+@pytest.mark.parametrize("where", WAITS)
+def test_stopped_at_any_moment_with_the_rounds_that_were_finished(where: str, tmp_path: Path) -> None:
+    (tmp_path / "found.json").write_text("of an earlier search")
+    script = SCRIPT.replace("WAIT", WAITS[where])
+    done = in_a_process(script, tmp_path)
     assert done.returncode == 130, done.stderr
     assert "Traceback" not in done.stderr and "Exception" not in done.stderr
     last = done.stderr.splitlines()[-1]
@@ -222,14 +227,5 @@ def test_stopped_while_it_is_loaded(tmp_path: Path) -> None:
         "    threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
         "STOP.listen = listen\nsys.argv = ['rotflex', 'demo', '--report', 'page']\nmain()\n"
     )
-    environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = in_a_process(script, tmp_path)
     assert (done.returncode, done.stderr) == (130, "rotflex: stopped\n")

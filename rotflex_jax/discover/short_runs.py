@@ -15,7 +15,6 @@ from rotflex_jax.discover.batched_predictor import BatchedPredictor, ParameterSe
 from rotflex_jax.fit.dataset import Dataset
 from rotflex_jax.fit.windows import Windows
 from rotflex_jax.mechanism.initial_state import DIFFERENCE
-from rotflex_jax.metrics import counted
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
 
 # Of the fit of a window's first state to a few samples, which determine it well.
@@ -40,38 +39,24 @@ class ShortRuns:
         predictor: Runs them.
         dataset: The recordings.
         windows: Where runs start again.
-        seconds: Length of a window [s].
     """
 
     predictor: BatchedPredictor
     dataset: Dataset
     windows: Windows
-    seconds: float
 
-    def errors(self, run: ParameterSet) -> Float[np.ndarray, "R N C"]:
-        """Measured less simulated outputs; zero where a sample does not count.
+    def outputs(self, run: ParameterSet) -> list[Float[np.ndarray, "_ C"]]:
+        """Outputs of each recording's runs; as measured where a sample does not count.
 
         Args:
             run: Parameters; of its first states (R, W, m) positions and speeds are where a fit starts, and
                 the others are kept. Its gain is not used.
         """
         run = run._replace(K=np.zeros_like(run.K))
-        e = self._outputs([run._replace(x0=self._first_states(run))])[0]
-        counts = np.zeros(e.shape[:2], bool)
-        for r, recording in enumerate(self.dataset.recordings):
-            counts[r, : recording.N] = counted(recording, self.seconds)
-        return np.where((counts & (self.dataset.data.seen > 0))[..., None], e, 0.0)
+        y_hat = self.dataset.data.y - self._innovations([run._replace(x0=self._first_states(run))])[0]
+        return [np.asarray(y_hat[r, : recording.N]) for r, recording in enumerate(self.dataset.recordings)]
 
-    def rmse(self, run: ParameterSet) -> Float[np.ndarray, " C"]:
-        """Root mean square error of each channel over all recordings that count; see `errors`."""
-        e = self.errors(run)
-        number = sum(
-            int(np.sum(counted(recording, self.seconds) * seen[: recording.N]))
-            for recording, seen in zip(self.dataset.recordings, self.dataset.data.seen, strict=True)
-        )
-        return np.sqrt(np.sum(e**2, axis=(0, 1)) / max(number, 1))
-
-    def _outputs(self, runs: list[ParameterSet]) -> Float[np.ndarray, "L R N C"]:
+    def _innovations(self, runs: list[ParameterSet]) -> Float[np.ndarray, "L R N C"]:
         return self.predictor.innovations(runs, self.windows.index)
 
     def _first_states(self, run: ParameterSet) -> Float[np.ndarray, "R W m"]:
@@ -91,12 +76,12 @@ class ShortRuns:
 
         def linearise(points: list[_FirstState]) -> list[NormalEquations]:
             changed = [started_at(points, k) for k in range(size)]
-            e = self._outputs([started_at(points), *changed])
+            e = self._innovations([started_at(points), *changed])
             rows = (head(e, p) for p in points)
             return [NormalEquations.of((w[1:] - w[0]).T / DIFFERENCE, w[0]) for w in rows]
 
         def costs(points: list[_FirstState]) -> list[float]:
-            e = self._outputs([started_at(points)])[0]
+            e = self._innovations([started_at(points)])[0]
             return [0.5 * float(np.sum(head(e, p) ** 2)) for p in points]
 
         found = minimise_together(

@@ -122,7 +122,7 @@ class ValidationSet:
         if not p.free_run:
             model = Model(p.supermodel.baseline, p.predictor.solver)
             windows = Windows.of_seconds(model, p.dataset, self.window_seconds, p.windows.number)
-        return ShortRuns(p.predictor, p.dataset, windows, self.window_seconds)
+        return ShortRuns(p.predictor, p.dataset, windows)
 
     def short_run_errors(
         self, h: Hypothesis, locations: Iterable[EffectLocation], inner: Hypothesis | None = None
@@ -140,7 +140,8 @@ class ValidationSet:
         known = (inner or h).initial_state_for(s, on)
         size, same = first.shape[-1], known.shape[1]
         x0[:, :same, size:] = known[..., size:]
-        return self.short_runs.rmse(ParameterSet(h.values(s), x0, s.gates(on), h.K))
+        runs = self.short_runs.outputs(ParameterSet(h.values(s), x0, s.gates(on), h.K))
+        return self.window_rmse([runs[i] for i in self.counted])
 
     def window_rmse(self, runs: Sequence[Float[np.ndarray, "_ C"]]) -> Float[np.ndarray, " C"]:
         """Root mean square error of short free runs of the recordings that count, without first samples."""

@@ -310,11 +310,6 @@ class GreyBoxProblem:
 
         They have the same number of windows, so that all share one compiled program.
         """
-        if seconds is not None and not seconds > 0:
-            raise InputError(
-                f"Argument `window_seconds` is {seconds}, but windows need a positive length; give for "
-                "instance 2.0, or None for whole recordings."
-            )
         of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
         longest = max(r.N * r.Ts for r in self.dataset.recordings)
         horizon, found, length = min(seconds or longest, longest), [], SHORTEST_HORIZON

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
 from rotflex_jax.errors import InputError
 
@@ -169,9 +169,7 @@ def is_absolute(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) 
     """
     if len(theta) < 2 * SLOW_BANDS[-1][1]:
         return False
-    # With low side lobes a strong motion in one band does not leak into the other.
-    window = np.blackman(len(theta))
-    hub, arm = (np.fft.rfft(window * (x - window @ x / window.sum())) for x in (theta, alpha))
+    hub, arm = _spectrum(theta), _spectrum(alpha)
     for start, stop, far in SLOW_BANDS:
         a, b = hub[start:stop], arm[start:stop]
         size, other = np.linalg.norm(a), np.linalg.norm(b)
@@ -389,6 +387,12 @@ SWAPPED_RATIO = 3.0
 """How many times the hub's motion a deflection cannot be in slow motion."""
 
 
+def _spectrum(x: Float[np.ndarray, " N"]) -> Complex[np.ndarray, " F"]:
+    """Fourier transform without the mean; with low side lobes a band does not leak into others."""
+    window = np.blackman(len(x))
+    return np.fft.rfft(window * (x - window @ x / window.sum()))
+
+
 def is_swapped(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) -> bool:
     """Whether alpha moves far more than theta in slow motion, in each of two bands, as the hub does.
 
@@ -403,8 +407,7 @@ def is_swapped(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) -
     """
     if len(theta) < 2 * SLOW_BANDS[-1][1]:
         return False
-    window = np.blackman(len(theta))
-    hub, arm = (np.fft.rfft(window * (x - window @ x / window.sum())) for x in (theta, alpha))
+    hub, arm = _spectrum(theta), _spectrum(alpha)
     for start, stop, _ in SLOW_BANDS:
         own = float(np.linalg.norm(arm[start:stop]))
         if own <= 10 * LEAST_SLOW_SHARE * np.linalg.norm(arm):

@@ -105,10 +105,11 @@ class PersistentJit:
         key = (known, tree, kinds, settings)
         program = self._held.get(key)
         if program is None:
-            texts = [static_key(x) for x in known]
-            lasting = bool(programs_folder()) and all(texts) and _unchanged()
-            name = f"{self._name}{texts}{tree}{kinds}{settings}" if lasting else ""
-            program = self._held[key] = self._made(known, tree, leaves, name)
+            texts, folder, file = [static_key(x) for x in known], programs_folder(), None
+            if folder is not None and all(texts) and _unchanged():
+                name = f"{self._name}{texts}{tree}{kinds}{settings}"
+                file = folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
+            program = self._held[key] = self._made(known, tree, leaves, file)
         return program(*leaves)
 
     def __len__(self) -> int:
@@ -119,18 +120,18 @@ class PersistentJit:
         """Let go of the programs in memory."""
         self._held.clear()
 
-    def _made(self, known: tuple[Any, ...], tree: Any, leaves: list[Any], name: str) -> Callable[..., Any]:
-        """The program for arguments like these as a function of their leaves; on disk if it has a name."""
+    def _made(
+        self, known: tuple[Any, ...], tree: Any, leaves: list[Any], file: Path | None
+    ) -> Callable[..., Any]:
+        """The program for arguments like these as a function of their leaves; kept in the file, if any."""
 
         def flat(*leaves: Any) -> Any:
             return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
 
         options = _options() | (_QUICK_TO_COMPILE if self._runs_rarely else {})
         program = jax.jit(flat, compiler_options=options)
-        folder = programs_folder()
-        if not name or folder is None:
+        if file is None:
             return program
-        file = folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
         stored = _read(file, leaves)
         if stored is None:
             stored = program.lower(*leaves).compile()
