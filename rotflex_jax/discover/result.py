@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.discover.assessment import NEAR_FLOOR as NEAR_FLOOR, Assessment, assess
+from rotflex_jax.discover.probabilities import Probabilities
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_phrase, with_titles
 from rotflex_jax.experiment import Experiment
@@ -275,6 +276,7 @@ class SearchResult:
         proposal: Where two effects remain: the standard input that distinguishes them best.
         test: Recordings that had no say in anything.
         remarks: Parameters of the final model at a bound, or far beyond what the recordings reach.
+        probabilities: Of sets of effects and of effects; None for results made by hand.
     """
 
     verdict: Verdict
@@ -291,6 +293,7 @@ class SearchResult:
     proposal: Experiment | None = None
     test: tuple[Recording, ...] = ()
     remarks: tuple[Remark, ...] = ()
+    probabilities: Probabilities | None = None
 
     @property
     def model(self) -> Model:
@@ -334,10 +337,12 @@ class SearchResult:
             "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,
             "notes": list(self.notes),
             "remarks": [r.to_dict() for r in self.remarks],
+            "probabilities": self.probabilities.to_dict() if self.probabilities else None,
             "elapsed_s": self.elapsed_s,
         }
 
     def __str__(self) -> str:
         lines = [self.sentence]
         lines += [f"  {i}. {r.sentence}" for i, r in enumerate(self.rounds, 1)]
+        lines += [self.probabilities.sentence] if self.probabilities else []
         return "\n".join(lines)

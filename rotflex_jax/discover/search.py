@@ -21,6 +21,7 @@ from rotflex_jax.discover.evaluation import (
     paired_estimates,
     process_noise_gain,
 )
+from rotflex_jax.discover.fitted_sets import fitted_sets
 from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_free_run, at_horizon
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
@@ -32,6 +33,7 @@ from rotflex_jax.discover.hypothesis import (
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.milestone import milestone
+from rotflex_jax.discover.probabilities import Probabilities, probabilities
 from rotflex_jax.discover.proposal import with_proposal
 from rotflex_jax.discover.refit import choose_process_noise, refit
 from rotflex_jax.discover.result import HorizonGain, Ranked, Round, Stage
@@ -46,6 +48,7 @@ from rotflex_jax.discover.selection import (
     validate_from_best_states,
 )
 from rotflex_jax.discover.stepwise import (
+    Eliminated,
     assign_calibrations,
     calibration_notes,
     eliminate,
@@ -58,6 +61,7 @@ from rotflex_jax.discover.stepwise import (
 )
 from rotflex_jax.discover.supermodel import EffectLocation, build, checked_candidates, scales
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import padded_length, prepare, process_noise_ports
@@ -96,6 +100,10 @@ class SearchState:
         notes: Remarks for a reader.
         gains: Effects that were added -> what they gained at both horizons.
         final: The model that is reported, with the parameters of `reported`.
+        tried: Models fitted and validated at both horizons on the way.
+        alternatives: Models fitted and validated at the reported horizon beside the final one.
+        merged: The final model with one effect in the place of several, where it has one.
+        machine: Calibrations that belong to the machine.
     """
 
     model: Model
@@ -114,6 +122,10 @@ class SearchState:
         default_factory=dict
     )
     final: Hypothesis | None = None
+    tried: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
+    alternatives: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
+    merged: ValidatedHypothesis | None = None
+    machine: list[EffectLocation] = dataclasses.field(default_factory=list)
 
     @functools.cached_property
     def reach(self) -> Reach:
@@ -280,7 +292,7 @@ def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress) -> SearchStat
     h = fit_baseline(horizons.prediction.problem)
     problem = horizons.free_run.problem
     current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
-    state = SearchState(model, horizons, say, current, passed=[current])
+    state = SearchState(model, horizons, say, current, passed=[current], tried=[current])
     state.reached("as it is")
     return state
 
@@ -332,7 +344,9 @@ def _refit(
         for h, f, c in zip(grown, runs, starts, strict=True)
         if state.is_plausible(h, c.location) and state.is_plausible(f, c.location)
     ]
-    return validate_from_best_states(state.validation, validated)
+    validated = validate_from_best_states(state.validation, validated)
+    state.tried += validated
+    return validated
 
 
 def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: list[Score]) -> bool:
@@ -357,10 +371,10 @@ def _simplify(state: SearchState) -> None:
     """Leave out what is not needed, assign calibrations, merge effects, correct the discretisation bias."""
     horizons, added = state.horizons, list(state.scores)
     assert state.current.free_run
-    final, runs, state.worth = eliminate(
-        horizons, state.current.hypothesis, state.current.free_run.hypothesis, added
-    )
-    state.current = horizons.validated(final, runs, state.current)
+    needed = eliminate(horizons, state.current.hypothesis, state.current.free_run.hypothesis, added)
+    final, state.worth = needed.prediction, needed.worth
+    state.current = horizons.validated(final, needed.free_run, state.current)
+    state.tried.insert(0, state.current)
     order = [p for p in added if p in final.locations]
     order += sorted(set(final.locations) - set(order), key=lambda p: -state.worth[p])
     reported = state.reported
@@ -368,15 +382,40 @@ def _simplify(state: SearchState) -> None:
     assigned = assign_calibrations(problem, validation, state.at(reported, state.current).hypothesis, order)
     final, order, notes = assigned.final, assigned.order, assigned.notes
     found = [p for p in order if p in state.scores]
-    rivals = remaining_rivals(problem, validation, final, state.rivals, found)
+    rivals, swapped = remaining_rivals(problem, validation, final, state.rivals, found)
+    state.machine = [p for p in order if p not in state.scores]
+    state.alternatives = [*swapped, *(_left_out(state, needed) if reported is horizons.prediction else ())]
     if one := merge_effects(problem, validation, final, order):
         final, notes = one.final, (*notes, one.note)
         state.scores[one.effect] = state.scores[one.simpler]
         state.gains[one.effect] = state.gains[one.simpler]
         order = [one.effect if p == one.simpler else p for p in order if p not in one.replaced[1:]]
+        state.merged = one.validated
         rivals[one.effect] = [*rivals.get(one.simpler, []), *(one.replaced if one.same_count else ())]
     state.order, state.own, state.notes, state.rivals = order, assigned.own, notes, rivals
     state.final = correct_discretisation_bias(problem, final)
+
+
+def _left_out(state: SearchState, needed: Eliminated) -> list[ValidatedHypothesis]:
+    """The final model without each effect, on validation data; only those that no round has fitted."""
+    s = state.problem.supermodel
+    if state.validation.folds:  # a fit for each recording, for a comparison that decides nothing
+        return []
+    known = {frozenset(v.hypothesis.locations) - set(s.calibrations) for v in state.tried}
+    return [
+        validate(state.validation, h, state.current)
+        for h in needed.without
+        if frozenset(h.locations) - set(s.calibrations) not in known
+    ]
+
+
+def _probabilities(state: SearchState, is_explained: bool) -> Probabilities:
+    """Probabilities of the sets that were fitted, the one that is reported first."""
+    reported, horizons = state.reported, state.horizons
+    sets = fitted_sets(horizons, state.tried, state.alternatives, reported, state.machine)
+    if state.merged:
+        sets = fitted_sets(horizons, (), [state.merged], reported, ()) + sets
+    return probabilities(sets, state.problem.measured_values, is_explained=is_explained)
 
 
 def _report(state: SearchState, evaluation: Evaluation, started: float) -> Discovery:
@@ -426,6 +465,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
             *(f"{remark.sentence}." for remark in remarks),
         ),
         remarks=remarks,
+        probabilities=_probabilities(state, verdict is not Verdict.UNEXPLAINED),
     )
 
 

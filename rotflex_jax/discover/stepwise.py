@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,9 +134,23 @@ def _best_shapes(
     return [best[i] for i in sorted(best)]
 
 
-def eliminate(
-    horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[EffectLocation]
-) -> tuple[Hypothesis, Hypothesis, dict[EffectLocation, float]]:
+class Eliminated(NamedTuple):
+    """A model with what is needed at both horizons.
+
+    Attributes:
+        prediction: Fitted to predictions.
+        free_run: Fitted to free runs.
+        worth: What each effect that was tested gains [nat].
+        without: The model of predictions without each of them, refitted.
+    """
+
+    prediction: Hypothesis
+    free_run: Hypothesis
+    worth: dict[EffectLocation, float]
+    without: list[Hypothesis]
+
+
+def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[EffectLocation]) -> Eliminated:
     """Drop, one at a time, effects without which the model is as good at both horizons.
 
     The effect added last has just shown that it is needed; earlier ones may have become needless, and
@@ -148,10 +163,10 @@ def eliminate(
         added: Effects in the order they were added.
 
     Returns:
-        The model with what is needed at both horizons, and what each effect that was tested gains [nat].
+        The model with what is needed at both horizons, and what was tested last.
     """
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
-    s = problem.supermodel
+    s, rivals = problem.supermodel, []
     while tested := [p for p in h.locations if p not in added[-1:]]:
         rivals = refit(problem, [without(s, h, p) for p in tested], alternations=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
@@ -171,8 +186,8 @@ def eliminate(
         h = rivals[tested.index(drop)]
         runs = refit(runs_problem, [without(s, runs, drop)])[0]
     else:
-        worth = {}
-    return h, runs, worth
+        worth, rivals = {}, []
+    return Eliminated(h, runs, worth, rivals)
 
 
 def _need(problem: LikelihoodProblem, runs: Hypothesis, location: EffectLocation) -> bool:
@@ -182,13 +197,25 @@ def _need(problem: LikelihoodProblem, runs: Hypothesis, location: EffectLocation
     return z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER
 
 
+class RemainingRivals(NamedTuple):
+    """What looks like the effects that were found.
+
+    Attributes:
+        alike: Effects that were found -> those that the final model cannot exclude in their places.
+        swapped: The final model with each rival in the place of an effect, validated.
+    """
+
+    alike: dict[EffectLocation, list[EffectLocation]]
+    swapped: list[ValidatedHypothesis]
+
+
 def remaining_rivals(
     problem: LikelihoodProblem,
     validation: ValidationSet,
     final: Hypothesis,
     rivals: dict[EffectLocation, list[EffectLocation]],
     found: list[EffectLocation],
-) -> dict[EffectLocation, list[EffectLocation]]:
+) -> RemainingRivals:
     """Rivals that the final model, with one of them in the place of a found effect, cannot exclude.
 
     What looked alike in a round may be distinguished once the other effects are in the model; a rival that
@@ -198,7 +225,7 @@ def remaining_rivals(
     remaining = {p: [r for r in rivals[p] if r not in found] for p in found}
     pairs = [(p, r) for p in found for r in remaining[p]]
     if not pairs or len(found) == 1:
-        return remaining
+        return RemainingRivals(remaining, [])
     swapped = []
     for p, r in pairs:
         start = CandidateStart(r, np.array(s.candidates[r].probes[0]).max(axis=0))
@@ -206,7 +233,7 @@ def remaining_rivals(
     best = validate(validation, final)
     validated = [validate(validation, h) for h in refit(problem, swapped)]
     alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(best, t)}
-    return {p: [r for r in remaining[p] if (p, r) in alike] for p in found}
+    return RemainingRivals({p: [r for r in remaining[p] if (p, r) in alike] for p in found}, validated)
 
 
 def nested_models(
@@ -247,6 +274,7 @@ class MergedEffects:
         simpler: The effect that it contains.
         replaced: All that it stands for.
         same_count: Whether it needs as many parameters as they, so that the data do not prefer the one.
+        validated: The hypothesis on validation data.
     """
 
     final: Hypothesis
@@ -254,6 +282,7 @@ class MergedEffects:
     simpler: EffectLocation
     replaced: tuple[EffectLocation, ...]
     same_count: bool
+    validated: ValidatedHypothesis
 
     @property
     def note(self) -> str:
@@ -320,11 +349,12 @@ def merge_effects(
     if saved < 0 or one.log_likelihood < final.log_likelihood - allowed or not is_physical(s, one, rich):
         return None
     kept = [rich if p == simple else p for p in order if p not in calibrations]
-    errors = validation.short_run_errors(validate(validation, one).with_trained_calibrations, kept)
+    validated = validate(validation, one)
+    errors = validation.short_run_errors(validated.with_trained_calibrations, kept)
     several = validation.short_run_errors(validate(validation, final).with_trained_calibrations, order)
     if float(np.mean(np.log(errors / several))) > WINDOWS_BETTER:
         return None
-    return MergedEffects(one, rich, simple, (simple, *calibrations), saved == 0)
+    return MergedEffects(one, rich, simple, (simple, *calibrations), saved == 0, validated)
 
 
 @dataclasses.dataclass(frozen=True)
