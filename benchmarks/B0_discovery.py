@@ -53,6 +53,7 @@ from rich.console import Console
 from arena.draws import drawn
 from arena.hidden import DEFAULTS, OUTSIDE
 from arena.pages import publish
+from arena.probability import drawn_probabilities, summary
 from arena.records import INPUTS
 from arena.table import answer, label, show
 from arena.wrong_seeds import REPORT as WORLDS_REPORT, TUNING as WORLDS_TUNING
@@ -238,6 +239,8 @@ def main() -> int:
     suffix += ("_tuning" if a.tuning else "") + ("_quick" if a.quick else "")
     path = a.out or HERE / "results" / f"B0{suffix}.json"
     wanted = [{"world": s} for s in seeds] if a.wrong_worlds else jobs(a, seeds, inputs)
+    if a.tuning:  # what probabilities are calibrated from
+        wanted = [{**job, "keep_evidence": True} for job in wanted]
     made = provenance()
     title = "B0, wrong worlds" if a.wrong_worlds else "B0"
     results: dict[str, Any] = {"benchmark": title, "runs": [], "records": {}}
@@ -263,10 +266,12 @@ def main() -> int:
         console.print(text, markup=False, soft_wrap=True)
     shown = [known[key(j)] for j in wanted]
     (show_worlds if a.wrong_worlds else show)(console, shown)
+    console.print(summary(shown), markup=False, soft_wrap=True)
     codes = {r.get("code") for r in shown}
     if len(codes) > 1:
         console.print(f"[yellow]These records come from {len(codes)} versions of the package.[/]")
-    for file in (path, *(publish_worlds if a.wrong_worlds else publish)(list(known.values()), path)):
+    pages = (publish_worlds if a.wrong_worlds else publish)(list(known.values()), path)
+    for file in (path, *pages, *drawn_probabilities(list(known.values()), path)):
         console.print(f"saved: {file}", markup=False, soft_wrap=True)
     return int(any("error" in r for r in shown))
 

@@ -12,6 +12,7 @@ from typing import Any
 import rotflex_jax as rf
 from arena.hidden import ABSORBED, DEFAULTS, SHAPES
 from arena.laws import Place
+from arena.probability import told
 from arena.records import make_record
 from arena.scoring import parameter_errors, renamed, scored, visible
 from rotflex_jax.effects import CATALOG
@@ -83,7 +84,8 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
     """Searches one record and marks the answer; a failure is a row with its error.
 
     Args:
-        job: `effects`, `kind`, `seed`, `seconds`; `size` if not 1, `channels` if not both.
+        job: `effects`, `kind`, `seed`, `seconds`; `size` if not 1, `channels` if not both;
+            `keep_evidence` to keep what the probabilities of sets rest on.
         tell: called with lines of progress.
 
     Returns:
@@ -131,6 +133,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
             windows=result.final.held_out_rmse_windows,
             windows_baseline=result.baseline.held_out_rmse_windows,
             noise_floor=result.noise_floor,
+            **told(result, job.get("keep_evidence", False)),
         )
         row = with_oracle(row, train, test)
     except Exception as problem:  # the benchmark reports it and goes on

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from typing import Any
 
 from arena.laws import Place
+from arena.probability import told as probabilities_told
 from arena.scoring import alike
 from arena.wrong_worlds import World, world
 from judged import ESTABLISHED, PROVISIONAL, errors, named, searched
@@ -73,7 +74,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
     """Searches one world and marks the answer; a failure is a row with its error.
 
     Args:
-        job: `world`, its number.
+        job: `world`, its number; `keep_evidence` to keep what the probabilities of sets rest on.
         tell: called with lines of progress.
 
     Returns:
@@ -104,6 +105,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
                 [s.effect, s.port, s.score if math.isfinite(s.score) else None] for s in result.ranking[:8]
             ],
             noise_floor=dict(result.noise_floor),
+            **probabilities_told(result, job.get("keep_evidence", False)),
             errors={
                 name: {
                     stage: errors(model, [recording])

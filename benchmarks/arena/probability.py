@@ -1,0 +1,254 @@
+"""Are the probabilities of sets of effects what they say: rows of evidence, reliability, credible sets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from arena.hidden import EQUIVALENT
+from arena.laws import Place
+from arena.marks import good
+from arena.scoring import alike, exact
+from rotflex_jax.text.colours import BASELINE, FINAL, INK
+from rotflex_jax.text.plotting import blank, styled
+
+if TYPE_CHECKING:  # a process makes its settings ahead of JAX
+    from rotflex_jax.discover import Discovery
+    from rotflex_jax.discover.probabilities import EvidenceRule, HorizonEvidence, Probabilities
+
+Row = dict[str, Any]
+
+BINS, LEAST, CREDIBLE = 10, 0.01, 0.9
+"""Bins of equal width; sets less probable than this are not counted; mass of a credible set."""
+
+
+def told(result: Discovery, evidence: bool = False) -> Row:
+    """What a row keeps of the probabilities of a search.
+
+    Args:
+        result: The search.
+        evidence: Whether the half seconds are kept too, for a calibration.
+    """
+    found = result.probabilities
+    if found is None:
+        return {}
+    row: Row = {
+        "probabilities": {
+            "sets": [[sorted(s.effects), round(s.probability, 5)] for s in found.sets],
+            "elsewhere": found.elsewhere,
+        }
+    }
+    if evidence:
+        row["evidence"] = {
+            "measured_values": sum(r.N for r in result.train) * len(result.noise_floor),
+            "sets": [
+                [sorted(s.effects), s.parameters, _written(s.prediction, 2), _written(s.free_run, 4)]
+                for s in found.evidence
+            ],
+        }
+    return row
+
+
+def _written(e: HorizonEvidence | None, digits: int) -> list[str] | None:
+    """Blocks as two lines of text."""
+    return None if e is None else [" ".join(f"{x:.{digits}f}" for x in blocks) for blocks in e]
+
+
+def _read(lines: Sequence[str] | None) -> HorizonEvidence | None:
+    from rotflex_jax.discover.probabilities import HorizonEvidence
+
+    return None if lines is None else HorizonEvidence(*(np.array(line.split(), float) for line in lines))
+
+
+def weighed(row: Row, rule: EvidenceRule) -> Probabilities:
+    """The probabilities of a row with another rule, from its evidence."""
+    from rotflex_jax.discover.probabilities import FittedSet, probabilities
+
+    kept = row["evidence"]
+    sets = [FittedSet(frozenset(names), count, _read(p), _read(f)) for names, count, p, f in kept["sets"]]
+    explained = row["verdict"] != "unexplained"
+    return probabilities(sets, kept["measured_values"], is_explained=explained, rule=rule)
+
+
+def place_of(name: str) -> Place:
+    """Effect and port of a name such as "coulomb@hub"."""
+    effect, _, port = name.partition("@")
+    return effect, port
+
+
+def reduced(names: Iterable[str], row: Row) -> frozenset[Place] | None:
+    """A set less what is right besides the hidden effects; None where it is right.
+
+    In a wrong world, names of what is wrong besides neither add to nor take from an answer, so that sets that
+    differ by them alone are one.
+    """
+    places = frozenset(place_of(n) for n in names)
+    if "world" not in row:
+        return None if exact(places, [(e, p) for e, p in row["wanted"]]) else places
+    wanted = set() if row["hidden"] is None else alike((row["hidden"][0], row["hidden"][1]))
+    besides = {(e, p) for b in row["besides"] for e, p in b["names"]} - wanted
+    left = places - besides
+    right = not left if not wanted else bool(left) and left <= wanted
+    return None if right else left
+
+
+class Event(NamedTuple):
+    """A probability, and whether what it speaks of was so."""
+
+    probability: float
+    true: bool
+
+
+def classes(row: Row) -> list[Event]:
+    """The sets of a row, those that are one answer together, most probable first."""
+    mass: dict[frozenset[Place] | None, float] = {}
+    for names, p in row["probabilities"]["sets"]:
+        key = reduced(names, row)
+        mass[key] = mass.get(key, 0.0) + p
+    return sorted((Event(p, key is None) for key, p in mass.items()), key=lambda e: -e.probability)
+
+
+def effect_events(row: Row) -> list[Event]:
+    """The effects of a row: is each there, or what no recording tells from it?"""
+    if "world" in row:
+        there = {(e, p) for b in row["besides"] for e, p in b["names"]}
+        there |= set() if row["hidden"] is None else alike((row["hidden"][0], row["hidden"][1]))
+    else:
+        there = {q for e, p in row["wanted"] for q in {(e, p)} | EQUIVALENT.get((e, p), set())}
+    mass: dict[str, float] = {}
+    for names, p in row["probabilities"]["sets"]:
+        for name in names:
+            mass[name] = mass.get(name, 0.0) + p
+    return [Event(p, place_of(name) in there) for name, p in mass.items()]
+
+
+def usable(records: Iterable[Row]) -> list[Row]:
+    """Rows with probabilities, of machines for whose effects the catalogue has names."""
+    return [r for r in good(list(records)) if "probabilities" in r and not r.get("outside")]
+
+
+class Bin(NamedTuple):
+    """Events of about one probability.
+
+    Attributes:
+        claimed: Their mean probability.
+        held: Share of them that were so.
+        cases: How many.
+    """
+
+    claimed: float
+    held: float
+    cases: int
+
+
+def reliability(events: Iterable[Event]) -> list[Bin]:
+    """Events in `BINS` bins of equal width; empty ones left out."""
+    listed = [e for e in events if e.probability >= LEAST]
+    place = [min(int(BINS * e.probability), BINS - 1) for e in listed]
+    groups = [[e for e, k in zip(listed, place, strict=True) if k == i] for i in range(BINS)]
+    return [
+        Bin(float(np.mean([e.probability for e in g])), float(np.mean([e.true for e in g])), len(g))
+        for g in groups
+        if g
+    ]
+
+
+def calibration_error(events: Iterable[Event]) -> float:
+    """Expected calibration error: mean of |claimed - held| over bins, weighted by cases.
+
+    >>> calibration_error([Event(0.8, True), Event(0.8, True), Event(0.8, False), Event(0.8, True)])
+    0.05
+    """
+    bins = reliability(events)
+    cases = sum(b.cases for b in bins)
+    return round(sum(b.cases * abs(b.claimed - b.held) for b in bins) / cases, 6) if cases else math.nan
+
+
+class CredibleSets(NamedTuple):
+    """How often the smallest sets of `CREDIBLE` mass hold the truth, and how many sets that takes."""
+
+    held: float
+    size: float
+    cases: int
+
+
+def credible(rows: Sequence[Row]) -> CredibleSets:
+    """Over rows, one at least; sets that are one answer count once."""
+    held, sizes = [], []
+    for row in rows:
+        listed = classes(row)
+        total = np.cumsum([e.probability for e in listed])
+        size = min(int(np.searchsorted(total, CREDIBLE - 1e-9)) + 1, len(listed))
+        held.append(any(e.true for e in listed[:size]))
+        sizes.append(size)
+    return CredibleSets(float(np.mean(held)), float(np.mean(sizes)), len(rows))
+
+
+def summary(records: Iterable[Row]) -> str:
+    """Calibration of a results file, in lines."""
+    lines, every = [], usable(records)
+    kinds = {
+        "plain": [r for r in every if "world" not in r],
+        "wrong worlds": [r for r in every if "world" in r],
+        "all": every,
+    }
+    for name, rows in kinds.items():
+        if not rows:
+            continue
+        top, sets = [classes(r)[0] for r in rows], [e for r in rows for e in classes(r)]
+        known = sum(any(e.true for e in classes(r)) for r in rows)
+        c = credible(rows)
+        lines.append(
+            f"{name}: {len(rows)} machines, the right set fitted in {known}; most probable set right in "
+            f"{sum(e.true for e in top)}, mean probability {np.mean([e.probability for e in top]):.3f}, "
+            f"calibration error {calibration_error(top):.3f}; all sets {calibration_error(sets):.3f}; "
+            f"effects {calibration_error([e for r in rows for e in effect_events(r)]):.3f}; sets of "
+            f"{100 * CREDIBLE:g} % hold the truth in {100 * c.held:.1f} %, mean size {c.size:.2f}"
+        )
+    return "\n".join(lines)
+
+
+@styled
+def draw_probabilities(records: list[Row], path: Path) -> None:
+    """Reliability diagram of the probabilities of sets and of effects."""
+    rows = usable(records)
+    figure = blank(5.4, 4.8)
+    ax = figure.subplots()
+    ax.plot([0, 1], [0, 1], color=INK, linewidth=0.8, label="as claimed")
+    kinds = (
+        ([e for r in rows for e in classes(r)], "o", FINAL, "sets of effects"),
+        ([e for r in rows for e in effect_events(r)], "s", BASELINE, "effects"),
+    )
+    for events, marker, colour, name in kinds:
+        bins = reliability(events)
+        scatter = [math.sqrt(b.claimed * (1 - b.claimed) / b.cases) for b in bins]
+        ax.errorbar(
+            [b.claimed for b in bins],
+            [b.held for b in bins],
+            yerr=scatter,
+            fmt=marker,
+            color=colour,
+            markersize=4.5,
+            capsize=2.5,
+            label=f"{name}; expected calibration error {calibration_error(events):.3f}",
+        )
+    ax.set_xlim(-0.02, 1.02)
+    ax.set_ylim(-0.05, 1.2)
+    ax.set_xlabel("probability claimed [–]")
+    ax.set_ylabel("share that were so [–]")
+    ax.set_title(f"Probabilities and what became of them ({len(rows)} machines)")
+    ax.legend(loc="upper left")
+    figure.savefig(path, dpi=160)
+
+
+def drawn_probabilities(records: list[Row], results: Path) -> list[Path]:
+    """The diagram beside a results file, as `B0_probabilities.png`; none without probabilities."""
+    if not usable(records):
+        return []
+    path = results.with_name(f"{results.stem}_probabilities.png")
+    draw_probabilities(records, path)
+    return [path]
