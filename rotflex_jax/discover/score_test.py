@@ -215,10 +215,15 @@ def _directions(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> Direction
 
 def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
     """Scores of all candidates that are not yet in the hypothesis, best first."""
+    return score_test(problem, h).listed
+
+
+def score_test(problem: LikelihoodProblem, h: Hypothesis) -> "ScoreTest":
+    """The test of all candidates that are not yet in the hypothesis."""
     s, seen = problem.supermodel, problem.seen
     candidates = [c for c in s.candidates.values() if c.location not in h.locations]
     if not candidates:
-        return []
+        return ScoreTest([], {}, None)
     families = s.families([c for c in candidates if not c.threshold])
     batches = [(family, probes) for family in families for probes in _packed(family)]
     e, J = problem.slopes([h])
@@ -241,7 +246,8 @@ def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
     headroom = float(np.exp(h.whitener.log_det / (2 * e.shape[-1])) / np.exp(np.mean(np.log(problem.noise))))
     r = orthogonal(w[None])[0]
     projected = _Projected(r, orthogonal, columns, problem.measured_values, max(headroom, 1.0))
-    return sorted((_score(c, projected) for c in candidates), key=lambda found: -found.nats)
+    listed = sorted((_score(c, projected) for c in candidates), key=lambda found: -found.nats)
+    return ScoreTest(listed, {c.location: c for c in candidates}, projected)
 
 
 def _changes(
@@ -327,6 +333,166 @@ def _amplitudes(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:
         drop = np.flatnonzero(keep)[np.argmin(found)]
         keep[drop] = False
     return a
+
+
+@dataclasses.dataclass(frozen=True)
+class PairScore:
+    """What two candidates would gain together.
+
+    Attributes:
+        starts: Where a refit of each should start.
+        gain: Log-likelihood gained to first order [nat].
+        nats: The same, less half a log N per parameter they need [nat].
+        more: How much more than the penalised better one of them alone [nat].
+        synergy: How much more than both alone [nat]: what each hides of the other.
+    """
+
+    starts: tuple[CandidateStart, CandidateStart]
+    gain: float
+    nats: float
+    more: float
+    synergy: float
+
+    @property
+    def locations(self) -> tuple[EffectLocation, EffectLocation]:
+        """Effects and ports."""
+        return self.starts[0].location, self.starts[1].location
+
+
+@dataclasses.dataclass(frozen=True)
+class ScoreTest:
+    """Scores of all candidates beside one hypothesis, and what two of them would gain together.
+
+    Attributes:
+        listed: Scores, best first.
+        candidates: All that were tested.
+        projected: What the scores were computed from; None without candidates.
+    """
+
+    listed: list[Score]
+    candidates: dict[EffectLocation, Candidate]
+    projected: _Projected | None
+
+    def pairs(self, locations: Sequence[EffectLocation]) -> list[PairScore]:
+        r"""Scores of all pairs of some candidates, in closed form.
+
+        .. math:: 2 g = b_2^T G_2^{-1} b_2, \qquad G = J_\perp^T J_\perp, \quad b = J_\perp^T r
+
+        with the rows and columns of the two; no model is run. Of their shapes those that gain most together
+        count. Pairs of which one contains the other are one effect and left out.
+
+        Args:
+            locations: Of candidates that were tested.
+        """
+        if self.projected is None:
+            return []
+        shapes = [_shapes(self.candidates[p], self.projected) for p in locations]
+        rows = np.concatenate([s.columns for group in shapes for s in group] or [np.zeros((0, 1))])
+        gram = _Gram(rows @ rows.T, rows @ self.projected.r if len(rows) else np.zeros(0))
+        last, by_shape = 0, []
+        for group in shapes:
+            ends = last + np.cumsum([len(s.columns) for s in group], dtype=int)
+            by_shape.append([(s, np.arange(e - len(s.columns), e)) for s, e in zip(group, ends, strict=True)])
+            last = int(ends[-1]) if len(ends) else last
+        alone = {s.location: s for s in self.listed}
+        found = []
+        for i, a in enumerate(by_shape):
+            for b in by_shape[i + 1 :]:
+                if a and b and not _contain_each_other(a[0][0].candidate, b[0][0].candidate):
+                    found.append(self._best_pair(gram, a, b, alone))
+        return found
+
+    def _best_pair(
+        self,
+        gram: "_Gram",
+        a: "list[tuple[_Shape, np.ndarray]]",
+        b: "list[tuple[_Shape, np.ndarray]]",
+        alone: dict[EffectLocation, Score],
+    ) -> PairScore:
+        """The shapes of two candidates that gain most together."""
+        assert self.projected
+        price = 0.5 * float(np.log(self.projected.samples))
+        best = None
+        for first, i in a:
+            for second, j in b:
+                values, gain = gram.solved([(first, i), (second, j)])
+                pair = (first, values[: len(i)]), (second, values[len(i) :])
+                count = sum(max(int(np.count_nonzero(v)), 1) + (len(s.candidate.probes) > 1) for s, v in pair)
+                if best is None or gain - price * count > best.nats:
+                    one, other = (
+                        CandidateStart(s.candidate.location, s.values(v), expected_gain=gain) for s, v in pair
+                    )
+                    best = PairScore((one, other), gain, gain - price * count, 0.0, 0.0)
+        assert best
+        each = [alone[p] for p in best.locations]
+        better = max(0.0, *(s.nats for s in each))
+        promised = sum(max(s.start.expected_gain, 0.0) for s in each)
+        return dataclasses.replace(best, more=best.nats - better, synergy=best.gain - promised)
+
+
+class _Shape(NamedTuple):
+    """A candidate at one of its shapes, with its slopes less what the hypothesis can still explain (k, M)."""
+
+    candidate: Candidate
+    shape: int
+    columns: Float[np.ndarray, "k M"]
+
+    def values(self, amplitudes: Float[np.ndarray, " k"]) -> Float[np.ndarray, " P"]:
+        """Parameter values at these amplitudes of the shape's directions."""
+        group = np.array(self.candidate.probes[self.shape], float)
+        mean = amplitudes @ group if any(self.candidate.amplitudes) else group[0]
+        return np.where(self.candidate.amplitudes, mean, group[0])
+
+
+def _shapes(c: Candidate, projected: _Projected) -> list[_Shape]:
+    """The shapes of a candidate whose slopes are finite."""
+    found = []
+    for shape in range(len(c.probes)):
+        J = np.array(projected.columns[(c.location, shape)])
+        if np.all(np.isfinite(J)):
+            found.append(_Shape(c, shape, np.asarray(projected.orthogonal(J))))
+    return found
+
+
+class _Gram(NamedTuple):
+    """Products of all projected slopes with each other and with the innovations."""
+
+    G: Float[np.ndarray, "K K"]
+    b: Float[np.ndarray, " K"]
+
+    def solved(self, shapes: Sequence[tuple[_Shape, np.ndarray]]) -> tuple[np.ndarray, float]:
+        """Amplitudes of some columns that gain most together, and that gain [nat].
+
+        Amplitudes that only positive values have are not negative.
+        """
+        rows = np.concatenate([i for _, i in shapes])
+        positive = np.concatenate([np.full(len(i), s.candidate.one_sided) for s, i in shapes])
+        size = np.sqrt(np.diag(self.G)[rows])
+        # Columns of norm one: their sizes differ by powers of ten.
+        keep = size > 1e-9 * max(float(size.max()), 1e-300)
+        a = np.zeros(len(rows))
+        G = self.G[np.ix_(rows, rows)] / np.outer(np.where(keep, size, 1.0), np.where(keep, size, 1.0))
+        b = self.b[rows] / np.where(keep, size, 1.0)
+        while keep.any():
+            found = np.linalg.lstsq(G[np.ix_(keep, keep)], -b[keep], rcond=1e-10)[0]
+            negative = np.flatnonzero(keep)[(found < 0) & positive[keep]]
+            if not len(negative):
+                a[keep] = found
+                break
+            full = np.zeros(len(rows))
+            full[keep] = found
+            keep[negative[np.argmin(full[negative])]] = False
+        most = np.concatenate(
+            [np.full(len(i), MAX_THRESHOLD_AMPLITUDE if s.candidate.threshold else np.inf) for s, i in shapes]
+        )
+        a = np.minimum(a, most * size)
+        return a / np.where(keep, size, 1.0), float(-a @ b - 0.5 * a @ G @ a)
+
+
+def _contain_each_other(a: Candidate, b: Candidate) -> bool:
+    """Whether one of two candidates is the other and something more."""
+    (first, port), (second, other) = a.location, b.location
+    return port == other and (first in CATALOG[second].contains or second in CATALOG[first].contains)
 
 
 def promising_at_both(prediction: list[Score], free_run: list[Score], most: int) -> list[tuple[Score, Score]]:

@@ -33,11 +33,12 @@ from rotflex_jax.discover.hypothesis import (
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.milestone import milestone
+from rotflex_jax.discover.pairs import find_pair, is_unexplained
 from rotflex_jax.discover.probabilities import Probabilities, probabilities
 from rotflex_jax.discover.proposal import with_proposal
 from rotflex_jax.discover.refit import choose_process_noise, refit
 from rotflex_jax.discover.result import HorizonGain, Ranked, Round, Stage
-from rotflex_jax.discover.score_test import Score, promising_at_both, scores
+from rotflex_jax.discover.score_test import Score, ScoreTest, promising_at_both, score_test
 from rotflex_jax.discover.selection import (
     best_window_rmse,
     choose,
@@ -104,6 +105,7 @@ class SearchState:
         alternatives: Models fitted and validated at the reported horizon beside the final one.
         merged: The final model with one effect in the place of several, where it has one.
         machine: Calibrations that belong to the machine.
+        tests: Score tests of the current model, of predictions and of free runs.
     """
 
     model: Model
@@ -126,6 +128,7 @@ class SearchState:
     alternatives: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
     merged: ValidatedHypothesis | None = None
     machine: list[EffectLocation] = dataclasses.field(default_factory=list)
+    tests: tuple[ScoreTest, ScoreTest] | None = None
 
     @functools.cached_property
     def reach(self) -> Reach:
@@ -231,15 +234,15 @@ def discover(
     evaluation = Evaluation.of(model, horizons, _several(test, "test"), calibrate_seconds)
     say("fitting the model as it is")
     state = _fit_as_it_is(model, horizons, say)
-    for number in range(rounds):
+    while len(state.scores) < rounds:
         left = len(state.problem.supermodel.candidates) - len(state.scores)
-        say(f"round {number + 1}: scoring {left} candidates")
+        say(f"round {len(state.scores) + 1}: scoring {left} candidates")
         promising_scores, starts, runs_starts = _score_candidates(state)
-        if not starts:
-            break
-        say("refitting " + ", ".join(str(start.location) for start in starts))
-        refitted = _refit(state, starts, runs_starts)
-        if not _decide(state, refitted, promising_scores):
+        if starts:
+            say("refitting " + ", ".join(str(start.location) for start in starts))
+            if _decide(state, _refit(state, starts, runs_starts), promising_scores):
+                continue
+        if len(state.scores) + 2 > rounds or not _add_pair(state):
             break
     say("checking that each effect is needed")
     _simplify(state)
@@ -303,8 +306,11 @@ def _score_candidates(
     """Scores worth a refit, and starts at both horizons: theirs, and effects that contain one that is on."""
     current, s = state.current, state.problem.supermodel
     assert current.free_run
-    listed = scores(state.problem, current.hypothesis)
-    runs = scores(state.horizons.free_run.problem, current.free_run.hypothesis)
+    state.tests = (
+        score_test(state.problem, current.hypothesis),
+        score_test(state.horizons.free_run.problem, current.free_run.hypothesis),
+    )
+    listed, runs = (test.listed for test in state.tests)
     if not state.ranking:
         by_runs = {x.location: x.nats for x in runs}
         state.ranking = [(x, by_runs[x.location]) for x in listed]
@@ -364,6 +370,24 @@ def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: l
     state.current = dataclasses.replace(winner, location=None, parameter_count=0)
     state.passed.append(state.current)
     state.reached(f"+ {location}")
+    return True
+
+
+def _add_pair(state: SearchState) -> bool:
+    """Add two effects that are needed together, where something is left; False where there are none."""
+    if state.tests is None or not is_unexplained(state.horizons, state.current):
+        return False
+    pair, tried = find_pair(state.horizons, state.current, state.tests, state.is_plausible, state.say)
+    state.tried += tried
+    if pair is None:
+        return False
+    for location, less in pair.members.items():
+        state.scores[location] = next((x.nats for x in state.tests[0].listed if x.location == location), 0.0)
+        state.rivals[location] = pair.rivals[location]
+        state.gains[location] = horizon_gains(pair.found, less)
+    state.current = dataclasses.replace(pair.found, parameter_count=0)
+    state.passed.append(state.current)
+    state.reached("+ " + " + ".join(str(p) for p in pair.members))
     return True
 
 

@@ -1,0 +1,195 @@
+"""One step further where a search stops unexplained: two effects at once.
+
+Two effects may hide each other: alone, each is refused, since the other one's errors are larger than what it
+explains. The score test says without a run what two candidates would gain together; the best few pairs are
+refitted at both horizons, and validation data decide by the rules of single effects. A pair must pass them
+beside the model as it is and beside each of its members alone.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from rotflex_jax.discover.assessment import NATS_PER_SAMPLE, NEAR_FLOOR
+from rotflex_jax.discover.evaluation import process_noise_gain
+from rotflex_jax.discover.horizon import Horizons, as_free_run
+from rotflex_jax.discover.hypothesis import (
+    CandidateStart,
+    Hypothesis,
+    parameter_count,
+    with_candidate,
+    without,
+)
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.refit import refit
+from rotflex_jax.discover.score_test import PairScore, ScoreTest
+from rotflex_jax.discover.selection import (
+    TRAIN_NATS,
+    admissible,
+    best_window_rmse,
+    describe,
+    distinguished,
+    shares_of_gain,
+)
+from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_from
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.validation import ValidatedHypothesis
+
+# Candidates of which pairs are scored, and pairs that are refitted: the best, and those that gain most beyond
+# what their members promise alone.
+PAIRED, BEST_PAIRS, SYNERGETIC_PAIRS = 10, 2, 1
+
+Pair = tuple[EffectLocation, EffectLocation]
+
+
+def is_unexplained(horizons: Horizons, current: ValidatedHypothesis) -> bool:
+    """Whether short runs are above the noise, or predictions still ask for a random torque."""
+    problem = horizons.prediction.problem
+    if bool(np.any(best_window_rmse(current) > NEAR_FLOOR * problem.noise)):
+        return True
+    return process_noise_gain(problem, current.hypothesis) > NATS_PER_SAMPLE * problem.measured_values
+
+
+def best_candidates(prediction: ScoreTest, free_run: ScoreTest, most: int) -> list[EffectLocation]:
+    """Candidates with the largest gains to first order, as shares of the best, summed over both horizons."""
+    share: dict[EffectLocation, float] = {}
+    for test in (prediction, free_run):
+        gains = {s.location: s.start.expected_gain for s in test.listed}
+        best = max(gains.values(), default=0.0)
+        for p, gain in gains.items():
+            share[p] = share.get(p, 0.0) + (max(gain, 0.0) / best if best > 0 else 0.0)
+    return sorted((p for p in share if share[p] > 0), key=lambda p: -share[p])[:most]
+
+
+def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[PairScore, PairScore]]:
+    """Pairs worth a refit with their scores of both horizons, best first.
+
+    At one horizon at least, the second effect must be worth its parameters beside the better one.
+    """
+    chosen = best_candidates(prediction, free_run, PAIRED)
+    tests = [{p.locations: p for p in test.pairs(chosen)} for test in (prediction, free_run)]
+    common = [p for p in tests[0] if p in tests[1]]
+    wanted = [p for p in common if any(t[p].nats > 0 and t[p].more > TRAIN_NATS for t in tests)]
+    if not wanted:
+        return []
+
+    def shares(value: Callable[[PairScore], float]) -> dict[Pair, float]:
+        most = [max(max(value(t[p]) for p in wanted), 1e-9) for t in tests]
+        return {p: sum(max(value(t[p]), 0.0) / m for t, m in zip(tests, most, strict=True)) for p in wanted}
+
+    by_score, by_synergy = shares(lambda s: s.nats), shares(lambda s: s.synergy)
+    best = sorted(wanted, key=lambda p: -by_score[p])[:BEST_PAIRS]
+    together = [p for p in sorted(wanted, key=lambda p: -by_synergy[p]) if by_synergy[p] > 0]
+    best += [p for p in together if p not in best][:SYNERGETIC_PAIRS]
+    return [(tests[0][p], tests[1][p]) for p in best]
+
+
+def refit_pairs(
+    problem: LikelihoodProblem, current: Hypothesis, pairs: Sequence[tuple[CandidateStart, CandidateStart]]
+) -> list[Hypothesis]:
+    """The current model with each pair, from the likeliest of several shares of both amplitudes."""
+    s, starts = problem.supermodel, []
+    for a, b in pairs:
+        grown = [with_candidate(s, with_candidate(s, current, a, x), b, x) for x in AMPLITUDE_SHARES]
+        starts.append(grown[int(np.argmax(problem.log_likelihoods(grown)))])
+    return refit(problem, starts)
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundPair:
+    """Two effects that are needed together.
+
+    Attributes:
+        found: The model with both.
+        members: Each effect -> the model without it.
+        rivals: Each effect -> others that are not distinguished from it beside the other member.
+    """
+
+    found: ValidatedHypothesis
+    members: dict[EffectLocation, ValidatedHypothesis]
+    rivals: dict[EffectLocation, list[EffectLocation]]
+
+
+def find_pair(
+    horizons: Horizons,
+    current: ValidatedHypothesis,
+    tests: tuple[ScoreTest, ScoreTest],
+    is_plausible: Callable[[Hypothesis, EffectLocation], bool],
+    say: Callable[[str], None],
+) -> tuple[FoundPair | None, list[ValidatedHypothesis]]:
+    """The best pair that passes, if there is one, and all that was fitted and validated.
+
+    Args:
+        horizons: Training and validation recordings.
+        current: The model so far.
+        tests: Its score tests of predictions and of free runs.
+        is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
+        say: Called with lines of progress.
+    """
+    pairs = promising_pairs(*tests)
+    if not pairs:
+        return None, []
+    say("looking one step further, refitting " + ", ".join(_named(a.locations) for a, _ in pairs))
+    problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
+    data, noise, s = problem.dataset.data, problem.noise, problem.supermodel
+    assert current.free_run
+    grown = refit_pairs(problem, current.hypothesis, [a.starts for a, _ in pairs])
+    runs = refit_pairs(runs_problem, current.free_run.hypothesis, [b.starts for _, b in pairs])
+    begun = [(i, as_free_run(runs_problem, h)) for i, h in enumerate(grown)]
+    runs = refit_from(runs_problem, runs, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
+    tried: dict[Pair, ValidatedHypothesis] = {}
+    for h, f, (score, _) in zip(grown, runs, pairs, strict=True):
+        if all(is_plausible(x, p) for x in (h, f) for p in score.locations if p in x.locations):
+            count = sum(parameter_count(s, h, p) for p in score.locations)
+            v = dataclasses.replace(horizons.validated(h, f, current), parameter_count=count)
+            tried[score.locations] = v
+            line = describe(v, current).removeprefix("None: ")
+            say(f"  {_named(score.locations)}: {line}")
+    able = {p: v for p, v in tried.items() if admissible(v, current, data, noise)}
+    everyone = list(tried.values())
+    if not able:
+        return None, everyone
+    shares = dict(zip(able, shares_of_gain(list(able.values()), current), strict=True))
+    for pair in sorted(able, key=lambda p: -shares[p]):
+        found, members = able[pair], {}
+        for p in pair:
+            less = _without(horizons, found, p, current)
+            everyone.append(less)
+            count = parameter_count(s, found.hypothesis, p)
+            if not admissible(dataclasses.replace(found, parameter_count=count), less, data, noise):
+                say(f"  {_named(pair)}: no better than without {p}")
+                break
+            members[p] = less
+        if len(members) == len(pair):
+            return FoundPair(found, members, _rivals(pair, able)), everyone
+    return None, everyone
+
+
+def _named(pair: Pair) -> str:
+    return f"{pair[0]} with {pair[1]}"
+
+
+def _without(
+    horizons: Horizons, found: ValidatedHypothesis, location: EffectLocation, current: ValidatedHypothesis
+) -> ValidatedHypothesis:
+    """A model less one effect, refitted and validated at both horizons."""
+    assert found.free_run
+    fits = []
+    for horizon, h in (
+        (horizons.prediction, found.hypothesis),
+        (horizons.free_run, found.free_run.hypothesis),
+    ):
+        less = without(horizon.problem.supermodel, h, location)
+        fits.append(refit(horizon.problem, [less])[0])
+    return horizons.validated(fits[0], fits[1], current)
+
+
+def _rivals(pair: Pair, able: dict[Pair, ValidatedHypothesis]) -> dict[EffectLocation, list[EffectLocation]]:
+    """For each member what takes its place in another admissible pair that is not distinguished."""
+    rivals: dict[EffectLocation, list[EffectLocation]] = {p: [] for p in pair}
+    for other, v in able.items():
+        mine, theirs = set(pair) - set(other), set(other) - set(pair)
+        if len(mine) == 1 and not distinguished(able[pair], v):
+            rivals[mine.pop()].append(theirs.pop())
+    return rivals
