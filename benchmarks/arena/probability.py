@@ -160,12 +160,12 @@ def reliability(events: Iterable[Event]) -> list[Bin]:
 def calibration_error(events: Iterable[Event]) -> float:
     """Expected calibration error: mean of |claimed - held| over bins, weighted by cases.
 
-    >>> calibration_error([Event(0.8, True), Event(0.8, True), Event(0.8, False), Event(0.8, True)])
+    >>> round(calibration_error([Event(0.8, held) for held in (True, True, False, True)]), 6)
     0.05
     """
     bins = reliability(events)
     cases = sum(b.cases for b in bins)
-    return round(sum(b.cases * abs(b.claimed - b.held) for b in bins) / cases, 6) if cases else math.nan
+    return sum(b.cases * abs(b.claimed - b.held) for b in bins) / cases if cases else math.nan
 
 
 class CredibleSets(NamedTuple):

@@ -1,0 +1,187 @@
+"""Two candidates at once: the joint score is dense least squares, and which pairs are worth a refit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import small_problem as sp
+from scipy.optimize import lsq_linear
+
+from rotflex_jax.discover.hypothesis import CandidateStart
+from rotflex_jax.discover.pairs import best_candidates, promising_pairs, refit_pairs
+from rotflex_jax.discover.score_test import (
+    MAX_THRESHOLD_AMPLITUDE,
+    Score,
+    ScoreTest,
+    _Projected,
+    _score,
+    score_test,
+)
+from rotflex_jax.discover.supermodel import Candidate, EffectLocation
+
+SAMPLES = 60
+
+
+def candidate(name: str, port: str, probes, one_sided=False, threshold=False) -> Candidate:
+    k = len(probes[0][0])
+    return Candidate(
+        EffectLocation(name, port), 0, tuple(range(k)), probes, (True,) * k, one_sided, threshold
+    )
+
+
+def made(candidates: list[Candidate], slopes: dict, r: np.ndarray) -> ScoreTest:
+    """A test with slopes made by hand, of which the hypothesis explains none."""
+    columns = {key: [row[None, :, None] for row in rows] for key, rows in slopes.items()}
+    orthogonal = lambda J: np.asarray(J).reshape(len(J), -1)  # noqa: E731
+    projected = _Projected(r, orthogonal, columns, float(SAMPLES), 1.0)
+    listed = sorted((_score(c, projected) for c in candidates), key=lambda s: -s.nats)
+    return ScoreTest(listed, {c.location: c for c in candidates}, projected)
+
+
+def dense(slopes: list[np.ndarray], r: np.ndarray, lower: list[float], upper: list[float]) -> float:
+    """What least squares within bounds takes from half the squared residual."""
+    J = np.vstack(slopes).T
+    found = lsq_linear(J, -r, (lower, upper), tol=1e-13)
+    return float(0.5 * r @ r - found.cost)
+
+
+@pytest.fixture(scope="module")
+def by_hand():
+    """Two directions of either sign in two shapes, one that is only positive, one with a threshold."""
+    rng = np.random.default_rng(5)
+    both = candidate("gravity", "hub", (((1.0, 0.0), (0.0, 1.0)), ((2.0, 0.0), (0.0, 2.0))))
+    positive = candidate("coulomb", "hub", (((0.5,),),), one_sided=True)
+    step = candidate("dead_zone", "input", (((0.2,),),), threshold=True)
+    c = [both, positive, step]
+    slopes = {(both.location, k): rng.normal(size=(2, SAMPLES)) for k in (0, 1)}
+    shared = rng.normal(size=SAMPLES)
+    slopes[(positive.location, 0)] = (shared + 0.1 * rng.normal(size=SAMPLES))[None]
+    slopes[(step.location, 0)] = (shared + 0.1 * rng.normal(size=SAMPLES))[None]
+    slopes[(both.location, 1)][0] *= 1e6  # columns of very different sizes
+    # Both amplitudes of one sign beside what is shared: each alone hides the other.
+    r = 3 * (slopes[(step.location, 0)] - slopes[(positive.location, 0)])[0] + 0.3 * rng.normal(size=SAMPLES)
+    r += 0.4 * slopes[(both.location, 0)][1]
+    return c, slopes, r, made(c, slopes, r)
+
+
+def test_the_joint_score_is_dense_least_squares(by_hand):
+    (both, positive, step), slopes, r, test = by_hand
+    pairs = {frozenset(p.locations): p for p in test.pairs([c.location for c in (both, positive, step)])}
+    assert len(pairs) == 3
+    inf = np.inf
+    half_log = 0.5 * np.log(SAMPLES)
+    g = pairs[frozenset({positive.location, step.location})]
+    each = [slopes[(c.location, 0)] for c in (positive, step)]
+    assert g.gain == pytest.approx(dense(each, r, [0.0, -inf], [inf, inf]), rel=1e-6)
+    # The size of what has a threshold is held; the other amplitude stays where it was.
+    large = -each[0][0] - 3.0 * each[1][0]
+    far = ScoreTest(test.listed, test.candidates, dataclasses.replace(test.projected, r=large))
+    (held,) = far.pairs([positive.location, step.location])
+    np.testing.assert_allclose(held.starts[0].values, [1.0 * 0.5], rtol=1e-6)
+    np.testing.assert_allclose(held.starts[1].values, [MAX_THRESHOLD_AMPLITUDE * 0.2])
+    left = large + each[0][0] + MAX_THRESHOLD_AMPLITUDE * each[1][0]
+    assert held.gain == pytest.approx(0.5 * large @ large - 0.5 * left @ left, rel=1e-6)
+    for other, lower in ((positive, 0.0), (step, -inf)):
+        options = []
+        for k in (0, 1):
+            gain = dense(
+                [slopes[(both.location, k)], slopes[(other.location, 0)]],
+                r,
+                [-inf, -inf, lower],
+                [inf, inf, inf],
+            )
+            options.append(gain)
+        p = pairs[frozenset({both.location, other.location})]
+        assert p.gain == pytest.approx(max(options), rel=1e-6)
+        # Two amplitudes and the choice of a shape, beside one amplitude.
+        assert p.nats == pytest.approx(p.gain - half_log * (2 + 1 + 1), rel=1e-6)
+
+
+def test_values_are_those_of_the_solution(by_hand):
+    (both, _, step), slopes, r, test = by_hand
+    (p,) = test.pairs([both.location, step.location])
+    gains = []
+    for k in (0, 1):
+        J = np.vstack([slopes[(both.location, k)], slopes[(step.location, 0)]])
+        a = np.linalg.lstsq(J.T, -r, rcond=None)[0]
+        gains.append((0.5 * r @ r - 0.5 * np.sum((r + a @ J) ** 2), k, a))
+    _, k, a = max(gains, key=lambda g: g[0])
+    first, second = p.starts
+    np.testing.assert_allclose(first.values, a[:2] @ np.array(both.probes[k]), rtol=1e-5)
+    np.testing.assert_allclose(second.values, min(a[2], MAX_THRESHOLD_AMPLITUDE) * 0.2, rtol=1e-5)
+
+
+def test_what_hides_behind_another_has_synergy():
+    """Two nearly equal slopes whose difference is missing: alone each explains little, together all."""
+    rng = np.random.default_rng(6)
+    a, b = candidate("viscous", "hub", (((1.0,),),)), candidate("viscous", "arm", (((1.0,),),))
+    c = candidate("gravity", "arm", (((1.0,),),))
+    shared, own = rng.normal(size=SAMPLES), rng.normal(size=(3, SAMPLES))
+    slopes = {
+        (a.location, 0): (shared + 0.2 * own[0])[None],
+        (b.location, 0): (shared + 0.2 * own[1])[None],
+        (c.location, 0): own[2][None],
+    }
+    r = 40 * (slopes[(a.location, 0)] - slopes[(b.location, 0)])[0] + rng.normal(size=SAMPLES)
+    r += 2.0 * own[2]
+    test = made([a, b, c], slopes, r)
+    ((x, y), *_) = promising_pairs(test, test)
+    assert set(x.locations) == {a.location, b.location} and x.locations == y.locations
+    assert x.synergy > 0.5 * x.gain and x.more > 0
+    # One that contains the other is one effect.
+    rich = candidate("stribeck", "hub", (((1.0,),),))
+    simple = candidate("coulomb", "hub", (((1.0,),),))
+    slopes = {(rich.location, 0): own[:1], (simple.location, 0): own[1:2]}
+    assert made([rich, simple], slopes, own[0] + own[1]).pairs([rich.location, simple.location]) == []
+
+
+def scored(location: EffectLocation, gain: float) -> Score:
+    start = CandidateStart(location, np.zeros(1), expected_gain=gain)
+    return Score(start, gain, True, 1.0, 1.0)
+
+
+def test_the_best_candidates_of_both_horizons():
+    """Shares of the best of each horizon add up: one with large numbers does not decide alone."""
+    places = [EffectLocation("viscous", p) for p in "abcd"]
+    tests = [
+        ScoreTest([scored(p, g) for p, g in zip(places, gains, strict=True)], {}, None)
+        for gains in ((1000.0, 100.0, 0.0, -5.0), (1.0, 8.0, 10.0, -np.inf))
+    ]
+    assert best_candidates(*tests, 10) == [places[0], places[2], places[1]]
+    assert best_candidates(*tests, 1) == places[:1]
+    assert ScoreTest([], {}, None).pairs([]) == []
+
+
+@pytest.fixture(scope="module")
+def small():
+    """Recordings with a little friction, the baseline at its optimum, and its test."""
+    problem = sp.problem(sp.recordings(sp.records(0.0015)))
+    h = sp.fitted(problem)
+    return problem, h, score_test(problem, h)
+
+
+def test_a_pair_of_a_model_is_dense_least_squares_too(small):
+    """Slopes of the super-model, less everything that the baseline can still move."""
+    problem, _, test = small
+    places = [sp.HUB, EffectLocation("cubic_spring", "joint"), EffectLocation("coulomb", "joint")]
+    for p in test.pairs(places):
+        slopes, lower, options = [], [], []
+        for location in p.locations:
+            c = test.candidates[location]
+            assert len(c.probes) == 1
+            slopes.append(test.projected.orthogonal(np.array(test.projected.columns[(location, 0)])))
+            lower += [0.0 if c.one_sided else -np.inf] * len(c.probes[0])
+        options = dense(slopes, test.projected.r, lower, [np.inf] * len(lower))
+        assert p.gain == pytest.approx(options, rel=1e-5)
+        alone = {s.location: s.start.expected_gain for s in test.listed}
+        assert p.gain >= max(alone[x] for x in p.locations) - 1e-6
+        assert p.nats <= p.gain - np.log(problem.measured_values) + 1e-6
+
+
+def test_a_refit_of_a_pair_reaches_what_its_score_promises(small):
+    problem, h, test = small
+    spring = EffectLocation("cubic_spring", "joint")
+    (p,) = test.pairs([sp.HUB, spring])
+    (both,) = refit_pairs(problem, h, [p.starts])
+    assert set(both.locations) == {*h.locations, sp.HUB, spring}
+    assert both.log_likelihood - h.log_likelihood == pytest.approx(p.gain, rel=0.25)

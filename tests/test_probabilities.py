@@ -1,0 +1,191 @@
+"""Probabilities of sets of effects: known evidence, scatter, credible sets, what is told of them."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.special import softmax
+from scipy.stats import norm
+
+from arena.probability import Event, calibration_error, classes, credible, effect_events, reliability, weighed
+from rotflex_jax.discover.probabilities import (
+    EvidenceRule,
+    FittedSet,
+    HorizonEvidence,
+    SetProbability,
+    probabilities,
+    set_probabilities,
+)
+from rotflex_jax.errors import InputError
+
+BLOCKS, TRAINING, VALUES = 12, 28, 14_000.0
+COMMON = np.random.default_rng(0).normal(size=BLOCKS) * 40
+TRAINED = np.random.default_rng(1).normal(size=TRAINING) * 40
+RULE = EvidenceRule(temperature=2.0, run_nats=1.5, prior_nats=0.7, elsewhere=0.04, elsewhere_unexplained=0.25)
+
+
+def fitted(
+    names: str, lead=0.0, trained=0.0, runs=0.0, parameters=0, pattern=None, free_run=True
+) -> FittedSet:
+    """A set that leads by so many nats in all, evenly, or with a pattern of the half seconds besides."""
+    pattern = np.zeros(BLOCKS) if pattern is None else pattern
+    prediction = HorizonEvidence(COMMON + lead / BLOCKS + pattern, TRAINED + trained / TRAINING)
+    free = HorizonEvidence(0.01 * COMMON + runs / BLOCKS, 0.01 * TRAINED) if free_run else None
+    return FittedSet(frozenset(names.split()), parameters, prediction, free)
+
+
+def test_even_leads_are_a_softmax():
+    """Without scatter no weighting of the half seconds changes a sum."""
+    sets = [
+        fitted("a@hub", 10.0, 12.0, 0.3, 1),
+        fitted("", 0.0),
+        fitted("a@hub b@arm", 13.0, 21.0, 0.5, 3),
+        fitted("b@arm", 9.0, 30.0, -0.2, 2),
+    ]
+    lead, trained = np.array([10.0, 0.0, 13.0, 9.0]), np.array([12.0, 0.0, 21.0, 30.0])
+    runs, k, n = np.array([0.3, 0.0, 0.5, -0.2]), np.array([1, 0, 3, 2]), np.array([1, 0, 2, 1])
+    log_weight = (lead + trained - 0.5 * k * np.log(VALUES)) / 2.0 + 1.5 * runs - 0.7 * n
+    np.testing.assert_allclose(set_probabilities(sets, VALUES, RULE), softmax(log_weight), rtol=1e-9)
+    assert np.ptp(softmax(log_weight)) < 0.99  # none of them decides alone
+
+
+def test_runs_that_validate_each_other_are_not_counted_twice():
+    """Their training blocks are the same samples; without them no parameter is paid for."""
+    none = np.zeros(0)
+    sets = [
+        FittedSet(frozenset({"a@hub"}), 1, HorizonEvidence(COMMON + 3.0 / BLOCKS, none)),
+        FittedSet(frozenset(), 0, HorizonEvidence(COMMON, none)),
+    ]
+    expected = softmax([3.0 / 2.0 - 0.7, 0.0])
+    np.testing.assert_allclose(set_probabilities(sets, VALUES, RULE), expected, rtol=1e-9)
+
+
+def test_a_missing_horizon_says_as_much_as_the_reference():
+    at_one = fitted("b@arm", 5.0, 5.0, parameters=1, free_run=False)
+    as_reference = fitted("b@arm", 5.0, 5.0, 0.8, parameters=1)
+    first = fitted("a@hub", 5.0, 5.0, 0.8, parameters=1)
+    p, q = (set_probabilities([first, other], VALUES, RULE) for other in (at_one, as_reference))
+    np.testing.assert_allclose(p, q)
+    np.testing.assert_allclose(p, [0.5, 0.5])
+    # The reference is the first that has both, wherever it stands.
+    np.testing.assert_allclose(set_probabilities([at_one, first], VALUES, RULE), [0.5, 0.5])
+
+
+def test_a_lead_within_its_scatter_does_not_decide():
+    """A sharp likelihood whose half seconds scatter: the probability is that of the sign of the lead."""
+    many, rng = 400, np.random.default_rng(3)
+    noise = rng.normal(size=many) * 30
+    noise -= noise.mean()
+    spread = noise.std(ddof=1) * np.sqrt(many)
+    none, zero = np.zeros(0), np.zeros(many)
+    rule = EvidenceRule(temperature=1.0, prior_nats=0.0)
+    for z in (0.0, 1.0, 2.0):
+        lead = HorizonEvidence(noise + z * spread / many, none)
+        sets = [
+            FittedSet(frozenset({"a@hub"}), 0, lead),
+            FittedSet(frozenset(), 0, HorizonEvidence(zero, none)),
+        ]
+        assert set_probabilities(sets, VALUES, rule)[0] == pytest.approx(norm.cdf(z), abs=0.025)
+    # The same lead without scatter is certain.
+    lead = HorizonEvidence(np.full(many, 2.0 * spread / many), none)
+    sets = [FittedSet(frozenset({"a@hub"}), 0, lead), FittedSet(frozenset(), 0, HorizonEvidence(zero, none))]
+    assert set_probabilities(sets, VALUES, rule)[0] > 1 - 1e-9
+
+
+def test_a_model_that_diverges_has_no_probability():
+    lost = fitted("b@arm", -1e9 * BLOCKS, 3.0)
+    p = set_probabilities([fitted("a@hub", 1.0), lost], VALUES, RULE)
+    np.testing.assert_allclose(p, [1.0, 0.0], atol=1e-12)
+
+
+@pytest.fixture
+def found():
+    sets = [
+        fitted("coulomb@hub", 6.0, 6.0, 0.0, 0),
+        fitted("stribeck@hub", 6.0 - 2 * np.log(2.0), 6.0, 0.0, 0),
+        fitted("coulomb@hub sensor_bias@alpha", 6.0 + 2 * (0.7 - np.log(4.0)), 6.0, 0.0, 0),
+        fitted("coulomb@hub", 99.0),
+    ]
+    return probabilities(sets, VALUES, is_explained=True, rule=RULE)
+
+
+def test_sets_effects_and_what_lies_elsewhere(found):
+    """Weights 1, 1/2, 1/4; the second fit of a set is left out."""
+    p = 0.96 * np.array([4, 2, 1]) / 7
+    assert [s.effects for s in found.sets] == [
+        {"coulomb@hub"},
+        {"stribeck@hub"},
+        {"coulomb@hub", "sensor_bias@alpha"},
+    ]
+    np.testing.assert_allclose([s.probability for s in found.sets], p)
+    assert list(found.effects) == ["coulomb@hub", "stribeck@hub", "sensor_bias@alpha"]
+    np.testing.assert_allclose(list(found.effects.values()), [p[0] + p[2], p[1], p[2]])
+    assert found.elsewhere == 0.04 and len(found.remarks) == 1
+    np.testing.assert_allclose(sum(s.probability for s in found.sets) + found.elsewhere, 1.0)
+
+
+def test_credible_sets_are_the_smallest(found):
+    assert found.credible(0.5) == found.sets[:1]
+    assert found.credible(0.6) == found.sets[:2]
+    assert found.credible(found.sets[0].probability) == found.sets[:1]
+    assert found.credible(0.9) == found.credible(0.99) == found.sets  # the rest lies elsewhere
+    assert all(isinstance(s, SetProbability) for s in found.credible())
+    for bad in (0, 1.5, float("nan"), "most"):
+        with pytest.raises(InputError, match="share"):
+            found.credible(bad)
+
+
+def test_what_is_told(found):
+    data = json.loads(json.dumps(found.to_dict()))
+    assert data["sets"][2]["effects"] == [
+        {"effect": "coulomb", "port": "hub"},
+        {"effect": "sensor_bias", "port": "alpha"},
+    ]
+    assert data["effects"]["stribeck@hub"] == pytest.approx(0.96 * 2 / 7)
+    assert "3 sets" in found.sentence and "Coulomb friction at hub 55 %" in found.sentence
+    assert "Stribeck" in found.sentence and "none of these 4 %" in found.sentence
+    left = probabilities([fitted("")], VALUES, is_explained=False, rule=RULE)
+    assert left.elsewhere == 0.25 and "catalogue" in left.remarks[1]
+    assert "nothing more 75 %" in left.sentence
+
+
+def test_calibration_error_by_hand():
+    """Ten of 0.85 of which seven are so, five of 0.25 of which one is; what is below 0.01 does not count."""
+    events = [Event(0.85, k < 7) for k in range(10)] + [Event(0.25, k < 1) for k in range(5)]
+    events += [Event(0.001, False)] * 100
+    assert calibration_error(events) == pytest.approx((10 * 0.15 + 5 * 0.05) / 15)
+    assert [(b.cases, b.held) for b in reliability(events)] == [(5, 0.2), (10, 0.7)]
+    assert calibration_error([Event(1.0, True)]) == 0.0
+
+
+def row(sets, wanted=(), **more):
+    return {"probabilities": {"sets": sets, "elsewhere": 0.1}, "wanted": wanted, "verdict": "found", **more}
+
+
+def test_sets_that_are_one_answer_count_once():
+    """An asymmetric friction is a symmetric one and an offset; what is wrong besides is neutral."""
+    sets = [
+        [["coulomb@hub", "voltage_offset@input"], 0.5],
+        [["coulomb_asymmetric@hub"], 0.3],
+        [["coulomb@hub"], 0.1],
+    ]
+    plain = row(sets, [["coulomb_asymmetric", "hub"]])
+    assert classes(plain) == [(pytest.approx(0.8), True), (0.1, False)]
+    assert credible([plain]) == (1.0, 2.0, 1)
+    assert dict(zip(("coulomb", "offset", "asymmetric"), effect_events(plain), strict=True)) == {
+        "coulomb": (pytest.approx(0.6), True),
+        "offset": (0.5, True),
+        "asymmetric": (0.3, True),
+    }
+    besides = [{"name": "voltage_offset", "names": [["voltage_offset", "input"]]}]
+    world = row(sets, world=7, hidden=["coulomb", "hub"], besides=besides)
+    assert classes(world) == [(pytest.approx(0.6), True), (0.3, False)]
+    nothing = row(sets, world=7, hidden=None, besides=besides)
+    assert classes(nothing) == [(pytest.approx(0.6), False), (0.3, False)]
+
+
+def test_a_row_is_weighed_again_as_it_was(found):
+    lines = lambda e: [" ".join(map(repr, b.tolist())) for b in e]  # noqa: E731
+    kept = [[sorted(s.effects), s.parameters, lines(s.prediction), lines(s.free_run)] for s in found.evidence]
+    again = weighed(row([], evidence={"measured_values": VALUES, "sets": kept}), RULE)
+    assert again.sets == found.sets and again.effects == found.effects
