@@ -333,6 +333,7 @@ class FakeSearch:
             where=[SimpleNamespace(statement="78 % of the error follows reversals")],
             to_dict=lambda: {"schema": 1, "verdict": "found"},
             report=self.report,
+            probabilities=SimpleNamespace(sentence="Most probable: Coulomb friction at hub 93 %."),
             assessment=assess({"theta": 0.2}, {"theta": 0.1}, {"theta": 5e-4}, 0.0, 600),
         )
 

@@ -21,6 +21,7 @@ from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.discover.formula import Formula, Term
 from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
+from rotflex_jax.discover.probabilities import Probabilities, SetProbability
 from rotflex_jax.discover.result import Ranked, Round, Stage, Where
 from rotflex_jax.discover.tables import next_steps
 from rotflex_jax.discover.verdict import Verdict
@@ -148,6 +149,16 @@ def two_rounds() -> Discovery:
         noise_floor={"theta": NOISE, "alpha": NOISE},
         elapsed_s=12.3,
         notes=("The <u>offset</u> of the voltage is significant.",),
+        probabilities=Probabilities(
+            (
+                SetProbability(frozenset({"coulomb@hub", "cubic_spring@joint"}), 0.72),
+                SetProbability(frozenset({"stribeck@hub", "cubic_spring@joint"}), 0.2),
+                SetProbability(frozenset(), 0.001),
+            ),
+            {"cubic_spring@joint": 0.92, "coulomb@hub": 0.72, "stribeck@hub": 0.2},
+            0.079,
+            ("Only sets that the search has <b>fitted</b> are listed.",),
+        ),
     )
 
 
@@ -310,6 +321,8 @@ def test_what_a_reader_must_learn_is_there(page, discovery) -> None:
     assert "78 % of the theta error lies within 80 ms after the hub reverses" in text
     assert "Not excited means" in text
     assert "1 of 5 candidates" in text
+    assert "Most probable of the 3 sets of effects that were fitted: Coulomb friction at hub + cubic" in text
+    assert "spring at joint 72 %; then" in text and "none of these 8 %" in text
     assert "What to do next" in text
     assert "jax" in text
 
@@ -319,7 +332,7 @@ def test_what_a_user_wrote_is_escaped(page) -> None:
     assert NASTY in text
     assert "The spring hardens <b>fast</b>." in text
     assert "<i>own</i> at hub" in text
-    assert "The <u>offset</u>" in text
+    assert "The <u>offset</u>" in text and "has <b>fitted</b> are" in text
     for tag in ("script", "b", "i", "u"):
         assert tag not in read(page).tags
 
@@ -375,6 +388,20 @@ def _has_unit(ax, axis) -> bool:
     group = getattr(ax, f"get_shared_{axis.axis_name}_axes")()
     labels = [getattr(other, name).get_label_text() for other in group.get_siblings(ax)]
     return any(re.search(r"\[.+\]", label) for label in labels)
+
+
+def test_the_most_probable_sets_and_effects_are_drawn(discovery) -> None:
+    """Bars of the reported set in its colour; none where one set alone was fitted."""
+    sets, effects = pictures(discovery)["probabilities"].figure.axes
+    assert [b.get_width() for b in sets.patches] == [0.72, 0.2]  # what is below 1 % is left out
+    assert [b.get_width() for b in effects.patches] == [0.92, 0.72, 0.2]
+    assert next(t.get_text() for t in effects.get_yticklabels()) == "cubic spring at joint"
+    colours = [b.get_facecolor()[:3] for b in sets.patches]
+    assert colours[0] != colours[1]
+    alone = dataclasses.replace(
+        discovery.probabilities, sets=discovery.probabilities.sets[:1], effects={"coulomb@hub": 0.9}
+    )
+    assert "probabilities" not in pictures(dataclasses.replace(discovery, probabilities=alone))
 
 
 def test_errors_after_reversals_are_drawn_to_the_last(discovery) -> None:

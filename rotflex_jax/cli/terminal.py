@@ -112,6 +112,8 @@ def print_discovery(result: Any) -> None:
         for name, estimate in added.parameters.items():
             console.print(f"  {estimate_line(name, estimate)}", markup=False)
         console.print(f"  {status_sentence(added)}", markup=False)
+    if result.probabilities:
+        console.print(f"\n{result.probabilities.sentence}", markup=False)
     names = ["baseline", *(f"+ {effect_label(added.effect, added.port)}" for added in result.rounds)]
     floor, seconds = ("noise floor of the sensor", result.noise_floor), digits(result.baseline.window_seconds)
     for title, note, errors in error_lists(result):

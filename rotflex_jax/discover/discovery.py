@@ -137,6 +137,7 @@ class Discovery(SearchResult):
         return card(
             self.verdict.shown.headline,
             paragraph(sentence(self.sentence)),
+            *([paragraph(self.probabilities.sentence)] if self.probabilities else []),
             picture(
                 staircase(stage_labels(self), errors, floor),
                 f"Held-out error over {seconds} of each model, with the noise of the sensor.",

@@ -171,7 +171,12 @@ def set_label(effects: frozenset[str]) -> str:
     >>> set_label(frozenset({"sensor_bias@alpha", "coulomb@hub"})), set_label(frozenset())
     ('Coulomb friction at hub + sensor bias of alpha', 'nothing more')
     """
-    return " + ".join(effect_label(*parts(n)) for n in sorted(effects)) or "nothing more"
+    return " + ".join(set_labels(effects))
+
+
+def set_labels(effects: frozenset[str]) -> tuple[str, ...]:
+    """The effects of a set in words, one that says so for the model as it was given."""
+    return tuple(effect_label(*parts(n)) for n in sorted(effects)) or ("nothing more",)
 
 
 def percent(probability: float) -> str:

@@ -57,6 +57,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "seconds": f"{discovery.baseline.window_seconds:g}",
         "tiles": _tiles(discovery),
         "rounds": [_round(discovery, k) for k in range(len(discovery.rounds))],
+        "probable": discovery.probabilities,
         "notes": discovery.notes,
         "steps": next_steps(discovery),
         "stages": list(zip(labels, colours, strict=True)),

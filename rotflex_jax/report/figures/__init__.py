@@ -6,7 +6,7 @@ modules and decorate it with `@figure`; the page shows it in its section.
 
 from rotflex_jax.discover.explanation import Explanation
 from rotflex_jax.discover.result import SearchResult
-from rotflex_jax.report.figures.evidence import parameters, ranking, staircase
+from rotflex_jax.report.figures.evidence import parameters, probabilities, ranking, staircase
 from rotflex_jax.report.figures.failure import profiles, residual_map
 from rotflex_jax.report.figures.registry import FIGURES
 from rotflex_jax.report.figures.residuals import residuals, responses
@@ -21,6 +21,7 @@ __all__ = [
     "overlay",
     "parameters",
     "pictures",
+    "probabilities",
     "profiles",
     "ranking",
     "residual_map",

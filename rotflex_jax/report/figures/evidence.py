@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 
+from rotflex_jax.discover.probabilities import LEAST_NAMED, parts, percent, set_labels
 from rotflex_jax.discover.result import NEAR_FLOOR, SearchResult
 from rotflex_jax.discover.tables import Outcome, channel_units, noise_ratios, outcomes, stage_labels
 from rotflex_jax.effects.labels import effect_label
@@ -17,6 +18,46 @@ from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks
 
 MOST_BARS = 14
+MOST_SETS = 6
+
+
+@figure(
+    "probabilities",
+    section="found",
+    caption="Left, sets of effects that the search has fitted, each a model of its own; right, each effect "
+    "with the sum over the sets that have it. What is missing to 1 lies with sets that were not fitted.",
+    description="Bars of the probability of each set of effects and of each effect.",
+)
+def probabilities(discovery: SearchResult) -> Figure | None:
+    """Probabilities of the likeliest sets and effects; none where there is but one set."""
+    found = discovery.probabilities
+    if found is None or len(found.sets) < 2:
+        return None
+    listed = [s for s in found.sets if s.probability >= LEAST_NAMED][:MOST_SETS] or [found.sets[0]]
+    reported = frozenset(f"{r.effect}@{r.port}" for r in discovery.rounds)
+    sets = [("\n+ ".join(set_labels(s.effects)), s.probability, s.effects == reported) for s in listed]
+    effects = [
+        (effect_label(*parts(name)), p, name in reported)
+        for name, p in list(found.effects.items())[:MOST_SETS]
+        if p >= LEAST_NAMED
+    ]
+    lines = max(sum(label.count("\n") + 1 for label, _, _ in sets), len(effects))
+    figure = blank(10.0, 0.3 * lines + 1.1)
+    axes = figure.subplots(1, 2)
+    for ax, bars, name in ((axes[0], sets, "set of effects [–]"), (axes[1], effects, "effect [–]")):
+        for k, (_, p, is_reported) in enumerate(bars):
+            ax.barh(k, p, 0.62, color=FINAL if is_reported else MEASURED, alpha=1.0 if is_reported else 0.75)
+            ax.annotate(percent(p), (p, k), (5, 0), textcoords="offset points", va="center", fontsize=8)
+        ax.set_yticks(range(len(bars)), [label for label, _, _ in bars])
+        for text, (_, _, is_reported) in zip(ax.get_yticklabels(), bars, strict=True):
+            text.set_fontweight("bold" if is_reported else "normal")
+        ax.set_ylim(max(len(bars), 1) - 0.4, -0.6)
+        ax.set_xlim(0.0, 1.18)
+        ax.set_xticks([0.0, 0.25, 0.5, 0.75, 1.0])
+        ax.grid(axis="y", visible=False)
+        ax.set_xlabel("probability [–]")
+        ax.set_ylabel(name)
+    return figure
 
 
 @figure(
