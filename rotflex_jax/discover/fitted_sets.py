@@ -10,6 +10,9 @@ from rotflex_jax.discover.probabilities import FittedSet, HorizonEvidence
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
 
+# Fits of one set whose log-likelihoods differ by no more than this in training are the same fit [nat].
+AS_LIKELY_NATS = 1.0
+
 
 def set_names(locations: Iterable[EffectLocation]) -> frozenset[str]:
     """Effects as the names of a set."""
@@ -23,7 +26,7 @@ def fitted_sets(
     reported: SearchHorizon,
     machine: Sequence[EffectLocation],
 ) -> list[FittedSet]:
-    """Every set once, the first of `at_both` first; of several fits the likeliest in training counts.
+    """Every set once, the first of `at_both` first.
 
     Calibrations are in every model of the search. Whether one is a property of the machine was decided
     apart, and where it is, it belongs to every set.
@@ -36,21 +39,36 @@ def fitted_sets(
         machine: Calibrations that belong to the machine.
     """
     s = horizons.prediction.problem.supermodel
-    found: dict[frozenset[str], tuple[ValidatedHypothesis, FittedSet]] = {}
-    everyone = [(v, True) for v in at_both] + [(v, False) for v in at_reported]
-    for v, both in everyone:
+    at_prediction: dict[frozenset[str], list[ValidatedHypothesis]] = {}
+    at_free_run: dict[frozenset[str], list[ValidatedHypothesis]] = {}
+    count: dict[frozenset[str], int] = {}
+    for v in (*at_both, *at_reported):
         h = v.hypothesis
         effects = [p for p in h.locations if p not in s.calibrations]
         names = set_names([*effects, *machine])
-        known = found.get(names)
-        if known and (not both or known[0].hypothesis.log_likelihood >= h.log_likelihood):
-            continue
-        runs = v.free_run if both else v if reported is horizons.free_run else None
-        prediction = v if both or reported is horizons.prediction else None
-        count = sum(parameter_count(s, h, p) for p in effects)
-        row = FittedSet(names, count, prediction and evidence_of(prediction), runs and evidence_of(runs))
-        found[names] = (v, row)
-    return [row for _, row in found.values()]
+        count.setdefault(names, sum(parameter_count(s, h, p) for p in effects))
+        free = v.free_run or (v if reported is horizons.free_run else None)
+        if free:
+            at_free_run.setdefault(names, []).append(free)
+        if v is not free:
+            at_prediction.setdefault(names, []).append(v)
+    return [
+        FittedSet(n, k, best_evidence(at_prediction.get(n, ())), best_evidence(at_free_run.get(n, ())))
+        for n, k in count.items()
+    ]
+
+
+def best_evidence(fits: Sequence[ValidatedHypothesis]) -> HorizonEvidence | None:
+    """What the best fit of a set says at one horizon; None without any.
+
+    Fits that are as likely in training differ on validation data by the minimum in which the search for
+    first states ended, which must not decide between sets.
+    """
+    if not fits:
+        return None
+    likeliest = max(v.hypothesis.log_likelihood for v in fits)
+    equal = [v for v in fits if v.hypothesis.log_likelihood >= likeliest - AS_LIKELY_NATS]
+    return evidence_of(max(equal, key=lambda v: v.log_likelihood))
 
 
 def evidence_of(v: ValidatedHypothesis) -> HorizonEvidence:
