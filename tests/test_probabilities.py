@@ -21,7 +21,15 @@ from rotflex_jax.errors import InputError
 BLOCKS, TRAINING, VALUES = 12, 28, 14_000.0
 COMMON = np.random.default_rng(0).normal(size=BLOCKS) * 40
 TRAINED = np.random.default_rng(1).normal(size=TRAINING) * 40
-RULE = EvidenceRule(temperature=2.0, run_nats=1.5, prior_nats=0.7, elsewhere=0.04, elsewhere_unexplained=0.25)
+RULE = EvidenceRule(
+    temperature=2.0,
+    run_nats=1.5,
+    training=0.6,
+    per_look=1.0,
+    prior_nats=0.7,
+    elsewhere=0.04,
+    elsewhere_unexplained=0.25,
+)
 
 
 def fitted(
@@ -44,7 +52,7 @@ def test_even_leads_are_a_softmax():
     ]
     lead, trained = np.array([10.0, 0.0, 13.0, 9.0]), np.array([12.0, 0.0, 21.0, 30.0])
     runs, k, n = np.array([0.3, 0.0, 0.5, -0.2]), np.array([1, 0, 3, 2]), np.array([1, 0, 2, 1])
-    log_weight = (lead + trained - 0.5 * k * np.log(VALUES)) / 2.0 + 1.5 * runs - 0.7 * n
+    log_weight = (lead + 0.6 * (trained - 0.5 * k * np.log(VALUES))) / 2.0 + 1.5 * runs - 0.7 * n
     np.testing.assert_allclose(set_probabilities(sets, VALUES, RULE), softmax(log_weight), rtol=1e-9)
     assert np.ptp(softmax(log_weight)) < 0.99  # none of them decides alone
 
@@ -78,7 +86,7 @@ def test_a_lead_within_its_scatter_does_not_decide():
     noise -= noise.mean()
     spread = noise.std(ddof=1) * np.sqrt(many)
     none, zero = np.zeros(0), np.zeros(many)
-    rule = EvidenceRule(temperature=1.0, prior_nats=0.0)
+    rule = EvidenceRule(temperature=1.0, prior_nats=0.0, per_look=1.0)
     for z in (0.0, 1.0, 2.0):
         lead = HorizonEvidence(noise + z * spread / many, none)
         sets = [
@@ -86,6 +94,11 @@ def test_a_lead_within_its_scatter_does_not_decide():
             FittedSet(frozenset(), 0, HorizonEvidence(zero, none)),
         ]
         assert set_probabilities(sets, VALUES, rule)[0] == pytest.approx(norm.cdf(z), abs=0.025)
+    # Four half seconds to a look double the scatter.
+    lead = HorizonEvidence(noise + 2.0 * spread / many, none)
+    sets = [FittedSet(frozenset({"a@hub"}), 0, lead), FittedSet(frozenset(), 0, HorizonEvidence(zero, none))]
+    p = set_probabilities(sets, VALUES, rule._replace(per_look=4.0))
+    assert p[0] == pytest.approx(norm.cdf(1.0), abs=0.025)
     # The same lead without scatter is certain.
     lead = HorizonEvidence(np.full(many, 2.0 * spread / many), none)
     sets = [FittedSet(frozenset({"a@hub"}), 0, lead), FittedSet(frozenset(), 0, HorizonEvidence(zero, none))]

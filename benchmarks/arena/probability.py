@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -36,12 +37,7 @@ def told(result: Discovery, evidence: bool = False) -> Row:
     found = result.probabilities
     if found is None:
         return {}
-    row: Row = {
-        "probabilities": {
-            "sets": [[sorted(s.effects), round(s.probability, 5)] for s in found.sets],
-            "elsewhere": found.elsewhere,
-        }
-    }
+    row: Row = {"probabilities": told_of(found)}
     if evidence:
         row["evidence"] = {
             "measured_values": sum(r.N for r in result.train) * len(result.noise_floor),
@@ -53,15 +49,28 @@ def told(result: Discovery, evidence: bool = False) -> Row:
     return row
 
 
+def told_of(found: Probabilities) -> Row:
+    """Sets and their probabilities, for JSON."""
+    return {
+        "sets": [[sorted(s.effects), round(s.probability, 5)] for s in found.sets],
+        "elsewhere": found.elsewhere,
+    }
+
+
 def _written(e: HorizonEvidence | None, digits: int) -> list[str] | None:
     """Blocks as two lines of text."""
     return None if e is None else [" ".join(f"{x:.{digits}f}" for x in blocks) for blocks in e]
 
 
 def _read(lines: Sequence[str] | None) -> HorizonEvidence | None:
+    return None if lines is None else _parsed(*lines)
+
+
+@functools.cache
+def _parsed(*lines: str) -> HorizonEvidence:
     from rotflex_jax.discover.probabilities import HorizonEvidence
 
-    return None if lines is None else HorizonEvidence(*(np.array(line.split(), float) for line in lines))
+    return HorizonEvidence(*(np.array(line.split(), float) for line in lines))
 
 
 def weighed(row: Row, rule: EvidenceRule) -> Probabilities:

@@ -60,6 +60,9 @@ class EvidenceRule(NamedTuple):
         temperature: Nats of the likelihood that are worth one: residuals of an incomplete model are alike
             from sample to sample.
         run_nats: What half a second says whose error in free run is larger by a factor e [nat].
+        training: Share of the training evidence that counts, 0 to 1: an incomplete model that is richer fits
+            the training recordings better whatever it is made of.
+        per_look: How many half seconds are worth one independent look at the machine.
         prior_nats: How much likelier than its presence the absence of an effect is beforehand [nat].
         elsewhere: Probability that the right set is none of those fitted, where the recordings are explained.
         elsewhere_unexplained: The same where something remains unexplained.
@@ -67,6 +70,8 @@ class EvidenceRule(NamedTuple):
 
     temperature: float = 3.0
     run_nats: float = 1.0
+    training: float = 0.3
+    per_look: float = 3.0
     prior_nats: float = 3.0
     elsewhere: float = 0.03
     elsewhere_unexplained: float = 0.3
@@ -199,17 +204,19 @@ def set_probabilities(
 
     .. math::
         p_s = E_w \frac{e^{l_s(w)}}{\sum_r e^{l_r(w)}}, \qquad
-        l_s(w) = \frac{1}{T} \Bigl( \sum_b w_b v_{sb} + \sum_b w_b t_{sb} - \frac{k_s}{2} \log N \Bigr)
+        l_s(w) = \frac{1}{T} \Bigl( \sum_b w_b v_{sb}
+                 + \gamma \bigl( \sum_b w_b t_{sb} - \tfrac{1}{2} k_s \log N \bigr) \Bigr)
                  + \nu \sum_b w_b f_{sb} - \lambda n_s
 
     with validation blocks `v`, training blocks `t`, blocks of free runs over validation recordings `f`, `k`
-    parameters, `n` effects, and weights `w` of mean one, uniform over all there are (Bayesian bootstrap).
+    parameters, `n` effects, and weights `w` of mean one that are drawn from Dirichlet's distribution with the
+    concentration 1 / `per_look` (Bayesian bootstrap).
 
     Args:
         fitted: The sets. The first that was fitted at both horizons is the reference: a horizon at which
             another one was not fitted says as much for it as for the reference.
         measured_values: How many values the training recordings have, N.
-        rule: Temperature T, nats of free runs nu, prior nats lambda.
+        rule: Temperature T, share of training gamma, nats of free runs nu, prior nats lambda, `per_look`.
 
     Returns:
         A probability for each set; they sum to one.
@@ -229,14 +236,15 @@ def set_probabilities(
         if not d.shape[1]:
             return np.zeros((DRAWS, len(d)))
         if d.shape[1] not in drawn:
-            drawn[d.shape[1]] = d.shape[1] * rng.dirichlet(np.ones(d.shape[1]), DRAWS)
+            alike = np.full(d.shape[1], 1.0 / rule.per_look)
+            drawn[d.shape[1]] = d.shape[1] * rng.dirichlet(alike, DRAWS)
         return drawn[d.shape[1]] @ np.nan_to_num(d, nan=-1e9).T
 
     predictions = [s.prediction or first.prediction for s in fitted]
     penalty = 0.5 * np.log(measured_values) * np.array([s.parameters for s in fitted])
-    trained = len(first.prediction.training) > 0
     likelihood = resampled([p.validation for p in predictions])
-    likelihood += resampled([p.training for p in predictions]) - trained * penalty
+    if len(first.prediction.training):
+        likelihood += rule.training * (resampled([p.training for p in predictions]) - penalty)
     log_weight = likelihood / rule.temperature
     if first.free_run:
         runs = [(s.free_run or first.free_run).validation for s in fitted]
