@@ -38,6 +38,14 @@ def test_finds_the_hidden_effect(place: Place, kind: str, seed: int, tolerance: 
     assert set(rounds) <= alike(place)
     assert result.verdict in ("found", "ambiguous")
 
+    # What is reported is the most probable set, and the right effect is in nearly all that could be.
+    probable = result.probabilities
+    assert probable.sets[0].effects == {f"{e}@{p}" for e, p in rounds}
+    assert probable.effects[f"{place[0]}@{place[1]}"] > 0.9
+    assert frozenset() in {s.effects for s in probable.sets} or place == ("voltage_offset", "input")
+    assert result.to_dict()["probabilities"]["sets"][0]["probability"] == probable.sets[0].probability
+    assert str(result).endswith(probable.sentence)
+
     hidden = {(e["effect"], e["port"]): e["parameters"] for e in truth["effects"]}
     errors = parameter_errors(hidden, {e.name: e for e in result.final.estimates})
     assert errors
@@ -54,7 +62,13 @@ def test_an_asymmetric_friction_is_one_law() -> None:
     record = make_record([("coulomb_asymmetric", "hub")], seed=2004, seconds=6.0, fs=FS)
     train, test = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"]).split(0.7)
     pairs = [(fx.Coulomb, "hub"), (fx.CoulombAsymmetric, "hub")]
-    (found,) = rf.discover(rf.joints.paper(), train, test, candidates=pairs).rounds
+    result = rf.discover(rf.joints.paper(), train, test, candidates=pairs)
+    (found,) = result.rounds
+    # Both ways to write it were fitted; the one with fewer effects is the more probable one.
+    probable = dict(result.probabilities.sets)
+    one, several = frozenset({"coulomb_asymmetric@hub"}), frozenset({"coulomb@hub", "voltage_offset@input"})
+    assert result.probabilities.sets[0].effects == one
+    assert probable[one] > probable[several] > 0
     assert (found.effect, found.port) == ("coulomb_asymmetric", "hub")
     # A voltage offset does the same with as many numbers.
     assert set(found.equivalent) == {("coulomb", "hub"), ("voltage_offset", "input")}
@@ -74,6 +88,9 @@ def test_hysteresis_takes_the_place_of_the_friction_it_contains() -> None:
 def test_finds_nothing_where_nothing_is_hidden() -> None:
     result, _ = searched(None, "noise", 2003)
     assert result.rounds == ()
+    assert (
+        result.probabilities.sets[0].effects == frozenset() and result.probabilities.sets[0].probability > 0.8
+    )
     assert result.verdict == "nothing_missing"
 
 

@@ -13,6 +13,7 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax import adaptive, basis, checks, export, joints, kernels, metrics
 from rotflex_jax.data import excitation, save_csv
+from rotflex_jax.discover.probabilities import Probabilities
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT
@@ -111,6 +112,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "basis.Delays": (basis.Delays, {"memory": 3}),
     "basis.Volterra": (basis.Volterra, {"bank": basis.Delays(3)}),
+    "Probabilities.credible": (Probabilities((), {}, 0.1).credible, {}),
     "save_csv": (save_csv, {"recording": RUN, "path": "never-made"}),
     "metrics.rmse": (metrics.rmse, {"y": Y, "y_hat": Y}),
     "noise": (excitation.noise, {"N": 100, "Ts": 0.01}),
@@ -391,6 +393,12 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("compare_plot", "recording"): [("x", "x|recording"), (None, "None|recording")],
     ("compare_plot", "model"): [("x", "x|mechanism|model"), (None, "None|mechanism|model")],
     ("compare_plot", "seconds"): [(NAN, "nan"), (-1, "-1")],
+    ("Probabilities.credible", "share"): [
+        (0, "0, but it must be above 0|0"),
+        (1.5, "1.5, but it is a probability"),
+        (NAN, "nan"),
+        ("most", "most"),
+    ],
     ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
 }
 

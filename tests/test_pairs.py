@@ -7,8 +7,19 @@ import pytest
 import small_problem as sp
 from scipy.optimize import lsq_linear
 
+import rotflex_jax.effects as fx
+from arena.records import make_record
+from rotflex_jax.discover.horizon import Horizons, as_free_run
 from rotflex_jax.discover.hypothesis import CandidateStart
-from rotflex_jax.discover.pairs import best_candidates, promising_pairs, refit_pairs
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.pairs import (
+    best_candidates,
+    find_pair,
+    is_unexplained,
+    promising_pairs,
+    refit_pairs,
+)
+from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.score_test import (
     MAX_THRESHOLD_AMPLITUDE,
     Score,
@@ -17,7 +28,10 @@ from rotflex_jax.discover.score_test import (
     _score,
     score_test,
 )
-from rotflex_jax.discover.supermodel import Candidate, EffectLocation
+from rotflex_jax.discover.stepwise import fit_baseline
+from rotflex_jax.discover.supermodel import Candidate, EffectLocation, build, scales
+from rotflex_jax.fit.dataset import prepare
+from rotflex_jax.models.model import Model
 
 SAMPLES = 60
 
@@ -185,3 +199,50 @@ def test_a_refit_of_a_pair_reaches_what_its_score_promises(small):
     (both,) = refit_pairs(problem, h, [p.starts])
     assert set(both.locations) == {*h.locations, sp.HUB, spring}
     assert both.log_likelihood - h.log_likelihood == pytest.approx(p.gain, rel=0.25)
+
+
+PAIR_WANTED = ((fx.Coulomb, "hub"), (fx.CubicSpring, "joint"), (fx.Coulomb, "joint"))
+STIFFENS = EffectLocation("cubic_spring", "joint")
+
+
+def horizons(hidden: dict) -> Horizons:
+    """Training and validation recordings of a machine with these effects, cut to free runs of 0.8 s."""
+    made = [
+        make_record(hidden, seed=seed, seconds=1.6, fs=400.0, perturb=0.0, rms=1.5)
+        for seed in (31, 32, 33, 34)
+    ]
+    found = sp.recordings(made)
+    train, held_back = found[:2], found[2:]
+    model, data = Model(sp.baseline()), sp.dataset(found[:2])
+    s = build(sp.baseline(), PAIR_WANTED, scales(model, train, data.torque_scale))
+    problem = LikelihoodProblem.of(s, sp.SOLVER, data, ("hub", "joint"))
+    other = LikelihoodProblem.of(s, sp.SOLVER, prepare(model, held_back, like=data), ("hub", "joint"))
+    return Horizons.of(model, problem, other, 0.8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spring", [60.0, 0.0])
+def test_a_pair_must_be_better_than_each_of_its_members(spring: float):
+    """Two hidden effects are found at once; where one is hidden, no pair is."""
+    hidden = {sp.HUB: {"level": 0.02}} | ({STIFFENS: {"coefficient": spring}} if spring else {})
+    at = horizons(hidden)
+    problem, runs = at.prediction.problem, at.free_run.problem
+    h = fit_baseline(problem)
+    current = at.validated(h, refit(runs, [as_free_run(runs, h)])[0])
+    assert is_unexplained(at, current)
+    tests = (score_test(problem, h), score_test(runs, current.free_run.hypothesis))
+    lines: list[str] = []
+    found, tried = find_pair(at, current, tests, lambda h, p: True, lines.append)
+    if not spring:
+        assert found is None
+        return
+    assert found and set(found.members) == {sp.HUB, STIFFENS} and found.rivals == {sp.HUB: [], STIFFENS: []}
+    assert found.found in tried and all(v in tried for v in found.members.values())
+    for location, less in found.members.items():
+        assert set(found.found.hypothesis.locations) - set(less.hypothesis.locations) == {location}
+        assert found.found.log_likelihood > less.log_likelihood > current.log_likelihood
+    s = problem.supermodel
+    i = s.parameter_indices(STIFFENS)[0]
+    assert found.found.hypothesis.mean_values(s)[i] == pytest.approx(spring, rel=0.2)
+    assert "looking one step further" in lines[0]
+    assert not is_unexplained(at, found.found)
