@@ -29,11 +29,11 @@ from rotflex_jax.discover.probabilities import RULE, EvidenceRule
 
 # What is tried of each number; all others are held while it is.
 TRIED: dict[str, tuple[float, ...]] = {
-    "temperature": (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 40.0),
-    "run_nats": (0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5),
-    "training": (0.0, 0.1, 0.3, 1.0),
-    "per_look": (1.0, 2.0, 3.0, 5.0, 8.0),
-    "prior_nats": (0.0, 0.5, 1.0, 2.0, 3.0, 4.0),
+    "temperature": (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 50.0),
+    "temperature_unexplained": (30.0, 100.0, 300.0, 1000.0, math.inf),
+    "run_nats": (0.0, 0.1, 0.2, 0.3, 0.5, 1.0),
+    "prior_nats": (0.5, 1.0, 2.0, 3.0, 4.0),
+    "passed_nats": (1.0, 2.0, 3.0, 4.0),
 }
 LEAST = 1e-3
 """Probability of a right set below which a machine counts no more against a rule: its fit went wrong."""

@@ -11,72 +11,60 @@ from arena.probability import Event, calibration_error, classes, credible, effec
 from rotflex_jax.discover.probabilities import (
     EvidenceRule,
     FittedSet,
-    HorizonEvidence,
     SetProbability,
     probabilities,
     set_probabilities,
 )
 from rotflex_jax.errors import InputError
 
-BLOCKS, TRAINING, VALUES = 12, 28, 14_000.0
+BLOCKS = 12
 COMMON = np.random.default_rng(0).normal(size=BLOCKS) * 40
-TRAINED = np.random.default_rng(1).normal(size=TRAINING) * 40
 RULE = EvidenceRule(
     temperature=2.0,
+    temperature_unexplained=20.0,
     run_nats=1.5,
-    training=0.6,
-    per_look=1.0,
     prior_nats=0.7,
+    passed_nats=0.4,
     elsewhere=0.04,
     elsewhere_unexplained=0.25,
 )
+PLAIN = EvidenceRule(temperature=1.0, prior_nats=0.0, passed_nats=0.0)
 
 
-def fitted(
-    names: str, lead=0.0, trained=0.0, runs=0.0, parameters=0, pattern=None, free_run=True
-) -> FittedSet:
-    """A set that leads by so many nats in all, evenly, or with a pattern of the half seconds besides."""
-    pattern = np.zeros(BLOCKS) if pattern is None else pattern
-    prediction = HorizonEvidence(COMMON + lead / BLOCKS + pattern, TRAINED + trained / TRAINING)
-    free = HorizonEvidence(0.01 * COMMON + runs / BLOCKS, 0.01 * TRAINED) if free_run else None
-    return FittedSet(frozenset(names.split()), parameters, prediction, free)
+def fitted(names: str, lead=0.0, runs=0.0, free_run=True) -> FittedSet:
+    """A set that leads by so many nats in all, evenly."""
+    free = 0.01 * COMMON + runs / BLOCKS if free_run else None
+    return FittedSet(frozenset(names.split()), COMMON + lead / BLOCKS, free)
 
 
 def test_even_leads_are_a_softmax():
     """Without scatter no weighting of the half seconds changes a sum."""
+    lead, runs, n = np.array([4.0, 0.0, 6.5, 4.5]), np.array([0.3, 0.0, 0.5, -0.2]), np.array([1, 0, 2, 1])
     sets = [
-        fitted("a@hub", 10.0, 12.0, 0.3, 1),
-        fitted("", 0.0),
-        fitted("a@hub b@arm", 13.0, 21.0, 0.5, 3),
-        fitted("b@arm", 9.0, 30.0, -0.2, 2),
+        fitted(s, x, f) for s, x, f in zip(("a@hub", "", "a@hub b@arm", "b@arm"), lead, runs, strict=True)
     ]
-    lead, trained = np.array([10.0, 0.0, 13.0, 9.0]), np.array([12.0, 0.0, 21.0, 30.0])
-    runs, k, n = np.array([0.3, 0.0, 0.5, -0.2]), np.array([1, 0, 3, 2]), np.array([1, 0, 2, 1])
-    log_weight = (lead + 0.6 * (trained - 0.5 * k * np.log(VALUES))) / 2.0 + 1.5 * runs - 0.7 * n
-    np.testing.assert_allclose(set_probabilities(sets, VALUES, RULE), softmax(log_weight), rtol=1e-9)
-    assert np.ptp(softmax(log_weight)) < 0.99  # none of them decides alone
-
-
-def test_runs_that_validate_each_other_are_not_counted_twice():
-    """Their training blocks are the same samples; without them no parameter is paid for."""
-    none = np.zeros(0)
-    sets = [
-        FittedSet(frozenset({"a@hub"}), 1, HorizonEvidence(COMMON + 3.0 / BLOCKS, none)),
-        FittedSet(frozenset(), 0, HorizonEvidence(COMMON, none)),
-    ]
-    expected = softmax([3.0 / 2.0 - 0.7, 0.0])
-    np.testing.assert_allclose(set_probabilities(sets, VALUES, RULE), expected, rtol=1e-9)
+    passed = np.array([0.4, 0.0, 0.0, 0.0])
+    expected = softmax(lead / 2.0 + 1.5 * runs - 0.7 * n + passed)
+    np.testing.assert_allclose(set_probabilities(sets, rule=RULE), expected, rtol=1e-9)
+    assert expected.min() > 0.02  # all have a say
+    # Where something remains, nats of predictions count for less.
+    expected = softmax(lead / 20.0 + 1.5 * runs - 0.7 * n + passed)
+    np.testing.assert_allclose(set_probabilities(sets, is_explained=False, rule=RULE), expected, rtol=1e-9)
+    none = RULE._replace(temperature_unexplained=np.inf)
+    expected = softmax(1.5 * runs - 0.7 * n + passed)
+    np.testing.assert_allclose(set_probabilities(sets, is_explained=False, rule=none), expected, rtol=1e-9)
 
 
 def test_a_missing_horizon_says_as_much_as_the_reference():
-    at_one = fitted("b@arm", 5.0, 5.0, parameters=1, free_run=False)
-    as_reference = fitted("b@arm", 5.0, 5.0, 0.8, parameters=1)
-    first = fitted("a@hub", 5.0, 5.0, 0.8, parameters=1)
-    p, q = (set_probabilities([first, other], VALUES, RULE) for other in (at_one, as_reference))
+    at_one, as_reference = fitted("b@arm", 5.0, free_run=False), fitted("b@arm", 5.0, 0.8)
+    first = fitted("a@hub", 5.0, 0.8)
+    p, q = (set_probabilities([first, other], rule=RULE) for other in (at_one, as_reference))
     np.testing.assert_allclose(p, q)
-    np.testing.assert_allclose(p, [0.5, 0.5])
+    np.testing.assert_allclose(p, softmax([0.4, 0.0]))
     # The reference is the first that has both, wherever it stands.
-    np.testing.assert_allclose(set_probabilities([at_one, first], VALUES, RULE), [0.5, 0.5])
+    np.testing.assert_allclose(set_probabilities([at_one, first], rule=RULE), softmax([0.4, 0.0]))
+    runs_alone = FittedSet(frozenset({"c@hub"}), None, first.free_run)
+    np.testing.assert_allclose(set_probabilities([first, runs_alone], rule=RULE), softmax([0.4, 0.0]))
 
 
 def test_a_lead_within_its_scatter_does_not_decide():
@@ -85,41 +73,32 @@ def test_a_lead_within_its_scatter_does_not_decide():
     noise = rng.normal(size=many) * 30
     noise -= noise.mean()
     spread = noise.std(ddof=1) * np.sqrt(many)
-    none, zero = np.zeros(0), np.zeros(many)
-    rule = EvidenceRule(temperature=1.0, prior_nats=0.0, per_look=1.0)
+
+    def of_lead(lead: np.ndarray) -> float:
+        sets = [FittedSet(frozenset({"a@hub"}), lead), FittedSet(frozenset(), np.zeros(many))]
+        return set_probabilities(sets, rule=PLAIN)[0]
+
     for z in (0.0, 1.0, 2.0):
-        lead = HorizonEvidence(noise + z * spread / many, none)
-        sets = [
-            FittedSet(frozenset({"a@hub"}), 0, lead),
-            FittedSet(frozenset(), 0, HorizonEvidence(zero, none)),
-        ]
-        assert set_probabilities(sets, VALUES, rule)[0] == pytest.approx(norm.cdf(z), abs=0.025)
-    # Four half seconds to a look double the scatter.
-    lead = HorizonEvidence(noise + 2.0 * spread / many, none)
-    sets = [FittedSet(frozenset({"a@hub"}), 0, lead), FittedSet(frozenset(), 0, HorizonEvidence(zero, none))]
-    p = set_probabilities(sets, VALUES, rule._replace(per_look=4.0))
-    assert p[0] == pytest.approx(norm.cdf(1.0), abs=0.025)
+        assert of_lead(noise + z * spread / many) == pytest.approx(norm.cdf(z), abs=0.025)
     # The same lead without scatter is certain.
-    lead = HorizonEvidence(np.full(many, 2.0 * spread / many), none)
-    sets = [FittedSet(frozenset({"a@hub"}), 0, lead), FittedSet(frozenset(), 0, HorizonEvidence(zero, none))]
-    assert set_probabilities(sets, VALUES, rule)[0] > 1 - 1e-9
+    assert of_lead(np.full(many, 2.0 * spread / many)) > 1 - 1e-9
 
 
 def test_a_model_that_diverges_has_no_probability():
-    lost = fitted("b@arm", -1e9 * BLOCKS, 3.0)
-    p = set_probabilities([fitted("a@hub", 1.0), lost], VALUES, RULE)
+    lost = fitted("b@arm", -1e9 * BLOCKS)
+    p = set_probabilities([fitted("a@hub", 1.0), lost], rule=RULE)
     np.testing.assert_allclose(p, [1.0, 0.0], atol=1e-12)
 
 
 @pytest.fixture
 def found():
     sets = [
-        fitted("coulomb@hub", 6.0, 6.0, 0.0, 0),
-        fitted("stribeck@hub", 6.0 - 2 * np.log(2.0), 6.0, 0.0, 0),
-        fitted("coulomb@hub sensor_bias@alpha", 6.0 + 2 * (0.7 - np.log(4.0)), 6.0, 0.0, 0),
+        fitted("coulomb@hub", 6.0),
+        fitted("stribeck@hub", 6.0 + 2 * (0.4 - np.log(2.0))),
+        fitted("coulomb@hub sensor_bias@alpha", 6.0 + 2 * (0.4 + 0.7 - np.log(4.0))),
         fitted("coulomb@hub", 99.0),
     ]
-    return probabilities(sets, VALUES, is_explained=True, rule=RULE)
+    return probabilities(sets, is_explained=True, rule=RULE)
 
 
 def test_sets_effects_and_what_lies_elsewhere(found):
@@ -138,10 +117,10 @@ def test_sets_effects_and_what_lies_elsewhere(found):
 
 
 def test_credible_sets_are_the_smallest(found):
-    assert found.credible(0.5) == found.sets[:1]
-    assert found.credible(0.6) == found.sets[:2]
-    assert found.credible(found.sets[0].probability) == found.sets[:1]
-    assert found.credible(0.9) == found.credible(0.99) == found.sets  # the rest lies elsewhere
+    """4, 2 and 1 of seven parts of what was fitted."""
+    assert found.credible(0.5) == found.credible(4 / 7) == found.sets[:1]
+    assert found.credible(0.58) == found.credible(6 / 7) == found.sets[:2]
+    assert found.credible(0.9) == found.credible(1) == found.sets
     assert all(isinstance(s, SetProbability) for s in found.credible())
     for bad in (0, 1.5, float("nan"), "most"):
         with pytest.raises(InputError, match="share"):
@@ -157,7 +136,7 @@ def test_what_is_told(found):
     assert data["effects"]["stribeck@hub"] == pytest.approx(0.96 * 2 / 7)
     assert "3 sets" in found.sentence and "Coulomb friction at hub 55 %" in found.sentence
     assert "Stribeck" in found.sentence and "none of these 4 %" in found.sentence
-    left = probabilities([fitted("")], VALUES, is_explained=False, rule=RULE)
+    left = probabilities([fitted("")], is_explained=False, rule=RULE)
     assert left.elsewhere == 0.25 and "catalogue" in left.remarks[1]
     assert "nothing more 75 %" in left.sentence
 
@@ -198,7 +177,7 @@ def test_sets_that_are_one_answer_count_once():
 
 
 def test_a_row_is_weighed_again_as_it_was(found):
-    lines = lambda e: [" ".join(map(repr, b.tolist())) for b in e]  # noqa: E731
-    kept = [[sorted(s.effects), s.parameters, lines(s.prediction), lines(s.free_run)] for s in found.evidence]
-    again = weighed(row([], evidence={"measured_values": VALUES, "sets": kept}), RULE)
+    line = lambda blocks: " ".join(map(repr, blocks.tolist()))  # noqa: E731
+    kept = [[sorted(s.effects), line(s.prediction), line(s.free_run)] for s in found.evidence]
+    again = weighed(row([], evidence=kept), RULE)
     assert again.sets == found.sets and again.effects == found.effects

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arena.hidden import EQUIVALENT
 from arena.laws import Place
@@ -19,7 +20,7 @@ from rotflex_jax.text.plotting import blank, styled
 
 if TYPE_CHECKING:  # a process makes its settings ahead of JAX
     from rotflex_jax.discover import Discovery
-    from rotflex_jax.discover.probabilities import EvidenceRule, HorizonEvidence, Probabilities
+    from rotflex_jax.discover.probabilities import EvidenceRule, Probabilities
 
 Row = dict[str, Any]
 
@@ -39,13 +40,9 @@ def told(result: Discovery, evidence: bool = False) -> Row:
         return {}
     row: Row = {"probabilities": told_of(found)}
     if evidence:
-        row["evidence"] = {
-            "measured_values": sum(r.N for r in result.train) * len(result.noise_floor),
-            "sets": [
-                [sorted(s.effects), s.parameters, _written(s.prediction, 2), _written(s.free_run, 4)]
-                for s in found.evidence
-            ],
-        }
+        row["evidence"] = [
+            [sorted(s.effects), _written(s.prediction, 2), _written(s.free_run, 4)] for s in found.evidence
+        ]
     return row
 
 
@@ -57,30 +54,22 @@ def told_of(found: Probabilities) -> Row:
     }
 
 
-def _written(e: HorizonEvidence | None, digits: int) -> list[str] | None:
-    """Blocks as two lines of text."""
-    return None if e is None else [" ".join(f"{x:.{digits}f}" for x in blocks) for blocks in e]
-
-
-def _read(lines: Sequence[str] | None) -> HorizonEvidence | None:
-    return None if lines is None else _parsed(*lines)
+def _written(blocks: NDArray[np.float64] | None, digits: int) -> str | None:
+    """Blocks as a line of text."""
+    return None if blocks is None else " ".join(f"{x:.{digits}f}" for x in blocks)
 
 
 @functools.cache
-def _parsed(*lines: str) -> HorizonEvidence:
-    from rotflex_jax.discover.probabilities import HorizonEvidence
-
-    return HorizonEvidence(*(np.array(line.split(), float) for line in lines))
+def _read(line: str | None) -> NDArray[np.float64] | None:
+    return None if line is None else np.array(line.split(), float)
 
 
 def weighed(row: Row, rule: EvidenceRule) -> Probabilities:
     """The probabilities of a row with another rule, from its evidence."""
     from rotflex_jax.discover.probabilities import FittedSet, probabilities
 
-    kept = row["evidence"]
-    sets = [FittedSet(frozenset(names), count, _read(p), _read(f)) for names, count, p, f in kept["sets"]]
-    explained = row["verdict"] != "unexplained"
-    return probabilities(sets, kept["measured_values"], is_explained=explained, rule=rule)
+    sets = [FittedSet(frozenset(names), _read(p), _read(f)) for names, p, f in row["evidence"]]
+    return probabilities(sets, is_explained=row["verdict"] != "unexplained", rule=rule)
 
 
 def place_of(name: str) -> Place:
@@ -178,7 +167,7 @@ def calibration_error(events: Iterable[Event]) -> float:
 
 
 class CredibleSets(NamedTuple):
-    """How often the smallest sets of `CREDIBLE` mass hold the truth, and how many sets that takes."""
+    """How often credible sets hold the truth, and how many sets that takes."""
 
     held: float
     size: float
@@ -186,12 +175,12 @@ class CredibleSets(NamedTuple):
 
 
 def credible(rows: Sequence[Row]) -> CredibleSets:
-    """Over rows, one at least; sets that are one answer count once."""
+    """The fewest sets of `CREDIBLE` of what was fitted, over rows, one at least; one answer counts once."""
     held, sizes = [], []
     for row in rows:
         listed = classes(row)
         total = np.cumsum([e.probability for e in listed])
-        size = min(int(np.searchsorted(total, CREDIBLE - 1e-9)) + 1, len(listed))
+        size = min(int(np.searchsorted(total, (CREDIBLE - 1e-9) * total[-1])) + 1, len(listed))
         held.append(any(e.true for e in listed[:size]))
         sizes.append(size)
     return CredibleSets(float(np.mean(held)), float(np.mean(sizes)), len(rows))

@@ -50,7 +50,6 @@ ALSO = {
         "rotflex_jax.discover.probabilities.Probabilities",
         "rotflex_jax.discover.probabilities.SetProbability",
         "rotflex_jax.discover.probabilities.FittedSet",
-        "rotflex_jax.discover.probabilities.HorizonEvidence",
         "rotflex_jax.discover.explanation.Explanation",
         "rotflex_jax.discover.latent_comparison.LatentTorqueComparison",
         "rotflex_jax.discover.formula.Formula",

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.discover.horizon import Horizons, SearchHorizon
-from rotflex_jax.discover.hypothesis import parameter_count
-from rotflex_jax.discover.probabilities import FittedSet, HorizonEvidence
+from rotflex_jax.discover.probabilities import FittedSet
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
 
@@ -41,25 +41,24 @@ def fitted_sets(
     s = horizons.prediction.problem.supermodel
     at_prediction: dict[frozenset[str], list[ValidatedHypothesis]] = {}
     at_free_run: dict[frozenset[str], list[ValidatedHypothesis]] = {}
-    count: dict[frozenset[str], int] = {}
+    known: dict[frozenset[str], None] = {}
     for v in (*at_both, *at_reported):
-        h = v.hypothesis
-        effects = [p for p in h.locations if p not in s.calibrations]
+        effects = [p for p in v.hypothesis.locations if p not in s.calibrations]
         names = set_names([*effects, *machine])
-        count.setdefault(names, sum(parameter_count(s, h, p) for p in effects))
+        known[names] = None
         free = v.free_run or (v if reported is horizons.free_run else None)
         if free:
             at_free_run.setdefault(names, []).append(free)
         if v is not free:
             at_prediction.setdefault(names, []).append(v)
     return [
-        FittedSet(n, k, best_evidence(at_prediction.get(n, ())), best_evidence(at_free_run.get(n, ())))
-        for n, k in count.items()
+        FittedSet(n, best_blocks(at_prediction.get(n, ())), best_blocks(at_free_run.get(n, ())))
+        for n in known
     ]
 
 
-def best_evidence(fits: Sequence[ValidatedHypothesis]) -> HorizonEvidence | None:
-    """What the best fit of a set says at one horizon; None without any.
+def best_blocks(fits: Sequence[ValidatedHypothesis]) -> Float[np.ndarray, " B"] | None:
+    """What each half second says for the best fit of a set at one horizon; None without any.
 
     Fits that are as likely in training differ on validation data by the minimum in which the search for
     first states ended, which must not decide between sets.
@@ -68,10 +67,4 @@ def best_evidence(fits: Sequence[ValidatedHypothesis]) -> HorizonEvidence | None
         return None
     likeliest = max(v.hypothesis.log_likelihood for v in fits)
     equal = [v for v in fits if v.hypothesis.log_likelihood >= likeliest - AS_LIKELY_NATS]
-    return evidence_of(max(equal, key=lambda v: v.log_likelihood))
-
-
-def evidence_of(v: ValidatedHypothesis) -> HorizonEvidence:
-    """What each half second says for a hypothesis at its horizon."""
-    # Where runs validate each other, the blocks of training are the same samples once more.
-    return HorizonEvidence(v.blocks, np.zeros(0) if v.folds else v.hypothesis.blocks)
+    return max(equal, key=lambda v: v.log_likelihood).blocks

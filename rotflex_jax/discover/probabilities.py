@@ -1,13 +1,12 @@
 """How probable each set of effects is that a search has fitted, and each effect with it.
 
-A set has more than one reason to be believed: what it gains on the training recordings, which is paid for by
-its parameters, and how well it then predicts recordings that it has not seen. The first is Laplace's evidence
-to the order of log N, the second the predictive density of the others, and their sum is the evidence of all
-recordings. Residuals of half a second belong together, so sums over half seconds are drawn again with random
-weights, and what a set gains only in a few moments loses its lead in many of these draws.
+A set is judged by what it says of recordings that its fit has not seen, half second by half second, as a
+predictor and in free runs. Residuals of half a second belong together, so sums over half seconds are drawn
+again with random weights: what a set gains only in a few moments loses its lead in many of these draws.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import checks
+from rotflex_jax.discover.likelihood import DIVERGED
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 
@@ -24,57 +24,43 @@ DRAWS, SEED = 2000, 0
 LEAST_NAMED = 0.01
 
 
-class HorizonEvidence(NamedTuple):
-    """What each half second says for a model at one horizon; see `Hypothesis.blocks`.
-
-    Attributes:
-        validation: Of the validation recordings.
-        training: Of the training recordings; empty where runs validate each other and these are the same.
-    """
-
-    validation: Float[np.ndarray, " B"]
-    training: Float[np.ndarray, " T"]
-
-
 @dataclasses.dataclass(frozen=True)
 class FittedSet:
-    """A set of effects that a search has fitted, and what the recordings say for it.
+    """A set of effects that a search has fitted, and what each half second of validation data says for it.
 
     Attributes:
         effects: Names, as "coulomb@hub".
-        parameters: How many numbers its effects take.
         prediction: Log-likelihood of predictions [nat]; None where it was not fitted to them.
         free_run: Minus the logarithm of the error of free runs; None where it was not fitted to them.
     """
 
     effects: frozenset[str]
-    parameters: int
-    prediction: HorizonEvidence | None = None
-    free_run: HorizonEvidence | None = None
+    prediction: Float[np.ndarray, " B"] | None = None
+    free_run: Float[np.ndarray, " F"] | None = None
 
 
 class EvidenceRule(NamedTuple):
     """How evidence becomes probability; the numbers are calibrated on simulated machines.
 
     Attributes:
-        temperature: Nats of the likelihood that are worth one: residuals of an incomplete model are alike
-            from sample to sample.
+        temperature: Nats of predictions that are worth one: innovations are alike from sample to sample.
+        temperature_unexplained: The same where something remains unexplained. Predictions then follow the
+            data within a few samples whatever the model, and their nats say nothing of the right set.
         run_nats: What half a second says whose error in free run is larger by a factor e [nat].
-        training: Share of the training evidence that counts, 0 to 1: an incomplete model that is richer fits
-            the training recordings better whatever it is made of.
-        per_look: How many half seconds are worth one independent look at the machine.
         prior_nats: How much likelier than its presence the absence of an effect is beforehand [nat].
+        passed_nats: How much likelier the set that has passed all tests of the search is beforehand than one
+            that has not: they ask for more than evidence, such as a gain on the training data too [nat].
         elsewhere: Probability that the right set is none of those fitted, where the recordings are explained.
         elsewhere_unexplained: The same where something remains unexplained.
     """
 
-    temperature: float = 3.0
-    run_nats: float = 1.0
-    training: float = 0.3
-    per_look: float = 3.0
-    prior_nats: float = 3.0
-    elsewhere: float = 0.03
-    elsewhere_unexplained: float = 0.3
+    temperature: float = 5.0
+    temperature_unexplained: float = math.inf
+    run_nats: float = 0.2
+    prior_nats: float = 2.0
+    passed_nats: float = 3.0
+    elsewhere: float = 0.02
+    elsewhere_unexplained: float = 0.17
 
 
 RULE = EvidenceRule()
@@ -111,9 +97,9 @@ class Probabilities:
     evidence: tuple[FittedSet, ...] = dataclasses.field(default=(), repr=False, compare=False)
 
     def credible(self, share: float = 0.9) -> tuple[SetProbability, ...]:
-        """The fewest sets that together have a probability of at least `share`.
+        """The fewest sets that together have this share of the probability of all that were fitted.
 
-        Where too much of it lies outside of what was fitted, all sets.
+        Given that the right set is among those that were fitted; `elsewhere` says how likely it is not.
 
         Args:
             share: Above 0, at most 1.
@@ -127,7 +113,7 @@ class Probabilities:
                 f"share was given {share:g}, but it is a probability; give one above 0, up to 1."
             )
         total = np.cumsum([s.probability for s in self.sets])
-        return self.sets[: int(np.searchsorted(total, share - 1e-12)) + 1]
+        return self.sets[: int(np.searchsorted(total, (share - 1e-12) * (1 - self.elsewhere))) + 1]
 
     @property
     def sentence(self) -> str:
@@ -196,27 +182,23 @@ def percent(probability: float) -> str:
 
 
 def set_probabilities(
-    fitted: Sequence[FittedSet],
-    measured_values: float,
-    rule: EvidenceRule = RULE,
+    fitted: Sequence[FittedSet], *, is_explained: bool = True, rule: EvidenceRule = RULE
 ) -> Float[np.ndarray, " S"]:
     r"""Probabilities of fitted sets among each other, with the scatter of the half seconds.
 
     .. math::
         p_s = E_w \frac{e^{l_s(w)}}{\sum_r e^{l_r(w)}}, \qquad
-        l_s(w) = \frac{1}{T} \Bigl( \sum_b w_b v_{sb}
-                 + \gamma \bigl( \sum_b w_b t_{sb} - \tfrac{1}{2} k_s \log N \bigr) \Bigr)
-                 + \nu \sum_b w_b f_{sb} - \lambda n_s
+        l_s(w) = \frac{1}{T} \sum_b w_b v_{sb} + \nu \sum_b w_b f_{sb} - \lambda n_s + \rho_s
 
-    with validation blocks `v`, training blocks `t`, blocks of free runs over validation recordings `f`, `k`
-    parameters, `n` effects, and weights `w` of mean one that are drawn from Dirichlet's distribution with the
-    concentration 1 / `per_look` (Bayesian bootstrap).
+    with blocks of predictions `v` and of free runs `f` over validation recordings, `n` effects, `rho` for the
+    set that passed the tests of the search, and weights `w` of mean one that are uniform over all there are
+    (Bayesian bootstrap).
 
     Args:
-        fitted: The sets. The first that was fitted at both horizons is the reference: a horizon at which
-            another one was not fitted says as much for it as for the reference.
-        measured_values: How many values the training recordings have, N.
-        rule: Temperature T, share of training gamma, nats of free runs nu, prior nats lambda, `per_look`.
+        fitted: The sets, first the one that passed the tests. A horizon at which a set was not fitted says as
+            much for it as for the first that was fitted at both.
+        is_explained: Whether the search ended with nothing left above the noise.
+        rule: Temperature T, nats of free runs nu, prior nats lambda and rho.
 
     Returns:
         A probability for each set; they sum to one.
@@ -226,46 +208,35 @@ def set_probabilities(
         distributions", Bayesian Analysis 13, 2018, section 3.4.
     """
     rng, drawn = np.random.default_rng(SEED), {}
-    first = next((s for s in fitted if s.prediction and s.free_run), fitted[0])
-    reference = list(fitted).index(first)
-    assert first.prediction
+    both = [k for k, s in enumerate(fitted) if s.prediction is not None and s.free_run is not None]
+    reference = both[0] if both else 0
 
-    def resampled(rows: list[np.ndarray]) -> np.ndarray:
+    def resampled(rows: list[np.ndarray | None]) -> np.ndarray:
         """Sums over half seconds less those of the reference (DRAWS, S)."""
-        d = np.array(rows) - rows[reference]
-        if not d.shape[1]:
-            return np.zeros((DRAWS, len(d)))
+        of_reference = rows[reference]
+        if of_reference is None or not len(of_reference):
+            return np.zeros((DRAWS, len(rows)))
+        d = np.array([of_reference if row is None else row for row in rows]) - of_reference
         if d.shape[1] not in drawn:
-            alike = np.full(d.shape[1], 1.0 / rule.per_look)
-            drawn[d.shape[1]] = d.shape[1] * rng.dirichlet(alike, DRAWS)
-        return drawn[d.shape[1]] @ np.nan_to_num(d, nan=-1e9).T
+            drawn[d.shape[1]] = d.shape[1] * rng.dirichlet(np.ones(d.shape[1]), DRAWS)
+        return drawn[d.shape[1]] @ np.nan_to_num(d, nan=DIVERGED).T
 
-    predictions = [s.prediction or first.prediction for s in fitted]
-    penalty = 0.5 * np.log(measured_values) * np.array([s.parameters for s in fitted])
-    likelihood = resampled([p.validation for p in predictions])
-    if len(first.prediction.training):
-        likelihood += rule.training * (resampled([p.training for p in predictions]) - penalty)
-    log_weight = likelihood / rule.temperature
-    if first.free_run:
-        runs = [(s.free_run or first.free_run).validation for s in fitted]
-        log_weight += rule.run_nats * resampled(runs)
+    temperature = rule.temperature if is_explained else rule.temperature_unexplained
+    log_weight = resampled([s.prediction for s in fitted]) / temperature
+    log_weight += rule.run_nats * resampled([s.free_run for s in fitted])
     log_weight -= rule.prior_nats * np.array([len(s.effects) for s in fitted])
+    log_weight[:, 0] += rule.passed_nats
     weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
     return np.mean(weight / weight.sum(axis=1, keepdims=True), axis=0)
 
 
 def probabilities(
-    fitted: Sequence[FittedSet],
-    measured_values: float,
-    *,
-    is_explained: bool,
-    rule: EvidenceRule = RULE,
+    fitted: Sequence[FittedSet], *, is_explained: bool, rule: EvidenceRule = RULE
 ) -> Probabilities:
     """Probabilities of the sets that a search has fitted.
 
     Args:
         fitted: The sets, the one reported first; of several fits of one set the first counts.
-        measured_values: How many values the training recordings have.
         is_explained: Whether the search ended with nothing left above the noise.
         rule: How evidence becomes probability.
 
@@ -275,7 +246,7 @@ def probabilities(
     known = {s.effects: s for s in reversed(fitted)}
     once = [known[e] for e in dict.fromkeys(s.effects for s in fitted)]
     elsewhere = rule.elsewhere if is_explained else rule.elsewhere_unexplained
-    p = (1 - elsewhere) * set_probabilities(once, measured_values, rule)
+    p = (1 - elsewhere) * set_probabilities(once, is_explained=is_explained, rule=rule)
     sets = [SetProbability(s.effects, float(x)) for s, x in zip(once, p, strict=True)]
     effects: dict[str, float] = {}
     for s in sets:

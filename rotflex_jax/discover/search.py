@@ -439,7 +439,7 @@ def _probabilities(state: SearchState, is_explained: bool) -> Probabilities:
     sets = fitted_sets(horizons, state.tried, state.alternatives, reported, state.machine)
     if state.merged:
         sets = fitted_sets(horizons, (), [state.merged], reported, ()) + sets
-    return probabilities(sets, state.problem.measured_values, is_explained=is_explained)
+    return probabilities(sets, is_explained=is_explained)
 
 
 def _report(state: SearchState, evaluation: Evaluation, started: float) -> Discovery:
