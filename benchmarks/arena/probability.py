@@ -120,7 +120,7 @@ def effect_events(row: Row) -> list[Event]:
     mass: dict[str, float] = {}
     for names, p in row["probabilities"]["sets"]:
         for name in names:
-            mass[name] = mass.get(name, 0.0) + p
+            mass[name] = mass.get(name, 0.0) + p / (1 - row["probabilities"]["elsewhere"])
     return [Event(p, place_of(name) in there) for name, p in mass.items()]
 
 

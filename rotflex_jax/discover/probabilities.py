@@ -84,7 +84,8 @@ class Probabilities:
 
     Attributes:
         sets: Sets that were fitted, the most probable one first; with `elsewhere` they sum to one.
-        effects: Name -> probability that it is there, the sum over the sets that have it.
+        effects: Name -> probability that it is there, the share of the fitted sets' probability that has it;
+            a right set elsewhere is taken to have it as often.
         elsewhere: Probability that the right set is none of these.
         remarks: What the numbers are conditional on, in sentences.
         evidence: What they were computed from.
@@ -251,7 +252,7 @@ def probabilities(
     effects: dict[str, float] = {}
     for s in sets:
         for name in sorted(s.effects):
-            effects[name] = effects.get(name, 0.0) + s.probability
+            effects[name] = effects.get(name, 0.0) + s.probability / (1 - elsewhere)
     remarks = [
         "Only sets that the search has fitted have a probability of their own; that the right one is none of "
         f"them has the probability {percent(elsewhere)}, as often as on simulated machines with such an end.",

@@ -25,7 +25,7 @@ MOST_SETS = 6
     "probabilities",
     section="found",
     caption="Left, sets of effects that the search has fitted, each a model of its own; right, each effect "
-    "with the sum over the sets that have it. What is missing to 1 lies with sets that were not fitted.",
+    "with the share of that which has it. What the sets lack to 1 lies with sets that were not fitted.",
     description="Bars of the probability of each set of effects and of each effect.",
 )
 def probabilities(discovery: SearchResult) -> Figure | None:
