@@ -149,6 +149,32 @@ def test_what_hides_behind_another_has_synergy():
     assert made([rich, simple], slopes, own[0] + own[1]).pairs([rich.location, simple.location]) == []
 
 
+def test_a_richer_effect_that_gains_nothing_is_not_paired():
+    """A friction that is the same both ways would only be refitted to the simpler law."""
+    rng = np.random.default_rng(7)
+    simple, other = candidate("coulomb", "hub", (((1.0,),),)), candidate("viscous", "arm", (((1.0,),),))
+    rich = candidate("coulomb_asymmetric", "hub", (((1.0, 0.0), (0.0, 1.0)),))
+    shared, own = rng.normal(size=SAMPLES), rng.normal(size=(3, SAMPLES))
+    first, second = shared + 0.2 * own[0], shared + 0.2 * own[1]
+    forward = np.where(np.arange(SAMPLES) % 2, first, 0.0)
+    slopes = {
+        (simple.location, 0): first[None],
+        (other.location, 0): second[None],
+        (rich.location, 0): np.array([forward, first - forward]),
+    }
+    for uneven, paired in ((0.0, simple), (20.0, rich)):
+        r = 40 * (first - second) + uneven * forward + 0.3 * rng.normal(size=SAMPLES)
+        test = made([simple, other, rich], slopes, r)
+        together = test.pairs([c.location for c in (simple, other, rich)])
+        assert {frozenset(p.locations) for p in together} == {
+            frozenset({simple.location, other.location}),
+            frozenset({rich.location, other.location}),
+        }
+        places = [frozenset(a.locations) for a, _ in promising_pairs(test, test)]
+        assert places[0] == {paired.location, other.location}
+        assert uneven or len(places) == 1
+
+
 def scored(location: EffectLocation, gain: float) -> Score:
     start = CandidateStart(location, np.zeros(1), expected_gain=gain)
     return Score(start, gain, True, 1.0, 1.0)

@@ -35,6 +35,7 @@ from rotflex_jax.discover.selection import (
 from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_from
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.effects import CATALOG
 
 # Candidates of which pairs are scored, and pairs that are refitted: the best, and those that gain most beyond
 # what their members promise alone.
@@ -71,6 +72,7 @@ def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[Pa
     tests = [{p.locations: p for p in test.pairs(chosen)} for test in (prediction, free_run)]
     common = [p for p in tests[0] if p in tests[1]]
     wanted = [p for p in common if any(t[p].nats > 0 and t[p].more > TRAIN_NATS for t in tests)]
+    wanted = [p for p in wanted if not _is_a_simpler_one(p, tests)]
     if not wanted:
         return []
 
@@ -83,6 +85,17 @@ def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[Pa
     together = [p for p in sorted(wanted, key=lambda p: -by_synergy[p]) if by_synergy[p] > 0]
     best += [p for p in together if p not in best][:SYNERGETIC_PAIRS]
     return [(tests[0][p], tests[1][p]) for p in best]
+
+
+def _is_a_simpler_one(pair: Pair, tests: Sequence[dict[Pair, PairScore]]) -> bool:
+    """Whether a pair gains nothing over the one with a simpler effect in the place of a richer one."""
+    for rich, other in (pair, pair[::-1]):
+        for name in CATALOG[rich.effect].contains:
+            simple = EffectLocation(name, rich.port)
+            known = [q for q in ((simple, other), (other, simple)) if all(q in t for t in tests)]
+            if any(all(t[pair].gain < t[q].gain + 1.0 for t in tests) for q in known):
+                return True
+    return False
 
 
 def refit_pairs(
