@@ -96,11 +96,13 @@ class HorizonGain(NamedTuple):
             summed over half seconds.
         z: How many standard deviations of its scatter over half seconds that is.
         error_ratio: Error of short free runs with the effect over that without it.
+        training_gain: The same as `gain` on training data.
     """
 
     gain: float
     z: float
     error_ratio: float
+    training_gain: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
