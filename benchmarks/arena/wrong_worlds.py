@@ -1,8 +1,9 @@
 """Wrong worlds: what a laboratory records of a machine whose model is wrong in more than one way.
 
 A world has one hidden effect that a search should name, with strength and shape drawn at random, and beside
-it what laboratories have: torques that no candidate describes, and faults that one would name. Trusted constants of the model are wrong, every run has
-a voltage offset of its own, a controller is in the loop, and its voltage and the counted angles are recorded.
+it what laboratories have: torques that no candidate describes, and faults that one would name. Trusted
+constants of the model are wrong, every run has a voltage offset of its own, a controller is in the loop, and
+its voltage and the counted angles are recorded.
 
     world = wrong_worlds.world(3000)
     rf.discover(world.model, world.train, world.validation)      # world.test has no say

@@ -161,7 +161,7 @@ class Round:
                 "score": _number(self.score),
                 "held_out_gain_nats": _number(self.held_out_gain_nats),
                 **{
-                    name: {"gain": _number(g.gain), "z": _number(g.z), "error_ratio": _number(g.error_ratio)}
+                    name: {key: _number(value) for key, value in g._asdict().items()}
                     for name, g in (("prediction", self.prediction), ("free_run", self.free_run))
                     if g is not None
                 },

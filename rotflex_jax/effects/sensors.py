@@ -12,6 +12,8 @@ from rotflex_jax.parameters import parameter
 # No disc of an encoder is further out of its centre than this share of its radius. Over a part of a turn a
 # larger one would be a gain of the sensor.
 _OUT_OF_CENTRE = (-0.05, 0.05)
+# Sensors that read more of each other than this are connected wrongly, which no search is needed for.
+_CROSSED = (-0.1, 0.1)
 
 
 @register
@@ -287,7 +289,9 @@ class CrossTalk(Sensing):
     relative: ClassVar[bool] = True
     beside: ClassVar[Beside] = "other"
 
-    share: float = parameter(0.0, unit="", typical=0.01, meaning="share of the other channel")
+    share: float = parameter(
+        0.0, unit="", typical=0.01, physical=_CROSSED, meaning="share of the other channel"
+    )
 
     def measure(self, value: Scalar, other: Scalar) -> Scalar:
         """Reading [unit of the channel]."""
