@@ -3,12 +3,14 @@
     python benchmarks/B9_measured.py
     python benchmarks/B9_measured.py --only rotflex two_dof_link_1
     python benchmarks/B9_measured.py --only "rotflex: A to B" --fresh
+    python benchmarks/B9_measured.py --workers 16
     python benchmarks/B9_measured.py --list
 
 The ends of the runs that are learnt from decide (validation); the test recordings are for judging alone. Free
 runs over the whole test and over windows of 2 s, with and without the voltage offset that the first 2 s of a
 test ask for. A search runs in a new process with nothing compiled, and once more in another one with what the
-first has compiled. Beside it is the best of the other methods (`rotflex_jax.compare`) on the same data.
+first has compiled. Beside it is the best of the other methods (`rotflex_jax.compare`) on the same data. With
+several workers each direction has a core, all share what they compile, and no times are reported.
 
 Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B9.json` after each
 direction, and the page `results/B9.md`; directions that the file has are kept unless `--fresh` is given.
@@ -18,9 +20,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import queue
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +64,33 @@ def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
     return wanted, left_out
 
 
+def side_by_side(
+    todo: list[tuple[str, str]], methods: list[str], workers: int
+) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Directions as they are ready, each in a process on a core of its own; without times."""
+    free = queue.SimpleQueue[int]()
+    for core in range(workers):
+        free.put(core)
+
+    def one(machine: str, direction: str, cache: str) -> dict[str, Any]:
+        core = free.get()
+        child = f"import os; os.sched_setaffinity(0, {{{core}}}); {CHILD}"
+        try:
+            row = process(child, machine, direction, "cold", *methods, cache=cache, show=True)
+        except subprocess.CalledProcessError as problem:
+            return {"error": f"the process ended with {problem.returncode}"}
+        finally:
+            free.put(core)
+        for time in ("clock", "processor", "clock_s", "processor_s"):
+            row.pop(time, None)
+        return row
+
+    with tempfile.TemporaryDirectory() as cache, ThreadPoolExecutor(workers) as pool:
+        running = {pool.submit(one, *way, cache): way for way in todo}
+        for done in as_completed(running):
+            yield *running[done], done.result()
+
+
 def measured(machine: str, direction: str, methods: list[str], warm: bool) -> dict[str, Any]:
     """One direction: everything in a new process, then the search again in another; a failure is a row."""
     with tempfile.TemporaryDirectory() as cache:
@@ -89,6 +121,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--methods", nargs="*", default=None, help="of the comparison; the quick ones if omitted"
     )
+    parser.add_argument("--workers", type=int, default=1, help="directions at the same time")
     parser.add_argument("--cold-only", action="store_true", help="No second search of each direction.")
     parser.add_argument("--fresh", action="store_true", help="Run again what the results have already.")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "B9.json")
@@ -114,17 +147,20 @@ def main() -> int:
     results["runs"].append({**made, "arguments": sys.argv[1:]})
     results["left_out"] = {**results.get("left_out", {}), **left_out}
     rows = results["rows"]
-    for count, (machine, direction) in enumerate(wanted, 1):
+    known = {key for key, row in rows.items() if "error" not in row and not a.fresh}
+    todo = [way for way in wanted if ": ".join(way) not in known]
+    if a.workers > 1:
+        done = side_by_side(todo, methods, a.workers)
+    else:
+        done = ((*way, measured(*way, methods, not a.cold_only)) for way in todo)
+    for count, (machine, direction, row) in enumerate(done, 1):
         key = f"{machine}: {direction}"
-        if key in rows and "error" not in rows[key] and not a.fresh:
-            continue
-        row = measured(machine, direction, methods, not a.cold_only)
         head = {"machine": machine, "direction": direction}
         rows[key] = head | row | {k: made[k] for k in ("commit", "clean", "code")}
         results["left_out"].pop(machine, None)
         save(a.out, results)
         write_file(a.out.with_suffix(".md"), page(results))
-        print(f"{count}/{len(wanted)} {key}: {row.get('error') or row['sentence']}", flush=True)
+        print(f"{count}/{len(todo)} {key}: {row.get('error') or row['sentence']}", flush=True)
     save(a.out, results)
     write_file(a.out.with_suffix(".md"), page(results))
     print(page(results))

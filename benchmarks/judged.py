@@ -51,6 +51,7 @@ def named(result: rf.Discovery) -> list[dict[str, Any]]:
             "port": r["port"],
             "equivalent": [[e["effect"], e["port"]] for e in r["equivalent"]],
             "status": r.get("status", ESTABLISHED),
+            "doubt": r.get("doubt", ""),
             "nats": r["evidence"]["held_out_gain_nats"],
             "score": r["evidence"]["score"],
         }

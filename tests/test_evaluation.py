@@ -108,5 +108,6 @@ def test_an_effect_with_a_rival_or_a_reason_is_provisional():
 @pytest.mark.parametrize("field", ["prediction", "free_run"])
 def test_gains_at_both_horizons_are_in_the_evidence(field: str):
     first = two_rounds().rounds[0]
-    gained = dataclasses.replace(first, **{field: HorizonGain(12.0, 3.0, 0.5)})
-    assert gained.to_dict()["evidence"][field] == {"gain": 12.0, "z": 3.0, "error_ratio": 0.5}
+    gained = dataclasses.replace(first, **{field: HorizonGain(12.0, 3.0, 0.5, 7.0)})
+    evidence = {"gain": 12.0, "z": 3.0, "error_ratio": 0.5, "training_gain": 7.0}
+    assert gained.to_dict()["evidence"][field] == evidence

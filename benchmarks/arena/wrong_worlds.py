@@ -1,8 +1,9 @@
 """Wrong worlds: what a laboratory records of a machine whose model is wrong in more than one way.
 
 A world has one hidden effect that a search should name, with strength and shape drawn at random, and beside
-it what laboratories have and no candidate describes. Trusted constants of the model are wrong, every run has
-a voltage offset of its own, a controller is in the loop, and its voltage and the counted angles are recorded.
+it what laboratories have: torques that no candidate describes, and faults that one would name. Trusted
+constants of the model are wrong, every run has a voltage offset of its own, a controller is in the loop, and
+its voltage and the counted angles are recorded.
 
     world = wrong_worlds.world(3000)
     rf.discover(world.model, world.train, world.validation)      # world.test has no say
@@ -183,15 +184,16 @@ def _modes(rng: np.random.Generator, link: bool) -> Beside:
 
 
 def _crosstalk(rng: np.random.Generator) -> Beside:
-    return Beside("crosstalk", {"share": _sign(rng) * log_uniform(rng, 0.004, 0.02)})
+    share = _sign(rng) * log_uniform(rng, 0.004, 0.02)
+    return Beside("crosstalk", {"share": share}, (("cross_talk", "alpha"),))
 
 
 def _late(_: np.random.Generator) -> Beside:
-    return Beside("alpha_late", {"samples": 1})
+    return Beside("alpha_late", {"samples": 1}, (("channel_delay", "alpha"),))
 
 
 def _drawn_besides(rng: np.random.Generator, kind: str, hidden: Place | None) -> list[Beside]:
-    """One or two things that no candidate has; of a link its modes and its gauge as well."""
+    """One or two things more; of a link its modes and its gauge as well."""
     others = {"torque": _unnamed_torque, "crosstalk": _crosstalk, "late": _late}
     if kind == "link":
         made = [_modes(rng, True), _gauge(rng)]

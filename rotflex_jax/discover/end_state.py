@@ -2,12 +2,20 @@
 
 from collections.abc import Sequence
 
-from rotflex_jax.discover.assessment import assess, in_noise
+from rotflex_jax.discover.assessment import Assessment, assess, in_noise
 from rotflex_jax.discover.result import Round, Stage
 from rotflex_jax.discover.score_test import Score
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.recording import Recording
+
+
+def assess_stages(
+    baseline: Stage, final: Stage, floor: dict[str, float], validation: Sequence[Recording]
+) -> Assessment:
+    """The final model by its errors on validation data; arguments as in `end_state`."""
+    errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
+    return assess(*errors, floor, final.process_noise_nats, sum(r.N for r in validation))
 
 
 def end_state(
@@ -28,8 +36,7 @@ def end_state(
         ranking: Scores of the baseline.
         test: Held-out recordings.
     """
-    errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
-    end = assess(*errors, floor, final.process_noise_nats, sum(r.N for r in test))
+    end = assess_stages(baseline, final, floor, test)
     seconds = final.window_seconds
     reached = f"the held-out error over {seconds:g} s is {in_noise(end.remaining)} times the sensor noise"
     names = " and ".join(effect_phrase(r.effect, r.port) for r in rounds)

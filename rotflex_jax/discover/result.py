@@ -96,11 +96,13 @@ class HorizonGain(NamedTuple):
             summed over half seconds.
         z: How many standard deviations of its scatter over half seconds that is.
         error_ratio: Error of short free runs with the effect over that without it.
+        training_gain: The same as `gain` on training data.
     """
 
     gain: float
     z: float
     error_ratio: float
+    training_gain: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +161,7 @@ class Round:
                 "score": _number(self.score),
                 "held_out_gain_nats": _number(self.held_out_gain_nats),
                 **{
-                    name: {"gain": _number(g.gain), "z": _number(g.z), "error_ratio": _number(g.error_ratio)}
+                    name: {key: _number(value) for key, value in g._asdict().items()}
                     for name, g in (("prediction", self.prediction), ("free_run", self.free_run))
                     if g is not None
                 },

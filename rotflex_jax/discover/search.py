@@ -3,14 +3,14 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
 from rotflex_jax import checks
 from rotflex_jax.discover.bias_correction import correct_discretisation_bias
 from rotflex_jax.discover.discovery import Discovery
-from rotflex_jax.discover.end_state import end_state
+from rotflex_jax.discover.end_state import assess_stages, end_state
 from rotflex_jax.discover.evaluation import (
     Evaluation,
     PairedEstimates,
@@ -48,6 +48,7 @@ from rotflex_jax.discover.selection import (
     runs_clearly_better,
     validate_from_best_states,
 )
+from rotflex_jax.discover.stand_in import signs
 from rotflex_jax.discover.stepwise import (
     Eliminated,
     assign_calibrations,
@@ -464,7 +465,9 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     m = stages[-1].model.mechanism
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
-    rounds = _rounds(state, stages, pairs, remarks)
+    explained = assess_stages(stages[0], stages[-1], floor, held_back).is_explained
+    stands_in = {} if explained else _stand_ins(state)
+    rounds = _rounds(state, stages, pairs, remarks, stands_in)
     listed = [s for s, _ in state.ranking]
     verdict, sentence = end_state(stages[0], rounds, stages[-1], floor, listed, held_back)
     return Discovery(
@@ -509,6 +512,7 @@ def _rounds(
     stages: Sequence[Stage],
     pairs: Sequence[PairedEstimates],
     remarks: Sequence[Remark],
+    stands_in: Mapping[EffectLocation, tuple[str, ...]],
 ) -> tuple[Round, ...]:
     """What was added, in order, each effect with the stage that it led to.
 
@@ -517,6 +521,7 @@ def _rounds(
         stages: Models, each with one effect more.
         pairs: The last one fitted to different recordings.
         remarks: On parameters of the last one.
+        stands_in: Signs that effects of an unexplained model stand in for something else.
     """
     mechanism = stages[-1].model.mechanism
     return tuple(
@@ -530,12 +535,22 @@ def _rounds(
             held_out_gain_nats=_gain_of_predictions(state, location, stage, before),
             sentence=mechanism.sentence(mechanism.effect(*location)),
             equation=mechanism.effect(*location).equation,
-            doubts=(*_doubts(state, location, pairs), *_beyond(remarks, location)),
+            doubts=(
+                *_doubts(state, location, pairs),
+                *_beyond(remarks, location),
+                *stands_in.get(location, ()),
+            ),
             prediction=state.gains.get(location, (None, None))[0],
             free_run=state.gains.get(location, (None, None))[1],
         )
         for location, before, stage in zip(state.order, stages, stages[1:], strict=False)
     )
+
+
+def _stand_ins(state: SearchState) -> dict[EffectLocation, tuple[str, ...]]:
+    """Signs that effects stand in for something else, of the final model at both horizons."""
+    gains = {p: at.gain + at.training_gain for p, (at, _) in state.gains.items()}
+    return signs((state.horizons.prediction, state.horizons.free_run), state.current, gains)
 
 
 def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: Stage, before: Stage) -> float:

@@ -32,6 +32,9 @@ SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
 # What predictions do not want, free runs must want by so many standard deviations of their block gains, on
 # validation and on training data, with an error that falls by so much (mean log ratio).
 FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
+# What predictions want by so many standard deviations, on validation and on training data, need not show in
+# free runs whose error something else makes, if these get no worse.
+PREDICTION_Z = 3.5
 
 
 def paired_gain(a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"]) -> tuple[float, float]:
@@ -47,12 +50,13 @@ def horizon_gains(
     """What a candidate gains on validation data, as a predictor and in free runs."""
     nats, z = paired_gain(candidate.blocks, current.blocks)
     ratio = float(np.exp(_log_error_ratio(candidate, current)))
-    prediction = HorizonGain(nats, z, ratio)
+    prediction = HorizonGain(nats, z, ratio, _training_gain(candidate, current)[0])
     runs, before = candidate.free_run, current.free_run
     if runs is None or before is None:
         return prediction, None
     gain, z = paired_gain(runs.blocks, before.blocks)
-    return prediction, HorizonGain(gain, z, float(np.exp(_log_error_ratio(runs, before))))
+    ratio, training = float(np.exp(_log_error_ratio(runs, before))), _training_gain(runs, before)[0]
+    return prediction, HorizonGain(gain, z, ratio, training)
 
 
 def helps(gain: HorizonGain) -> bool:
@@ -125,7 +129,8 @@ def admissible(
     certainty = min(paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1])
     as_trained = _log_error_ratio(candidate, current)
     if enough and min(ratio, as_trained) < limit:
-        return not far or certainty > HELD_OUT_Z or as_trained < -FREE_RUN_BETTER
+        beyond_doubt = min(z, train_z) > PREDICTION_Z
+        return not far or certainty > HELD_OUT_Z or as_trained < -FREE_RUN_BETTER or beyond_doubt
     return far and _free_runs_insist(candidate, current)
 
 

@@ -9,6 +9,12 @@ import jax.numpy as jnp
 from rotflex_jax.effects.base import Beside, Probe, Scalar, Scale, Sensing, Stamp, StatePart, register
 from rotflex_jax.parameters import parameter
 
+# No disc of an encoder is further out of its centre than this share of its radius. Over a part of a turn a
+# larger one would be a gain of the sensor.
+_OUT_OF_CENTRE = (-0.05, 0.05)
+# Sensors that read more of each other than this are connected wrongly, which no search is needed for.
+_CROSSED = (-0.1, 0.1)
+
 
 @register
 @dataclasses.dataclass(frozen=True)
@@ -214,12 +220,24 @@ class EccentricEncoder(Sensing):
     searched: ClassVar[tuple[str, ...]] = ("theta",)
     turning: ClassVar[bool] = True
 
-    # An amplitude of one turns the reading back: no disc is that far from its centre.
+    # An amplitude of one turns the reading back.
     cosine: float = parameter(
-        0.0, unit="rad", typical=0.01, lower=-0.9, upper=0.9, meaning="amplitude of the cosine"
+        0.0,
+        unit="rad",
+        typical=0.01,
+        lower=-0.9,
+        upper=0.9,
+        physical=_OUT_OF_CENTRE,
+        meaning="amplitude of the cosine",
     )
     sine: float = parameter(
-        0.0, unit="rad", typical=0.01, lower=-0.9, upper=0.9, meaning="amplitude of the sine"
+        0.0,
+        unit="rad",
+        typical=0.01,
+        lower=-0.9,
+        upper=0.9,
+        physical=_OUT_OF_CENTRE,
+        meaning="amplitude of the sine",
     )
 
     def measure(self, value: Scalar) -> Scalar:
@@ -271,7 +289,9 @@ class CrossTalk(Sensing):
     relative: ClassVar[bool] = True
     beside: ClassVar[Beside] = "other"
 
-    share: float = parameter(0.0, unit="", typical=0.01, meaning="share of the other channel")
+    share: float = parameter(
+        0.0, unit="", typical=0.01, physical=_CROSSED, meaning="share of the other channel"
+    )
 
     def measure(self, value: Scalar, other: Scalar) -> Scalar:
         """Reading [unit of the channel]."""

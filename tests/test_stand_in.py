@@ -1,0 +1,94 @@
+"""Signs that an effect stands in for something else: sizes by window, changes of free runs, nats left."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_problem import HUB, NOISE, problem, recordings, records, start, supermodel
+
+from rotflex_jax.discover.horizon import SearchHorizon
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_effect
+from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.refit import levenberg_marquardt
+from rotflex_jax.discover.stand_in import LEAST_CHANGE, SCATTER, nats_above_noise, signs, window_sizes
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet
+from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder
+from rotflex_jax.parameters import specifications
+
+
+def with_friction(at: LikelihoodProblem, level: float) -> Hypothesis:
+    """A fit that began with friction of that level at the hub."""
+    h = with_effect(supermodel(), start(at), CandidateStart(HUB, np.array([level])), 1.0)
+    return levenberg_marquardt(at, [h])[0]
+
+
+def mixed(levels: tuple[float, float]) -> LikelihoodProblem:
+    """Two recordings of machines whose friction is not the same."""
+    made = [records(level)[k] for k, level in enumerate(levels)]
+    return problem(recordings(tuple(made)))
+
+
+@pytest.fixture(scope="module")
+def same() -> tuple[LikelihoodProblem, Hypothesis]:
+    at = mixed((0.02, 0.02))
+    return at, with_friction(at, 0.03)
+
+
+def test_an_effect_of_the_machine_has_one_size(same):
+    at, h = same
+    sizes = window_sizes(at, h, [HUB])[HUB]
+    assert sizes.scatter < SCATTER / 3 and sizes.change > 2 * LEAST_CHANGE
+
+
+def test_two_sizes_show_as_scatter():
+    """Friction of 0.012 and 0.028 N m asks for changes of +-40 % around the mean."""
+    at = mixed((0.012, 0.028))
+    sizes = window_sizes(at, with_friction(at, 0.03), [HUB])[HUB]
+    assert 0.25 < sizes.scatter < 0.55
+
+
+def test_an_effect_that_does_little_changes_little():
+    """A hundredth of the friction is less than what its absence leaves."""
+    at = mixed((0.02, 0.02))
+    s, h = supermodel(), start(at)
+    little = with_effect(s, h, CandidateStart(HUB, np.array([2e-4])), 1.0)
+    assert window_sizes(at, little, [HUB])[HUB].change < LEAST_CHANGE / 5
+
+
+def test_nats_above_the_noise_by_hand(same):
+    """`N log(rms / noise)` of each channel: half the noise is `log 2` more for each value above it."""
+    at, h = same
+    e, counted = at.innovations([h])[0], at.seen > 0
+    # Far below any error, so that each channel counts.
+    tiny = dataclasses.replace(at, dataset=dataclasses.replace(at.dataset, noise=NOISE * 1e-3))
+    rms = np.sqrt(np.mean(e[counted] ** 2, axis=0))
+    expected = counted.sum() * (np.log(rms[0] / (1e-3 * NOISE[0])) + np.log(rms[1] / (1e-3 * NOISE[1])))
+    assert nats_above_noise(tiny, h) == pytest.approx(expected, rel=1e-9)
+    huge = dataclasses.replace(at, dataset=dataclasses.replace(at.dataset, noise=NOISE * 1e3))
+    assert nats_above_noise(huge, h) == 0.0
+
+
+def validated(h: Hypothesis) -> ValidatedHypothesis:
+    runs = ValidatedHypothesis(h, np.zeros(0), h, NOISE)
+    return dataclasses.replace(runs, free_run=runs)
+
+
+def test_each_sign_is_a_sentence(same):
+    at, h = same
+    horizon = SearchHorizon(at, ValidationSet(at, 2.0))
+    rest = 2 * nats_above_noise(at, h)
+    assert signs((horizon, horizon), validated(h), {HUB: rest + 1.0})[HUB] == ()
+    (few,) = signs((horizon, horizon), validated(h), {HUB: rest - 1.0})[HUB]
+    assert f"gain {rest - 1:.0f} nats" in few and f"{rest:.0f} are left above the sensor noise" in few
+    other = mixed((0.012, 0.028))
+    apart = SearchHorizon(other, ValidationSet(other, 2.0))
+    (scattered,) = signs((apart, apart), validated(with_friction(other, 0.03)), {HUB: 1e9})[HUB]
+    assert scattered.startswith("windows of 2 s differ by")
+
+
+def test_sensor_faults_of_an_impossible_size_are_not_physical():
+    """A fifth of the servo angle in a strain gauge, or a disc 8 degrees out of centre, is something else."""
+    for fault, names in ((CrossTalk, ("share",)), (EccentricEncoder, ("sine", "cosine"))):
+        for name in names:
+            low, high = specifications(fault(at="theta"))[name].physical
+            assert -0.14 < low < -0.02 < 0.02 < high < 0.14
