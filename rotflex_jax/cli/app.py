@@ -99,6 +99,7 @@ def discover(
     test: given.Test = None,
     split: given.Share = None,
     calibrate: given.Calibrate = 2.0,
+    resume: given.Continue = None,
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
     save_model: given.ModelFile = None,
@@ -112,7 +113,7 @@ def discover(
 
     Several FILES without --held-out and --split validate each other: each decides on what the others found.
     """
-    refused = {"held-out": held_out, "test": test, "save-model": save_model}
+    refused = {"held-out": held_out, "test": test, "save-model": save_model, "continue": resume}
     check_each(each, {"scheduler": scheduler, "workers": workers}, refused)
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, [*(held_out or []), *(test or [])])
@@ -126,9 +127,8 @@ def discover(
     if not validation and (len(train) == 1 or split is not None):
         train, validation = map(list, zip(*(recording.split(share) for recording in train), strict=True))
     no_say = columns.load_all(test or [])
-    _discover(
-        model, train, validation, report, json_file, save_model, test=no_say, calibrate_seconds=calibrate
-    )
+    options = {"calibrate_seconds": calibrate, "resume": resume}
+    _discover(model, train, validation, report, json_file, save_model, test=no_say, **options)
 
 
 @given.reads_files

@@ -125,6 +125,14 @@ Calibrate = Annotated[
         help="Report errors also with the offsets of each unseen recording's own first SECONDS; 0: not.",
     ),
 ]
+Continue = Annotated[
+    Path | None,
+    typer.Option(
+        "--continue",
+        metavar="FILE",
+        help="Go on from NAME.stopped.json that a stopped search of the same files has left.",
+    ),
+]
 Share = Annotated[
     float | None,
     typer.Option("--split", metavar="SHARE", help="Share of each FILE to fit, the rest is held out: 0.7."),

@@ -4,11 +4,20 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from rotflex_jax import checks
 from rotflex_jax.discover.bias_correction import correct_discretisation_bias
+from rotflex_jax.discover.checkpoint import (
+    KeptStage,
+    digest_of_search,
+    kept,
+    not_kept,
+    read_stages,
+    restored,
+)
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.end_state import end_state
 from rotflex_jax.discover.evaluation import (
@@ -96,12 +105,16 @@ class SearchState:
         notes: Remarks for a reader.
         gains: Effects that were added -> what they gained at both horizons.
         final: The model that is reported, with the parameters of `reported`.
+        resumed: How many of the effects an earlier search has added, which was stopped.
+        digest: Of all that the models depend on.
     """
 
     model: Model
     horizons: Horizons
     say: Progress
     current: ValidatedHypothesis
+    digest: str = ""
+    resumed: int = 0
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
@@ -154,11 +167,19 @@ class SearchState:
         """A validated structure with the parameters of one horizon."""
         return found.free_run if horizon is self.horizons.free_run and found.free_run else found
 
-    def reached(self, label: str) -> None:
-        """Report the error of the current model."""
+    def reached(self, label: str, added: EffectLocation | None = None) -> None:
+        """Report the error of the current model, after an effect was added."""
         channels, recording = self.model.mechanism.channels, self.validation.problem.dataset.recordings[0]
         units = {c: recording.units[recording.channels.index(c)] for c in channels}
-        self.say(milestone(label, channels, units, best_window_rmse(self.current), self.problem.noise))
+        line = milestone(label, channels, units, best_window_rmse(self.current), self.problem.noise)
+        if (runs := self.current.free_run) is not None:
+            stage = KeptStage(kept(self.current.hypothesis), kept(runs.hypothesis))
+            if added is not None:
+                stage = stage._replace(
+                    location=added, score=self.scores[added], rivals=tuple(self.rivals[added])
+                )
+            line.kept = stage.to_dict(self.digest)
+        self.say(line)
 
 
 @one_thread
@@ -174,6 +195,7 @@ def discover(
     rounds: int = ROUNDS,
     window_seconds: float = 2.0,
     calibrate_seconds: float = 2.0,
+    resume: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Discovery:
     """Find the physical effects that a model lacks, and say how sure that is.
@@ -199,13 +221,16 @@ def discover(
         window_seconds: Length of short free runs [s].
         calibrate_seconds: The errors reported as calibrated allow each recording that no fit saw the offsets
             that its own first seconds give [s]; 0 for none.
+        resume: `NAME.stopped.json` that a stopped search of the same recordings has left: the search goes on
+            after the rounds in it, which count among `rounds`.
         progress: Called with a line of text at each stage.
 
     Returns:
         Discovery.
 
     Raises:
-        InputError: No recording, channels that the model lacks, or one that moves against the model.
+        InputError: No recording, channels that the model lacks, or one that moves against the model; a file
+            to go on from that another search has left.
     """
     started, say = time.perf_counter(), checks.progress(progress)
     clear_compilation_caches()
@@ -215,11 +240,17 @@ def discover(
     if candidates is not None:
         candidates = checked_candidates(model.mechanism, candidates)
     trained = listed(train, "train", SHORTEST_TO_FIT)
-    horizons = _prepare(model, trained, _several(validation, "validation"), candidates, window_seconds)
+    held_back = _several(validation, "validation")
+    seen = (*trained, *held_back)
+    horizons = _prepare(model, trained, held_back, candidates, window_seconds)
     evaluation = Evaluation.of(model, horizons, _several(test, "test"), calibrate_seconds)
-    say("fitting the model as it is")
-    state = _fit_as_it_is(model, horizons, say)
-    for number in range(rounds):
+    digest = digest_of_search(model, horizons.prediction.problem.supermodel, window_seconds, seen)
+    if resume is None:
+        say("fitting the model as it is")
+        state = _fit_as_it_is(model, horizons, say, digest)
+    else:
+        state = _as_it_was(model, horizons, say, digest, resume)
+    for number in range(state.resumed, rounds):
         left = len(state.problem.supermodel.candidates) - len(state.scores)
         say(f"round {number + 1}: scoring {left} candidates")
         promising_scores, starts, runs_starts = _score_candidates(state)
@@ -275,14 +306,50 @@ def _prepare(
     return Horizons.of(model, problem, other, window_seconds)
 
 
-def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress) -> SearchState:
+def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -> SearchState:
     """The user's model, fitted and validated."""
     h = fit_baseline(horizons.prediction.problem)
     problem = horizons.free_run.problem
     current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
-    state = SearchState(model, horizons, say, current, passed=[current])
+    state = SearchState(model, horizons, say, current, digest, passed=[current])
     state.reached("as it is")
     return state
+
+
+def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:
+    """What a search that was stopped had found, validated again."""
+    stages = read_stages(path, digest)
+    say(f"going on after {len(stages) - 1} finished rounds")
+    state = None
+    for stage in stages:
+        try:
+            h = restored(horizons.prediction.problem, stage.prediction)
+            runs = restored(horizons.free_run.problem, stage.free_run)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+            raise not_kept(path) from None
+        before = state.current if state else None
+        found = horizons.validated(h, runs, before)
+        if state is None:
+            state = SearchState(model, horizons, say, found, digest, len(stages) - 1, passed=[found])
+            state.reached("as it is")
+            if len(stages) > 1:
+                _rank(state)
+        elif stage.location is not None:
+            _add(state, found, stage.location, stage.score, stage.rivals)
+    assert state
+    return state
+
+
+def _rank(state: SearchState) -> tuple[list[Score], list[Score]]:
+    """Scores of all candidates beside the current model, of predictions and of free runs."""
+    current = state.current
+    assert current.free_run
+    listed = scores(state.problem, current.hypothesis)
+    runs = scores(state.horizons.free_run.problem, current.free_run.hypothesis)
+    if not state.ranking:
+        by_runs = {x.location: x.nats for x in runs}
+        state.ranking = [(x, by_runs[x.location]) for x in listed]
+    return listed, runs
 
 
 def _score_candidates(
@@ -290,12 +357,7 @@ def _score_candidates(
 ) -> tuple[list[Score], list[CandidateStart], list[CandidateStart]]:
     """Scores worth a refit, and starts at both horizons: theirs, and effects that contain one that is on."""
     current, s = state.current, state.problem.supermodel
-    assert current.free_run
-    listed = scores(state.problem, current.hypothesis)
-    runs = scores(state.horizons.free_run.problem, current.free_run.hypothesis)
-    if not state.ranking:
-        by_runs = {x.location: x.nats for x in runs}
-        state.ranking = [(x, by_runs[x.location]) for x in listed]
+    listed, runs = _rank(state)
     chosen = promising_at_both(listed, runs, REFITTED)
     known = {x.location for x, _ in chosen}
     further = [c for c in generalisations(s, current.hypothesis) if c.location not in known]
@@ -343,14 +405,24 @@ def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: l
     winner, rivals = choose(candidates, current, data, state.problem.noise)
     if winner is None or winner.location is None:
         return False
-    location = winner.location
-    state.scores[location] = next((s.nats for s in scored if s.location == location), 0.0)
-    state.rivals[location] = [r.location for r in rivals if r.location]
-    state.gains[location] = horizon_gains(winner, current)
-    state.current = dataclasses.replace(winner, location=None, parameter_count=0)
-    state.passed.append(state.current)
-    state.reached(f"+ {location}")
+    nats = next((s.nats for s in scored if s.location == winner.location), 0.0)
+    _add(state, winner, winner.location, nats, [r.location for r in rivals if r.location])
     return True
+
+
+def _add(
+    state: SearchState,
+    found: ValidatedHypothesis,
+    location: EffectLocation,
+    nats: float,
+    rivals: Sequence[EffectLocation],
+) -> None:
+    """One round more: the effect, the score that put it forward, and what is not distinguished from it."""
+    state.scores[location], state.rivals[location] = nats, list(rivals)
+    state.gains[location] = horizon_gains(found, state.current)
+    state.current = dataclasses.replace(found, location=None, parameter_count=0)
+    state.passed.append(state.current)
+    state.reached(f"+ {location}", location)
 
 
 def _simplify(state: SearchState) -> None:
@@ -420,6 +492,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         noise_floor=floor,
         elapsed_s=time.perf_counter() - started,
         notes=(
+            *_resumed(state.resumed),
             *calibration_notes(problem.supermodel, validated[-1], state.own),
             *difference_notes(problem.supermodel, pairs),
             *state.notes,
@@ -427,6 +500,14 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         ),
         remarks=remarks,
     )
+
+
+def _resumed(count: int) -> tuple[str, ...]:
+    """That a search went on from what another one had found, in a sentence."""
+    if not count:
+        return ()
+    found = "one round" if count == 1 else f"{count} rounds"
+    return (f"The search went on after {found} of one that was stopped; the time is that of the rest.",)
 
 
 def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stage:
