@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.discover.assessment import NEAR_FLOOR as NEAR_FLOOR, Assessment, assess
+from rotflex_jax.discover.conditional import ConditionalInterval
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_phrase, with_titles
 from rotflex_jax.experiment import Experiment
@@ -275,6 +276,8 @@ class SearchResult:
         proposal: Where two effects remain: the standard input that distinguishes them best.
         test: Recordings that had no say in anything.
         remarks: Parameters of the final model at a bound, or far beyond what the recordings reach.
+        conditional: Parameters whose intervals from predictions and from free runs exclude each other: the
+            model is incomplete, and its intervals hold only under it.
     """
 
     verdict: Verdict
@@ -291,6 +294,7 @@ class SearchResult:
     proposal: Experiment | None = None
     test: tuple[Recording, ...] = ()
     remarks: tuple[Remark, ...] = ()
+    conditional: tuple[ConditionalInterval, ...] = ()
 
     @property
     def model(self) -> Model:
@@ -334,6 +338,7 @@ class SearchResult:
             "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,
             "notes": list(self.notes),
             "remarks": [r.to_dict() for r in self.remarks],
+            "conditional_intervals": [c.to_dict() for c in self.conditional],
             "elapsed_s": self.elapsed_s,
         }
 

@@ -18,6 +18,7 @@ from rotflex_jax.discover.checkpoint import (
     read_stages,
     restored,
 )
+from rotflex_jax.discover.conditional import ConditionalInterval, conditional_note, excluding
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.end_state import end_state
 from rotflex_jax.discover.evaluation import (
@@ -25,6 +26,7 @@ from rotflex_jax.discover.evaluation import (
     PairedEstimates,
     difference_notes,
     disagreement,
+    estimates,
     evaluate,
     own_estimates,
     paired_estimates,
@@ -474,6 +476,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     m = stages[-1].model.mechanism
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
     rounds = _rounds(state, stages, pairs, remarks)
+    conditional = _conditional(state)
     listed = [s for s, _ in state.ranking]
     verdict, sentence = end_state(stages[0], rounds, stages[-1], floor, listed, held_back)
     return Discovery(
@@ -493,13 +496,28 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         elapsed_s=time.perf_counter() - started,
         notes=(
             *_resumed(state.resumed),
+            *conditional_note(conditional),
             *calibration_notes(problem.supermodel, validated[-1], state.own),
             *difference_notes(problem.supermodel, pairs),
             *state.notes,
             *(f"{remark.sentence}." for remark in remarks),
         ),
         remarks=remarks,
+        conditional=conditional,
     )
+
+
+def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
+    """Parameters of the machine on which predictions and free runs of the final structure do not agree."""
+    horizons, s = state.horizons, state.problem.supermodel
+    if (runs := state.current.free_run) is None:
+        return ()
+    own = {s.mechanism.parameter_names[i] for i in state.current.hypothesis.local}
+    each = (
+        [e for e in estimates(at.problem, found.hypothesis) if e.name not in own]
+        for at, found in ((horizons.prediction, state.current), (horizons.free_run, runs))
+    )
+    return excluding(*each)
 
 
 def _resumed(count: int) -> tuple[str, ...]:
