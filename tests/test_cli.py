@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax.cli import app, terminal
+from rotflex_jax.cli import app, main, terminal
 from rotflex_jax.data.datasets import DATASETS
 from rotflex_jax.discover.assessment import assess
 from rotflex_jax.discover.result import RunErrors
@@ -512,3 +512,17 @@ def test_discover_on_the_demo_recording(run, tmp_path: Path, monkeypatch: pytest
     assert (turn["effect"], turn["port"]) in {(effect.name, port) for effect, port in pairs}
     assert turn["held_out_rmse_windows"]["theta"] < found["baseline"]["held_out_rmse_windows"]["theta"]
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [(None, "3"), ("0", "0")])
+def test_remarks_of_the_compiler_do_not_reach_the_terminal(
+    chosen: str | None, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["rotflex", "--version"])
+    monkeypatch.setattr("rotflex_jax.cli.stopping.STOP.listen", lambda: None)
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", chosen or "")  # given back afterwards
+    if chosen is None:
+        del os.environ["TF_CPP_MIN_LOG_LEVEL"]
+    with pytest.raises(SystemExit):
+        main()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == expected

@@ -121,7 +121,7 @@ def discover(
     given.check_writable(json_file=save_model)
     model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
     if each:
-        search_each(model, files, columns, share, report, json_file, scheduler, workers)
+        search_each(model, files, columns, share, report, json_file, scheduler, workers, calibrate)
         return
     train, validation = columns.load_all(files), columns.load_all(held_out or [])
     if not validation and (len(train) == 1 or split is not None):

@@ -39,6 +39,7 @@ from rotflex_jax.discover.hypothesis import (
     generalisations,
     is_physical,
     parameter_count,
+    without,
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
@@ -67,7 +68,7 @@ from rotflex_jax.discover.stepwise import (
     refit_from,
     remaining_rivals,
 )
-from rotflex_jax.discover.supermodel import EffectLocation, build, checked_candidates, scales
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, checked_candidates, scales
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
@@ -290,10 +291,12 @@ def _prepare(
             "One recording was given for training and none for validation, but a search decides on data that "
             "no fit has seen; give a second recording, or the two parts of recording.split(0.7)."
         )
+    _check_apart(train, held_back)
     check_signs(model, (*train, *held_back))
     dataset = prepare(model, train, length=padded_length(train), noise_of=held_back)
     wanted = list(search_places(m) if candidates is None else candidates)
     supermodel = build(m, wanted, scales(model, train, dataset.torque_scale))
+    _check_constants(m, supermodel, (*train, *held_back))
     ports = tuple(process_noise_ports(m, 1.0))
     # The super-model has friction contacts at every port, of which few are ever switched on.
     solver = model.solver
@@ -306,6 +309,28 @@ def _prepare(
     of_validation = prepare(model, held_back, length=length, like=dataset)
     other = LikelihoodProblem.of(supermodel, solver, of_validation, ports)
     return Horizons.of(model, problem, other, window_seconds)
+
+
+def _check_apart(train: Sequence[Recording], held_back: Sequence[Recording]) -> None:
+    """Refuses data that were fitted in the place of data that no fit has seen."""
+    for k, a in enumerate(train):
+        for b in held_back or train[k + 1 :]:
+            if a is b or (a.Ts == b.Ts and np.array_equal(a.u, b.u) and np.array_equal(a.y, b.y)):
+                raise InputError(
+                    "The same recording was given to fit and to validate, but a search decides on data that "
+                    "no fit has seen; give another recording, or the two parts of recording.split(0.7)."
+                )
+
+
+def _check_constants(m: Mechanism, s: SuperModel, recordings: Sequence[Recording]) -> None:
+    """Refuses constants of effects that the search may add: it fits these."""
+    added = set(s.mechanism.parameter_names) - set(m.parameter_names)
+    for recording in recordings:
+        if known := sorted(added & set(recording.constants)):
+            raise InputError(
+                f"The recording has the constant {known[0]!r}, but the model has no such effect and a search "
+                "fits what it adds; add the effect to the model, or leave the constant out."
+            )
 
 
 def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -> SearchState:
@@ -577,7 +602,14 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
     """Log-likelihood of predictions that an effect gains on validation data [nat]; NaN if unknown."""
     if stage.horizon == "prediction":
         return stage.log_likelihood - before.log_likelihood
-    return state.gains[location][0].gain if location in state.gains else float("nan")
+    if location in state.gains:
+        return state.gains[location][0].gain
+    current, s = state.current, state.problem.supermodel
+    if location not in current.hypothesis.locations:
+        return float("nan")
+    # A calibration of a model whose parameters are those of free runs.
+    less = refit(state.problem, [without(s, current.hypothesis, location)], alternations=1)[0]
+    return current.log_likelihood - validate(state.validation, less, current).log_likelihood
 
 
 def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
