@@ -133,7 +133,6 @@ REFUSED = {
     "discover {run} --joint paper:mass=1": "mass",
     "discover {run} --joint paper:stiffness=soft": "stiffness",
     "discover {run} --joint paper:stiffness=-1": "stiffness",
-    "discover {run} --output theta": "alpha",
     "discover {run} --Ts 0.002 --time t": "--Ts",
     "discover {run} --Ts -1": "--Ts",
     "discover {run} --Ts 0.004": "Ts",
@@ -349,6 +348,31 @@ def search(monkeypatch: pytest.MonkeyPatch) -> FakeSearch:
     fake = FakeSearch()
     monkeypatch.setattr(rf, "discover", fake)
     return fake
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "channels"),
+    [
+        (("t", "voltage", "theta"), "", ("theta",)),
+        (("t", "voltage", "Alpha [rad]"), "", ("alpha",)),
+        (("t", "voltage", "speed"), "", ("speed",)),
+        (("t", "voltage", "theta"), "--joint quanser_2010:arm=1", ("theta",)),
+        (NAMES, "", ("theta", "alpha")),
+        (NAMES, "--output theta", ("theta",)),
+        (NAMES, "--output alpha=theta", ("alpha",)),
+        (NAMES, "--joint paper:sensors=alpha", ("alpha",)),
+    ],
+)
+def test_a_file_with_one_sensor_has_its_joint(
+    names, options, channels, run, search, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(terminal, "print_discovery", lambda _: None)
+    table = DEMO[:400, [*range(len(names) - 1), 3 if names[-1].lower().startswith("alpha") else 2]]
+    file = write(tmp_path / "one.csv", DEMO[:400] if names == NAMES else table, names)
+    status, _, err = run("discover", file, *options.split())
+    assert status == 0, err
+    ((model, train, _),) = search.calls
+    assert model.mechanism.channels == channels and train[0].channels == channels
 
 
 def test_several_files_validate_each_other(run, search, recorded, tmp_path) -> None:

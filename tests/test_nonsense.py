@@ -120,6 +120,8 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "basis.Volterra": (basis.Volterra, {"bank": basis.Delays(3)}),
     "save_csv": (save_csv, {"recording": RUN, "path": "never-made"}),
     "metrics.rmse": (metrics.rmse, {"y": Y, "y_hat": Y}),
+    "joints.paper": (joints.paper, {}),
+    "joints.quanser_2010": (joints.quanser_2010, {}),
     "noise": (excitation.noise, {"N": 100, "Ts": 0.01}),
     "multisine": (excitation.multisine, {"N": 100, "Ts": 0.01}),
     "prbs": (excitation.prbs, {"N": 100, "Ts": 0.01}),
@@ -289,7 +291,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("fleet", "degres"): [(True, "did you mean degrees")],
     ("load", "source"): [(None, "NoneType was given"), (3, "int was given")],
     ("load, from a frame", "counts"): [(c, "`counts` must be the counts of one turn") for c, _ in NO_COUNT],
-    ("load, resampled", "Ts"): [(0.02, "`resample` and `Ts` were both given"), (NAN, "both given")],
+    ("load, resampled", "Ts"): [(0.02, "`resample` and Ts=0.02 were both given"), (NAN, "both given")],
     ("enable_fast_loops", "limit"): COUNTS,
     ("enable_compilation_cache", "folder"): [(3, "must be a path, but is 3"), (True, "is True")],
     ("explore", "recordings"): NO_RECORDINGS,
@@ -411,6 +413,13 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         (["a", "b"], "2 names for 1 models"),
     ],
     ("compare_plot", "seconds"): [(NAN, "nan"), (-1, "-1")],
+    ("joints.paper", "sensors"): [
+        ("beta", "one or several of 'theta', 'alpha', 'speed', but is 'beta'"),
+        ((), "but is ''"),
+        (3, "list of names, but is 3"),
+        ("theta+theta", "but is 'theta.theta'"),
+    ],
+    ("joints.quanser_2010", "sensors"): [(["x"], "but is 'x'")],
     ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
 }
 

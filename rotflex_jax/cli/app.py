@@ -119,7 +119,7 @@ def discover(
     given.check_distinct(files, [*(held_out or []), *(test or [])])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
-    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint, columns)))
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers, calibrate)
         return
@@ -152,7 +152,7 @@ def compare(
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."
         )
-    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint, columns)))
     names = methods if methods is None else methods.split(",")
     from rotflex_jax.compare import QUICK
     from rotflex_jax.compare.method import selected_methods

@@ -267,8 +267,8 @@ def load(
     accepted = acceptable(accept)
     if resample is not None and Ts is not None:
         raise InputError(
-            f"Arguments `resample` and `Ts` were both given ({shown(resample)}, {shown(Ts)}), but resampling "
-            "needs the times of the samples, and Ts stands in their place; leave one of the two out."
+            f"Argument `resample` and Ts={shown(Ts)} were both given, but resampling "
+            "needs the times of the samples, and that period stands in their place; leave one of the two out."
         )
     if is_foreign(source):
         names = list(outputs) if isinstance(outputs, Mapping) else outputs
