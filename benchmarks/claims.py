@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import scipy.stats
+
 RESULTS = Path(__file__).resolve().parent / "results"
 
 # Name -> the text that stands between the marks of that name.
@@ -175,6 +177,44 @@ def arena_nothing() -> str:
 def arena_alarms() -> str:
     """How many of them raised an alarm."""
     return str(sum(bool(r["rounds"]) for r in records(hidden=False)))
+
+
+def most(k: int, n: int) -> float:
+    """The largest share of which k of n or fewer would be seen in one case of twenty.
+
+    The upper end of the exact one-sided 95 % interval of a share.
+
+    Source: C. J. Clopper and E. S. Pearson, Biometrika 26, 1934.
+
+    >>> round(most(0, 116), 4), round(most(3, 60), 4)
+    (0.0255, 0.1242)
+    """
+    return float(scipy.stats.beta.ppf(0.95, k + 1, n - k)) if k < n else 1.0
+
+
+def _at_most(k: int, n: int) -> str:
+    """That share in per cent, rounded up."""
+    return f"{math.ceil(1000 * most(k, n)) / 10:.1f}"
+
+
+@named
+def arena_alarm_bound() -> str:
+    """The share of alarms that is not excluded [%]."""
+    return _at_most(int(arena_alarms()), int(arena_nothing()))
+
+
+@named
+def arena_missed_bound() -> str:
+    """The share of missed effects that is not excluded [%]."""
+    found, count = int(arena_inside()), len(records())
+    return _at_most(count - found, count)
+
+
+@named
+def arena_overlooked_bound() -> str:
+    """The share of effects outside of the catalogue called otherwise that is not excluded [%]."""
+    found, count = int(arena_unexplained()), int(arena_outside())
+    return _at_most(count - found, count)
 
 
 @named

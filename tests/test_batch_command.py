@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rotflex_jax.cli import app
+from rotflex_jax.errors import InputError
 from rotflex_jax.runtime import xla
 from rotflex_jax.text.numbers import digits
 
@@ -54,6 +55,18 @@ def test_every_file_is_searched_by_itself(run) -> None:
     assert "4 of 4: run_2: found coulomb@hub" in err
     assert Path("rotflex-each/summary.html").exists()
     assert "rotflex-each/summary.html" in out
+
+
+def test_searches_by_themselves_have_the_options_of_a_search(run, monkeypatch) -> None:
+    batch, given = importlib.import_module("rotflex_jax.batch"), []
+
+    def fleet(*_, search, **options):
+        given.append(search.keywords)
+        raise InputError("Enough.")
+
+    monkeypatch.setattr(batch, "fleet", fleet)
+    run("discover run_0.csv run_1.csv --each --calibrate 0.5")
+    assert given == [{"calibrate_seconds": 0.5}]
 
 
 def test_json_on_stdout_stands_alone_and_the_folder_can_be_chosen(run) -> None:

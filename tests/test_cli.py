@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax.cli import app, terminal
+from rotflex_jax.cli import app, main, terminal
 from rotflex_jax.data.datasets import DATASETS
 from rotflex_jax.discover.assessment import assess
 from rotflex_jax.discover.result import RunErrors
@@ -133,7 +133,6 @@ REFUSED = {
     "discover {run} --joint paper:mass=1": "mass",
     "discover {run} --joint paper:stiffness=soft": "stiffness",
     "discover {run} --joint paper:stiffness=-1": "stiffness",
-    "discover {run} --output theta": "alpha",
     "discover {run} --Ts 0.002 --time t": "--Ts",
     "discover {run} --Ts -1": "--Ts",
     "discover {run} --Ts 0.004": "Ts",
@@ -352,6 +351,31 @@ def search(monkeypatch: pytest.MonkeyPatch) -> FakeSearch:
     return fake
 
 
+@pytest.mark.parametrize(
+    ("names", "options", "channels"),
+    [
+        (("t", "voltage", "theta"), "", ("theta",)),
+        (("t", "voltage", "Alpha [rad]"), "", ("alpha",)),
+        (("t", "voltage", "speed"), "", ("speed",)),
+        (("t", "voltage", "theta"), "--joint quanser_2010:arm=1", ("theta",)),
+        (NAMES, "", ("theta", "alpha")),
+        (NAMES, "--output theta", ("theta",)),
+        (NAMES, "--output alpha=theta", ("alpha",)),
+        (NAMES, "--joint paper:sensors=alpha", ("alpha",)),
+    ],
+)
+def test_a_file_with_one_sensor_has_its_joint(
+    names, options, channels, run, search, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(terminal, "print_discovery", lambda _: None)
+    table = DEMO[:400, [*range(len(names) - 1), 3 if names[-1].lower().startswith("alpha") else 2]]
+    file = write(tmp_path / "one.csv", DEMO[:400] if names == NAMES else table, names)
+    status, _, err = run("discover", file, *options.split())
+    assert status == 0, err
+    ((model, train, _),) = search.calls
+    assert model.mechanism.channels == channels and train[0].channels == channels
+
+
 def test_several_files_validate_each_other(run, search, recorded, tmp_path) -> None:
     """Unless --split or --held-out says otherwise; a file that has no say is passed on as such."""
     other, third = (write(tmp_path / name, DEMO[:400]) for name in ("other.csv", "third.csv"))
@@ -513,3 +537,17 @@ def test_discover_on_the_demo_recording(run, tmp_path: Path, monkeypatch: pytest
     assert (turn["effect"], turn["port"]) in {(effect.name, port) for effect, port in pairs}
     assert turn["held_out_rmse_windows"]["theta"] < found["baseline"]["held_out_rmse_windows"]["theta"]
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [(None, "3"), ("0", "0")])
+def test_remarks_of_the_compiler_do_not_reach_the_terminal(
+    chosen: str | None, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["rotflex", "--version"])
+    monkeypatch.setattr("rotflex_jax.cli.stopping.STOP.listen", lambda: None)
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", chosen or "")  # given back afterwards
+    if chosen is None:
+        del os.environ["TF_CPP_MIN_LOG_LEVEL"]
+    with pytest.raises(SystemExit):
+        main()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == expected

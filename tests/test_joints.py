@@ -162,3 +162,47 @@ def test_single_inertia_stands_for_a_linear_axis():
     np.testing.assert_allclose(space.A[1, 1], -203.5 / 95.1, rtol=1e-12)
     np.testing.assert_allclose(space.B[1], 35.15 / 95.1, rtol=1e-12)
     assert axis.channels == ("q",) and axis.effect("motor", "axis").at == "axis"
+
+
+@pytest.mark.parametrize("preset", ["paper", "quanser_2002", "quanser_2010"])
+@pytest.mark.parametrize(
+    ("sensors", "row"), [("theta", 0), ("alpha", 1), ("speed", 2), (["alpha", "speed"], 1)]
+)
+def test_sensors_of_a_joint(preset: str, sensors: str | list[str], row: int) -> None:
+    """The equations are those with both sensors; the output is the row of the state that it says."""
+    both, some = getattr(joints, preset)(), getattr(joints, preset)(sensors=sensors)
+    assert some.channels == ((sensors,) if isinstance(sensors, str) else tuple(sensors))
+    a, b = linearise(both), linearise(some)
+    np.testing.assert_allclose(b.A, a.A)
+    np.testing.assert_allclose(b.C[0], np.eye(4)[row])
+
+
+def test_from_the_deflection_alone_the_torque_constant_is_held() -> None:
+    """Between voltage and deflection there are four numbers: as many as are then free.
+
+    alpha / V = -c3 s / (s^3 + c2 s^2 + c1 s + c0) / s
+    """
+    alone = joints.paper(sensors="alpha", hub_damping=0.004, joint_damping=0.003)
+    names = alone.free_names
+    assert "hub.motor.torque_constant" not in names
+    assert "hub.motor.torque_constant" in joints.paper(sensors="speed").free_names
+
+    def coefficients(mechanism) -> np.ndarray:
+        linear = linearise(mechanism)
+        # The angle itself has no say in the deflection.
+        A, B, C = linear.A[1:, 1:], linear.B[1:], linear.C[:, 1:]
+        s = 1j * np.array([2.0, 11.0, 40.0])
+        return np.concatenate([[*(C @ np.linalg.solve(x * np.eye(3) - A, B)).ravel()] for x in s])
+
+    def rank(free) -> int:
+        values = dict(zip(alone.parameter_names, alone.values, strict=True))
+        columns = []
+        for name in free:
+            up, down = (coefficients(alone.with_values({name: values[name] * f})) for f in (1.001, 0.999))
+            slope = (up - down) / 0.002
+            columns.append(np.concatenate([slope.real, slope.imag]))
+        J = np.array(columns)
+        return int(np.linalg.matrix_rank(J / np.linalg.norm(J, axis=1, keepdims=True), tol=1e-6))
+
+    assert rank(names) == len(names) == 4
+    assert rank((*names, "hub.motor.torque_constant")) == 4

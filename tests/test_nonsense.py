@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import rotflex_jax as rf
@@ -17,6 +18,7 @@ from rotflex_jax.discover.probabilities import Probabilities
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT
+from rotflex_jax.runtime import xla
 
 NAN, INF = math.nan, math.inf
 N = 200
@@ -26,6 +28,7 @@ Y = rf.simulate(JOINT, U, 0.002) + 1e-4 * np.random.default_rng(0).normal(size=(
 RUN = rf.Recording(u=U, y=Y, Ts=0.002)
 A, B = RUN.split(0.7)
 MODEL = Model(JOINT)
+FRAME = pd.DataFrame({"t": 0.002 * np.arange(N), "voltage": U, "theta": Y[:, 0], "alpha": Y[:, 1]})
 SERIES = basis.Volterra(basis.Delays(3))
 LIMITS = rf.Limits(voltage=5.0)
 NOISE = {"theta": 1e-3, "alpha": 1e-3}
@@ -71,6 +74,10 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "fleet": (rf.fleet, {"joint": JOINT, "recordings": [RUN], "folder": "never-made", "workers": 0}),
     "load": (rf.load, {"source": "no-such.csv"}),
+    "load, from a frame": (rf.load, {"source": FRAME, "outputs": ["theta", "alpha"]}),
+    "load, resampled": (rf.load, {"source": FRAME, "outputs": ["theta", "alpha"], "resample": "auto"}),
+    "enable_fast_loops": (xla.enable_fast_loops, {}),
+    "enable_compilation_cache": (xla.enable_compilation_cache, {}),
     "explore": (rf.explore, {"model": MODEL, "recordings": RUN}),
     "Limits": (rf.Limits, {"voltage": 5.0}),
     "Exponential": (rf.Exponential, {}),
@@ -115,6 +122,8 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Probabilities.credible": (Probabilities((), {}, 0.1).credible, {}),
     "save_csv": (save_csv, {"recording": RUN, "path": "never-made"}),
     "metrics.rmse": (metrics.rmse, {"y": Y, "y_hat": Y}),
+    "joints.paper": (joints.paper, {}),
+    "joints.quanser_2010": (joints.quanser_2010, {}),
     "noise": (excitation.noise, {"N": 100, "Ts": 0.01}),
     "multisine": (excitation.multisine, {"N": 100, "Ts": 0.01}),
     "prbs": (excitation.prbs, {"N": 100, "Ts": 0.01}),
@@ -145,6 +154,7 @@ PROCESS_NOISE = [
     (1e-6, "but is 1e-06"),
 ]
 NO_NUMBER = [(NAN, "nan"), ("a", "'a'"), (None, "None")]
+NO_COUNT = [(0.5, ""), (True, ""), ("many", ""), (NAN, ""), ([1], "")]
 COUNTS = [(0, "is 0"), (1.5, "is 1.5"), (NAN, "is nan"), (-1, "is -1"), ("many", "is 'many'")]
 
 BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
@@ -193,6 +203,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("discover", "rounds"): [(-1, "is -1"), (1.5, "is 1.5"), (NAN, "is nan"), ("all", "is 'all'")],
     ("discover", "window_seconds"): NO_SECONDS,
     ("discover", "calibrate_seconds"): [(-1, "is -1"), (NAN, "is nan"), (INF, "is inf"), (None, "is None")],
+    ("discover", "resume"): [(3, "path of a file is needed, but 3"), ("no.json", "cannot be read")],
     ("discover", "progress"): NO_PROGRESS,
     ("learn_torque", "model"): NO_MODEL,
     ("learn_torque", "train"): [*NO_RECORDINGS, *TOO_SHORT],
@@ -281,6 +292,10 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("fleet", "progress"): NO_PROGRESS,
     ("fleet", "degres"): [(True, "did you mean degrees")],
     ("load", "source"): [(None, "NoneType was given"), (3, "int was given")],
+    ("load, from a frame", "counts"): [(c, "`counts` must be the counts of one turn") for c, _ in NO_COUNT],
+    ("load, resampled", "Ts"): [(0.02, "`resample` and Ts=0.02 were both given"), (NAN, "both given")],
+    ("enable_fast_loops", "limit"): COUNTS,
+    ("enable_compilation_cache", "folder"): [(3, "must be a path, but is 3"), (True, "is True")],
     ("explore", "recordings"): NO_RECORDINGS,
     ("Limits", "voltage"): [(NAN, "given as nan"), ("a", "given as 'a'"), (INF, "given as inf")],
     ("Limits", "slew"): [(NAN, "given as nan"), (0, "given as 0")],
@@ -292,9 +307,9 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("SmoothRK4", "width"): NO_SECONDS,
     ("SmoothRK4", "substeps"): COUNTS,
     ("Mechanism", "coordinates"): [
-        (None, "given as None"),
-        (3, "given as 3"),
-        ("a", "a list is needed"),
+        (None, "is None"),
+        (3, "is 3"),
+        ("a", "must be a list of names, but is 'a'"),
         ((), "no coordinates"),
     ],
     ("Mechanism", "ports"): [(None, "given as None"), ({"p": (NAN,)}, "one number per coordinate")],
@@ -315,6 +330,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         ({"x": 1}, "names 'x', but the recording has the channels theta, alpha"),
         (3, "is 3"),
     ],
+    ("Recording", "remarks"): [(3, "list of findings, but has 3"), ("ab", "has 'ab'"), ([1], "has 1")],
     ("Recording", "continues"): [(3, "the recording before this one, but is 3")],
     ("Recording", "constants"): [(3, "is 3"), ({"a": NAN}, "the value nan")],
     ("Recording", "channels"): [(3, "must be words"), ((1, 2), "must be words")],
@@ -392,6 +408,12 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("keep_programs", "folder"): [(3, "is 3"), (None, "is None"), (__file__, "is a file")],
     ("compare_plot", "recording"): [("x", "x|recording"), (None, "None|recording")],
     ("compare_plot", "model"): [("x", "x|mechanism|model"), (None, "None|mechanism|model")],
+    ("compare_plot", "labels"): [
+        ("a", "`labels` must be a list of names, but is 'a'"),
+        (3, "is 3"),
+        ([1], "is a list"),
+        (["a", "b"], "2 names for 1 models"),
+    ],
     ("compare_plot", "seconds"): [(NAN, "nan"), (-1, "-1")],
     ("Probabilities.credible", "share"): [
         (0, "0, but it must be above 0|0"),
@@ -399,6 +421,13 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         (NAN, "nan"),
         ("most", "most"),
     ],
+    ("joints.paper", "sensors"): [
+        ("beta", "one or several of 'theta', 'alpha', 'speed', but is 'beta'"),
+        ((), "but is ''"),
+        (3, "list of names, but is 3"),
+        ("theta+theta", "but is 'theta.theta'"),
+    ],
+    ("joints.quanser_2010", "sensors"): [(["x"], "but is 'x'")],
     ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
 }
 
@@ -426,7 +455,7 @@ def test_nonsense_is_refused(
 
 
 def test_every_public_function_is_in_the_table() -> None:
-    settings = {"enable_compilation_cache", "enable_fast_loops", "live", "performance"}
+    settings = {"live", "performance"}
     functions = {name for name in rf.__all__ if inspect.isfunction(getattr(rf, name))} - settings
     inputs = set(excitation.INPUTS)
     assert functions | inputs <= {function for function, _ in BAD}
@@ -437,3 +466,10 @@ def test_whole_numbers_may_be_floats() -> None:
     assert RUN.decimate(2.0).N == RUN.decimate(2).N == 100
     assert RUN.slice(np.int64(0), 60).N == 60
     assert rf.Recording(u=U, y=Y, Ts=np.array([[0.002]]), n_init=np.float64(20)).n_init == 20
+
+
+def test_counts_may_be_a_number_of_numpy() -> None:
+    options = {"outputs": ["theta", "alpha"], "accept": ("units",)}
+    plain = rf.load(FRAME, counts=4096, **options)
+    for counts in (np.int64(4096), np.float32(4096), {"theta": np.int32(4096), "alpha": np.array(4096)}):
+        assert np.array_equal(rf.load(FRAME, counts=counts, **options).y, plain.y)

@@ -266,7 +266,7 @@ def machine(**changes):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"coordinates": "phi"}, r"coordinates were given as 'phi', but a list is needed; write \['phi'\]"),
+        ({"coordinates": "phi"}, r"`coordinates` must be a list of names, but is 'phi'; write \['phi'\]"),
         ({"ports": ["shaft"]}, "ports were given as .* names with one number per coordinate"),
         ({"ports": {"shaft": 1}}, "ports were given as .* names with one number per coordinate"),
         ({"ports": {"shaft": (1, 0)}}, "Port 'shaft' was given 2 entries, but the mechanism has the 1 coord"),
@@ -277,7 +277,7 @@ def machine(**changes):
         ({"outputs": {"angle": ("shaft", "sped")}}, "'position' or 'speed'"),
         ({"outputs": {"angle": ("shaft", "speed", 1)}}, "needs a port, or a port and 'speed'"),
         ({"outputs": {"angle": "wheel"}}, r"needs one of the ports \('shaft',\)"),
-        ({"trusted": "shaft.inertia.inertia"}, "trusted parameters were given as .* a list is needed"),
+        ({"trusted": "shaft.inertia.inertia"}, "`trusted` must be a list of names, but is 'shaft"),
         ({"trusted": ["shaft.inertia"]}, "this mechanism has .*shaft.inertia.inertia"),
     ],
 )

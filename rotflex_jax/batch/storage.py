@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import hashlib
 import json
 import math
 import os
@@ -11,8 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from rotflex_jax import __version__
 from rotflex_jax.batch.code_digest import code_text, of_main
@@ -23,6 +20,7 @@ from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.digest import content, digest_of
 from rotflex_jax.text.files import write_file
 
 RESULTS, MODELS = "recordings", "models"
@@ -40,7 +38,7 @@ def digest_of_search(
     )
     files = [Path(place).read_bytes() for place in places if place.endswith(".py")]
     written = code_text(s for s in subjects(model, search) if of_main(s))
-    return _digest(text.encode(), written.encode(), *files)
+    return digest_of(text.encode(), written.encode(), *files)
 
 
 def digest_of_recording(source: Path | Recording, common: str) -> str:
@@ -50,19 +48,8 @@ def digest_of_recording(source: Path | Recording, common: str) -> str:
         OSError: The file cannot be read.
     """
     if isinstance(source, Recording):
-        labels = (source.Ts, source.channels, source.units, source.input_name, source.input_unit)
-        labels = (*labels, source.n_init, source.start, source.accept, sorted(source.resolution.items()))
-        labels = (*labels, sorted(source.constants.items()))
-        arrays = (np.ascontiguousarray(a).tobytes() for a in (source.u, source.y))
-        return _digest(common.encode(), repr(labels).encode(), *arrays)
-    return _digest(common.encode(), source.read_bytes())
-
-
-def _digest(*parts: bytes) -> str:
-    found = hashlib.sha256()
-    for part in parts:
-        found.update(len(part).to_bytes(8, "big") + part)
-    return found.hexdigest()
+        return digest_of(common.encode(), *content(source))
+    return digest_of(common.encode(), source.read_bytes())
 
 
 def _named(search: Any) -> str:
@@ -90,7 +77,7 @@ def names_of(sources: Sequence[Path | Recording]) -> list[str]:
 def _short(source: Path | Recording, number: int) -> str:
     if isinstance(source, Recording):
         return str(number)
-    return _digest(os.path.realpath(source).encode())[:8]
+    return digest_of(os.path.realpath(source).encode())[:8]
 
 
 def write(folder: Path, record: Record) -> None:

@@ -99,6 +99,7 @@ def discover(
     test: given.Test = None,
     split: given.Share = None,
     calibrate: given.Calibrate = 2.0,
+    resume: given.Continue = None,
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
     save_model: given.ModelFile = None,
@@ -112,23 +113,22 @@ def discover(
 
     Several FILES without --held-out and --split validate each other: each decides on what the others found.
     """
-    refused = {"held-out": held_out, "test": test, "save-model": save_model}
+    refused = {"held-out": held_out, "test": test, "save-model": save_model, "continue": resume}
     check_each(each, {"scheduler": scheduler, "workers": workers}, refused)
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, [*(held_out or []), *(test or [])])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
-    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint, columns)))
     if each:
-        search_each(model, files, columns, share, report, json_file, scheduler, workers)
+        search_each(model, files, columns, share, report, json_file, scheduler, workers, calibrate)
         return
     train, validation = columns.load_all(files), columns.load_all(held_out or [])
     if not validation and (len(train) == 1 or split is not None):
         train, validation = map(list, zip(*(recording.split(share) for recording in train), strict=True))
     no_say = columns.load_all(test or [])
-    _discover(
-        model, train, validation, report, json_file, save_model, test=no_say, calibrate_seconds=calibrate
-    )
+    options = {"calibrate_seconds": calibrate, "resume": resume}
+    _discover(model, train, validation, report, json_file, save_model, test=no_say, **options)
 
 
 @given.reads_files
@@ -152,7 +152,7 @@ def compare(
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."
         )
-    model, columns = columns.of(by_name.model(given.joint_for(files, joint)))
+    model, columns = columns.of(by_name.model(given.joint_for(files, joint, columns)))
     names = methods if methods is None else methods.split(",")
     from rotflex_jax.compare import QUICK
     from rotflex_jax.compare.method import selected_methods

@@ -125,6 +125,14 @@ Calibrate = Annotated[
         help="Report errors also with the offsets of each unseen recording's own first SECONDS; 0: not.",
     ),
 ]
+Continue = Annotated[
+    Path | None,
+    typer.Option(
+        "--continue",
+        metavar="FILE",
+        help="Go on from NAME.stopped.json that a stopped search of the same files has left.",
+    ),
+]
 Share = Annotated[
     float | None,
     typer.Option("--split", metavar="SHARE", help="Share of each FILE to fit, the rest is held out: 0.7."),
@@ -248,6 +256,9 @@ GreyBox = Annotated[
 ]
 
 
+# Joints that can have one sensor alone.
+ONE_SENSOR = ("paper", "quanser_2002", "quanser_2010")
+
 # Substeps within which a smooth input is followed.
 SMOOTH_SUBSTEPS = 4
 
@@ -343,6 +354,21 @@ class Columns:
             "time_unit": self.time_unit,
             "resample": _period(self.resample),
         }
+
+    def sensor_alone(self, file: Path) -> str | None:
+        """The one sensor of a joint that the options name, or that a file has; None where it is not one."""
+        from rotflex_jax.data.files import OTHER_NAMES, read_table
+        from rotflex_jax.joints.rotary_flexible import SENSORS
+
+        if self.outputs:
+            found = [text.partition("=")[0] for text in self.outputs]
+            return found[0] if len(found) == 1 and found[0] in SENSORS else None
+        try:
+            table = read_table(file)
+        except (InputError, OSError):
+            return None  # whoever loads it says why
+        found = [c for c in SENSORS if table.find(c, *OTHER_NAMES.get(c, ())) in table.columns]
+        return found[0] if found and (len(found) == 1 or "alpha" not in found) else None
 
     def load_all(self, files: Sequence[Path]) -> "list[Recording]":
         """The recordings in files, and those of public data sets that are named in the place of a file."""
@@ -470,13 +496,21 @@ def public_name(file: Path) -> str | None:
     return name
 
 
-def joint_for(files: Sequence[Path], joint: str) -> str:
-    """The joint that was given, or that of the public data set where all files are its name."""
+def joint_for(files: Sequence[Path], joint: str, columns: Columns) -> str:
+    """The joint that was given, or that of the public data set where all files are its name.
+
+    A joint of which the files have one sensor alone becomes one with that sensor.
+    """
     from rotflex_jax.data.registry import DATASETS
 
     names = {public_name(file) for file in files}
     name = names.pop() if len(names) == 1 else None
-    return DATASETS[name].joint if name is not None and joint == "paper" else joint
+    if name is not None:
+        return DATASETS[name].joint if joint == "paper" else joint
+    sensor = columns.sensor_alone(files[0])
+    if sensor is None or joint.partition(":")[0] not in ONE_SENSOR or "sensors=" in joint:
+        return joint
+    return f"{joint}{',' if ':' in joint else ':'}sensors={sensor}"
 
 
 def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:

@@ -1,5 +1,7 @@
 """`rotflex discover --each`: every file by itself, many at once."""
 
+import functools
+import inspect
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,11 +39,18 @@ def search_each(
     json_file: Path | None,
     scheduler: str | None,
     workers: int | None,
+    calibrate_seconds: float = 2.0,
 ) -> None:
     """Search every file, write the summary, show it."""
     from rotflex_jax.batch import fleet
+    from rotflex_jax.discover import discover
     from rotflex_jax.runtime.xla import enable_fast_start
 
+    # Results of searches as usual are those of `rotflex_jax.fleet` as usual.
+    usual = inspect.signature(discover).parameters["calibrate_seconds"].default
+    options: dict[str, Any] = {}
+    if calibrate_seconds != usual:
+        options["search"] = functools.partial(discover, calibrate_seconds=calibrate_seconds)
     if workers == 0:
         enable_fast_start()  # this process then does the work
     with terminal.progress("Searching") as step:
@@ -53,6 +62,7 @@ def search_each(
             workers=workers,
             split=share,
             progress=lambda line: step(given.as_options(line)),
+            **options,
             **columns.reading(),
         )
     if len(result.failed) == len(files):

@@ -57,7 +57,7 @@ def check(
 ) -> None:
     """Say what is in a recording and what is wrong with it; takes seconds."""
     given.check_distinct(files, [])
-    joint = given.joint_for(files, joint)
+    joint = given.joint_for(files, joint, columns)
     model = by_name.model(joint)
     model, columns = columns.of(model)
     from rotflex_jax.fit.signs import check_signs

@@ -32,7 +32,10 @@ class RoundsSoFar:
             errors = getattr(line, "errors", None)
             if self.file is not None and errors is not None:
                 label = str(getattr(line, "label", ""))
-                self._stages.append({"model": label, "held_out_rmse_windows": dict(errors)})
+                stage = {"model": label, "held_out_rmse_windows": dict(errors)}
+                if found := getattr(line, "kept", None):
+                    stage["search"] = found
+                self._stages.append(stage)
                 self._write(self.file)
             step(line)
 
@@ -45,7 +48,11 @@ class RoundsSoFar:
         except InputError:
             return  # the search is worth more than its trace
         done = len(self._stages) - 1
-        STOP.kept = f"the errors of the model as it is and after {done} finished rounds are in {file}"
+        rounds = "one finished round" if done == 1 else f"{done} finished rounds"
+        STOP.kept = (
+            f"the model as it is and after {rounds} are in {file}: the same command with --continue goes on "
+            "from there"
+        )
 
     def remove(self) -> None:
         """Nothing is kept of a search that has ended."""

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Real
 
+from rotflex_jax.checks import real, shown
 from rotflex_jax.data.binary import table_from_frame, table_from_mat, table_from_npz, table_from_parquet
 from rotflex_jax.data.resampling import resampled
 from rotflex_jax.data.spreadsheet import table_from_xlsx
@@ -264,6 +265,11 @@ def load(
     array([0.01745329])
     """
     accepted = acceptable(accept)
+    if resample is not None and Ts is not None:
+        raise InputError(
+            f"Argument `resample` and Ts={shown(Ts)} were both given, but resampling "
+            "needs the times of the samples, and that period stands in their place; leave one of the two out."
+        )
     if is_foreign(source):
         names = list(outputs) if isinstance(outputs, Mapping) else outputs
         return from_foreign(source, names, units, Ts, accepted)
@@ -308,7 +314,7 @@ def load(
     if resample is None:
         start, period = _timing(table, clock, time, Ts, time_unit, len(u), "units" in accepted)
     else:
-        t = _stamps(table, clock, Ts, time_unit, len(u), "units" in accepted)
+        t = _stamps(table, clock, time_unit, len(u), "units" in accepted)
         at = f"{table.label}: the time {clock!r}", table.where, table.first
         start, period, u, together, told = resampled(t, u, together, resample, *at)
         remarks.append(told)
@@ -426,10 +432,10 @@ def _counts(counts: Any, channels: Sequence[str], degrees: bool) -> dict[str, fl
                 f"Argument `counts` names the channel {channel!r}, but the recording has "
                 f"{', '.join(channels)}; name one of these."
             )
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value < 1e12:
+        if not 1 <= real(value) < 1e12:
             raise InputError(
-                f"Argument `counts` must be the counts of one turn, a number from 1 on, but is {value!r}; "
-                "give for instance 4096, four times the lines of an encoder that is counted at every edge."
+                f"Argument `counts` must be the counts of one turn, a number from 1 on, but is {shown(value)}"
+                "; give for instance 4096, four times the lines of an encoder that is counted at every edge."
             )
     return {channel: float(value) for channel, value in each.items()}
 
@@ -485,18 +491,13 @@ def _check_angle_unit(table: Table, name: str, degrees: bool) -> None:
 
 
 def _stamps(
-    table: Table, name: str, Ts: float | None, time_unit: str | None, samples: int, any_unit: bool
+    table: Table, name: str, time_unit: str | None, samples: int, any_unit: bool
 ) -> Real[np.ndarray, " N"]:
     """The times of all samples [s]."""
     if time_unit is not None and time_unit not in TIME_UNITS:
         raise InputError(
             f"Argument `time_unit` must be one of {', '.join(TIME_UNITS)}, but is {time_unit!r}; give "
             "for instance time_unit='ms'."
-        )
-    if Ts is not None and name not in table.columns:
-        raise InputError(
-            f"Argument `resample` needs the times of the samples, but Ts={Ts:g} was given and {table.label} "
-            "has no column of them; leave `resample` out, or name the column with time=."
         )
     behind = name_and_unit(name)[1].lower()
     unit = time_unit or TIME_WORDS.get(behind, behind if behind in TIME_UNITS else None)
@@ -525,7 +526,7 @@ def _timing(
         if Ts is None:
             table.column("t", "time=, or give the sampling period with Ts=")
         return 0.0, float(Ts or 0.0)
-    t = _stamps(table, name, Ts, time_unit, samples, any_unit)
+    t = _stamps(table, name, time_unit, samples, any_unit)
     label = f"{table.label}: the time {name!r}"
     measured = even_spacing(t, label, table.where, table.first)
     if Ts is not None and abs(measured - Ts) > 0.01 * Ts:

@@ -77,8 +77,11 @@ class Assessment:
     @property
     def criterion(self) -> str:
         """Which criterion decided, as a clause."""
+        unknown = [c for c, times in self.remaining.items() if math.isnan(times)]
         if not self.at_noise:
-            worst = max(self.remaining, key=lambda c: self.remaining[c])
+            if all(times < NEAR_FLOOR for c, times in self.remaining.items() if c not in unknown):
+                return f"the sensor noise of {' and '.join(unknown)} is not known, to judge what is left by"
+            worst = max(set(self.remaining) - set(unknown), key=lambda c: self.remaining[c])
             return f"the error of {worst} in short runs is above {NEAR_FLOOR:g} times the sensor noise"
         if not self.torque_free:
             return (
@@ -154,4 +157,4 @@ def in_noise(remaining: Mapping[str, float]) -> str:
     >>> in_noise({"theta": 1.168, "alpha": 228.6})
     'theta 1.17, alpha 229'
     """
-    return ", ".join(f"{c} {multiple(times)}" for c, times in remaining.items())
+    return ", ".join(f"{c} {multiple(times) or 'an unknown number of'}" for c, times in remaining.items())

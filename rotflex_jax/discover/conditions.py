@@ -9,7 +9,6 @@ import scipy
 from jaxtyping import Bool, Float, Int
 
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.numbers import as_read
 
@@ -125,7 +124,8 @@ def _speed(
     window = 2 * half_width(recording) + 1
     unit = recording.units[recording.channels.index(channel)]
     known = dict(zip(mechanism.channels, mechanism.quantities, strict=True)) if mechanism is not None else {}
-    is_speed = known.get(channel) is Quantity.SPEED or unit.endswith("/s")
+    # The reading of a machine says what it is; without one its unit tells a speed.
+    is_speed = known[channel].derivative > 0 if channel in known else unit.endswith("/s")
     order = 0 if is_speed else 1
     weights = scipy.signal.savgol_coeffs(window, 2, deriv=order, delta=recording.Ts)
     y = recording.channel(channel).astype(float)

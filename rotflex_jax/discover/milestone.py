@@ -1,6 +1,7 @@
 """A line of progress with the validation error of a model that a search has reached."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,8 +19,10 @@ class Milestone(str):
         floor: Channel -> noise of the sensor [unit of the channel].
         units: Channel -> unit in which people read it.
         factors: Channel -> what its own unit is in that one.
+        kept: What a search needs to go on from this model, in plain JSON types; see `checkpoint`.
     """
 
+    kept: dict[str, Any]
     label: str
     errors: dict[str, float]
     floor: dict[str, float]
@@ -53,7 +56,7 @@ def milestone(
     label = with_titles(label)
     listed = ", ".join(f"{c} {read[c][0] * e:.3g} {read[c][1]}" for c, e in by_name.items())
     line = Milestone(f"{label}: short runs from fitted first states leave {listed}")
-    line.label, line.errors = label, by_name
+    line.label, line.errors, line.kept = label, by_name, {}
     line.floor = dict(zip(channels, (float(f) for f in floor), strict=True))
     line.units = {c: unit for c, (_, unit) in read.items()}
     line.factors = {c: factor for c, (factor, _) in read.items()}

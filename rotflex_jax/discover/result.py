@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.discover.assessment import NEAR_FLOOR as NEAR_FLOOR, Assessment, assess
+from rotflex_jax.discover.conditional import ConditionalInterval
 from rotflex_jax.discover.probabilities import Probabilities
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_phrase, with_titles
@@ -279,6 +280,8 @@ class SearchResult:
         test: Recordings that had no say in anything.
         remarks: Parameters of the final model at a bound, or far beyond what the recordings reach.
         probabilities: Of sets of effects and of effects; None for results made by hand.
+        conditional: Parameters whose intervals from predictions and from free runs exclude each other: the
+            model is incomplete, and its intervals hold only under it.
     """
 
     verdict: Verdict
@@ -296,6 +299,7 @@ class SearchResult:
     test: tuple[Recording, ...] = ()
     remarks: tuple[Remark, ...] = ()
     probabilities: Probabilities | None = None
+    conditional: tuple[ConditionalInterval, ...] = ()
 
     @property
     def model(self) -> Model:
@@ -340,6 +344,7 @@ class SearchResult:
             "notes": list(self.notes),
             "remarks": [r.to_dict() for r in self.remarks],
             "probabilities": self.probabilities.to_dict() if self.probabilities else None,
+            "conditional_intervals": [c.to_dict() for c in self.conditional],
             "elapsed_s": self.elapsed_s,
         }
 

@@ -4,11 +4,22 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from rotflex_jax import checks
 from rotflex_jax.discover.bias_correction import correct_discretisation_bias
+from rotflex_jax.discover.checkpoint import (
+    AddedEffect,
+    KeptStage,
+    digest_of_search,
+    kept,
+    not_kept,
+    read_stages,
+    restored,
+)
+from rotflex_jax.discover.conditional import ConditionalInterval, conditional_note, excluding
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.end_state import assess_stages, end_state
 from rotflex_jax.discover.evaluation import (
@@ -16,6 +27,7 @@ from rotflex_jax.discover.evaluation import (
     PairedEstimates,
     difference_notes,
     disagreement,
+    estimates,
     evaluate,
     own_estimates,
     paired_estimates,
@@ -29,6 +41,7 @@ from rotflex_jax.discover.hypothesis import (
     generalisations,
     is_physical,
     parameter_count,
+    without,
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
@@ -61,7 +74,7 @@ from rotflex_jax.discover.stepwise import (
     refit_from,
     remaining_rivals,
 )
-from rotflex_jax.discover.supermodel import EffectLocation, build, checked_candidates, scales
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, checked_candidates, scales
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.base import Effect
@@ -107,12 +120,16 @@ class SearchState:
         merged: The final model with one effect in the place of several, where it has one.
         machine: Calibrations that belong to the machine.
         tests: Score tests of the current model, of predictions and of free runs.
+        resumed: How many of the effects an earlier search has added, which was stopped.
+        digest: Of all that the models depend on.
     """
 
     model: Model
     horizons: Horizons
     say: Progress
     current: ValidatedHypothesis
+    digest: str = ""
+    resumed: int = 0
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
@@ -170,11 +187,15 @@ class SearchState:
         """A validated structure with the parameters of one horizon."""
         return found.free_run if horizon is self.horizons.free_run and found.free_run else found
 
-    def reached(self, label: str) -> None:
-        """Report the error of the current model."""
+    def reached(self, label: str, added: Sequence[AddedEffect] = ()) -> None:
+        """Report the error of the current model, after effects were added."""
         channels, recording = self.model.mechanism.channels, self.validation.problem.dataset.recordings[0]
         units = {c: recording.units[recording.channels.index(c)] for c in channels}
-        self.say(milestone(label, channels, units, best_window_rmse(self.current), self.problem.noise))
+        line = milestone(label, channels, units, best_window_rmse(self.current), self.problem.noise)
+        if (runs := self.current.free_run) is not None:
+            stage = KeptStage(kept(self.current.hypothesis), kept(runs.hypothesis), tuple(added))
+            line.kept = stage.to_dict(self.digest)
+        self.say(line)
 
 
 @one_thread
@@ -190,6 +211,7 @@ def discover(
     rounds: int = ROUNDS,
     window_seconds: float = 2.0,
     calibrate_seconds: float = 2.0,
+    resume: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Discovery:
     """Find the physical effects that a model lacks, and say how sure that is.
@@ -215,13 +237,16 @@ def discover(
         window_seconds: Length of short free runs [s].
         calibrate_seconds: The errors reported as calibrated allow each recording that no fit saw the offsets
             that its own first seconds give [s]; 0 for none.
+        resume: `NAME.stopped.json` that a stopped search of the same recordings has left: the search goes on
+            after the rounds in it, which count among `rounds`.
         progress: Called with a line of text at each stage.
 
     Returns:
         Discovery.
 
     Raises:
-        InputError: No recording, channels that the model lacks, or one that moves against the model.
+        InputError: No recording, channels that the model lacks, or one that moves against the model; a file
+            to go on from that another search has left.
     """
     started, say = time.perf_counter(), checks.progress(progress)
     clear_compilation_caches()
@@ -231,10 +256,16 @@ def discover(
     if candidates is not None:
         candidates = checked_candidates(model.mechanism, candidates)
     trained = listed(train, "train", SHORTEST_TO_FIT)
-    horizons = _prepare(model, trained, _several(validation, "validation"), candidates, window_seconds)
+    held_back = _several(validation, "validation")
+    seen = (*trained, *held_back)
+    horizons = _prepare(model, trained, held_back, candidates, window_seconds)
     evaluation = Evaluation.of(model, horizons, _several(test, "test"), calibrate_seconds)
-    say("fitting the model as it is")
-    state = _fit_as_it_is(model, horizons, say)
+    digest = digest_of_search(model, horizons.prediction.problem.supermodel, window_seconds, seen)
+    if resume is None:
+        say("fitting the model as it is")
+        state = _fit_as_it_is(model, horizons, say, digest)
+    else:
+        state = _as_it_was(model, horizons, say, digest, resume)
     while len(state.scores) < rounds:
         left = len(state.problem.supermodel.candidates) - len(state.scores)
         say(f"round {len(state.scores) + 1}: scoring {left} candidates")
@@ -273,10 +304,12 @@ def _prepare(
             "One recording was given for training and none for validation, but a search decides on data that "
             "no fit has seen; give a second recording, or the two parts of recording.split(0.7)."
         )
+    _check_apart(train, held_back)
     check_signs(model, (*train, *held_back))
     dataset = prepare(model, train, length=padded_length(train), noise_of=held_back)
     wanted = list(search_places(m) if candidates is None else candidates)
     supermodel = build(m, wanted, scales(model, train, dataset.torque_scale))
+    _check_constants(m, supermodel, (*train, *held_back))
     ports = tuple(process_noise_ports(m, 1.0))
     # The super-model has friction contacts at every port, of which few are ever switched on.
     solver = model.solver
@@ -291,21 +324,67 @@ def _prepare(
     return Horizons.of(model, problem, other, window_seconds)
 
 
-def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress) -> SearchState:
+def _check_apart(train: Sequence[Recording], held_back: Sequence[Recording]) -> None:
+    """Refuses data that were fitted in the place of data that no fit has seen."""
+    for k, a in enumerate(train):
+        for b in held_back or train[k + 1 :]:
+            if a is b or (a.Ts == b.Ts and np.array_equal(a.u, b.u) and np.array_equal(a.y, b.y)):
+                raise InputError(
+                    "The same recording was given to fit and to validate, but a search decides on data that "
+                    "no fit has seen; give another recording, or the two parts of recording.split(0.7)."
+                )
+
+
+def _check_constants(m: Mechanism, s: SuperModel, recordings: Sequence[Recording]) -> None:
+    """Refuses constants of effects that the search may add: it fits these."""
+    added = set(s.mechanism.parameter_names) - set(m.parameter_names)
+    for recording in recordings:
+        if known := sorted(added & set(recording.constants)):
+            raise InputError(
+                f"The recording has the constant {known[0]!r}, but the model has no such effect and a search "
+                "fits what it adds; add the effect to the model, or leave the constant out."
+            )
+
+
+def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -> SearchState:
     """The user's model, fitted and validated."""
     h = fit_baseline(horizons.prediction.problem)
     problem = horizons.free_run.problem
     current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
-    state = SearchState(model, horizons, say, current, passed=[current], tried=[current])
+    state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
     return state
 
 
-def _score_candidates(
-    state: SearchState,
-) -> tuple[list[Score], list[CandidateStart], list[CandidateStart]]:
-    """Scores worth a refit, and starts at both horizons: theirs, and effects that contain one that is on."""
-    current, s = state.current, state.problem.supermodel
+def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:
+    """What a search that was stopped had found, validated again."""
+    stages = read_stages(path, digest)
+    say(f"going on after {len(stages) - 1} finished rounds")
+    state = None
+    for stage in stages:
+        try:
+            h = restored(horizons.prediction.problem, stage.prediction)
+            runs = restored(horizons.free_run.problem, stage.free_run)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+            raise not_kept(path) from None
+        before = state.current if state else None
+        found = horizons.validated(h, runs, before)
+        if state is None:
+            state = SearchState(
+                model, horizons, say, found, digest, len(stages) - 1, passed=[found], tried=[found]
+            )
+            state.reached("as it is")
+            if len(stages) > 1:
+                _rank(state)
+        else:
+            _add(state, found, stage.added)
+    assert state
+    return state
+
+
+def _rank(state: SearchState) -> tuple[list[Score], list[Score]]:
+    """Scores of all candidates beside the current model, of predictions and of free runs."""
+    current = state.current
     assert current.free_run
     state.tests = (
         score_test(state.problem, current.hypothesis),
@@ -315,6 +394,15 @@ def _score_candidates(
     if not state.ranking:
         by_runs = {x.location: x.nats for x in runs}
         state.ranking = [(x, by_runs[x.location]) for x in listed]
+    return listed, runs
+
+
+def _score_candidates(
+    state: SearchState,
+) -> tuple[list[Score], list[CandidateStart], list[CandidateStart]]:
+    """Scores worth a refit, and starts at both horizons: theirs, and effects that contain one that is on."""
+    current, s = state.current, state.problem.supermodel
+    listed, runs = _rank(state)
     chosen = promising_at_both(listed, runs, REFITTED)
     known = {x.location for x, _ in chosen}
     further = [c for c in generalisations(s, current.hypothesis) if c.location not in known]
@@ -364,13 +452,10 @@ def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: l
     winner, rivals = choose(candidates, current, data, state.problem.noise)
     if winner is None or winner.location is None:
         return False
-    location = winner.location
-    state.scores[location] = next((s.nats for s in scored if s.location == location), 0.0)
-    state.rivals[location] = [r.location for r in rivals if r.location]
-    state.gains[location] = horizon_gains(winner, current)
-    state.current = dataclasses.replace(winner, location=None, parameter_count=0)
-    state.passed.append(state.current)
-    state.reached(f"+ {location}")
+    nats = next((s.nats for s in scored if s.location == winner.location), 0.0)
+    not_distinguished = tuple(r.location for r in rivals if r.location)
+    added = AddedEffect(winner.location, nats, not_distinguished, horizon_gains(winner, current))
+    _add(state, winner, [added])
     return True
 
 
@@ -382,14 +467,27 @@ def _add_pair(state: SearchState) -> bool:
     state.tried += tried
     if pair is None:
         return False
-    for location, less in pair.members.items():
-        state.scores[location] = next((x.nats for x in state.tests[0].listed if x.location == location), 0.0)
-        state.rivals[location] = pair.rivals[location]
-        state.gains[location] = horizon_gains(pair.found, less)
-    state.current = dataclasses.replace(pair.found, parameter_count=0)
-    state.passed.append(state.current)
-    state.reached("+ " + " + ".join(str(p) for p in pair.members))
+    nats = {x.location: x.nats for x in state.tests[0].listed}
+    _add(
+        state,
+        pair.found,
+        [
+            AddedEffect(p, nats.get(p, 0.0), tuple(pair.rivals[p]), horizon_gains(pair.found, less))
+            for p, less in pair.members.items()
+        ],
+    )
     return True
+
+
+def _add(state: SearchState, found: ValidatedHypothesis, added: Sequence[AddedEffect]) -> None:
+    """One model more, with the effects that led to it."""
+    for effect in added:
+        state.scores[effect.location] = effect.score
+        state.rivals[effect.location] = list(effect.rivals)
+        state.gains[effect.location] = effect.gains
+    state.current = dataclasses.replace(found, location=None, parameter_count=0)
+    state.passed.append(state.current)
+    state.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
 
 
 def _simplify(state: SearchState) -> None:
@@ -466,8 +564,8 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
     m = stages[-1].model.mechanism
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
     explained = assess_stages(stages[0], stages[-1], floor, held_back).is_explained
-    stands_in = {} if explained else _stand_ins(state)
-    rounds = _rounds(state, stages, pairs, remarks, stands_in)
+    rounds = _rounds(state, stages, pairs, remarks, {} if explained else _stand_ins(state))
+    conditional = _conditional(state)
     listed = [s for s, _ in state.ranking]
     verdict, sentence = end_state(stages[0], rounds, stages[-1], floor, listed, held_back)
     return Discovery(
@@ -486,6 +584,8 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         noise_floor=floor,
         elapsed_s=time.perf_counter() - started,
         notes=(
+            *_resumed(state.resumed),
+            *conditional_note(conditional),
             *calibration_notes(problem.supermodel, validated[-1], state.own),
             *difference_notes(problem.supermodel, pairs),
             *state.notes,
@@ -493,7 +593,29 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         ),
         remarks=remarks,
         probabilities=_probabilities(state, verdict is not Verdict.UNEXPLAINED),
+        conditional=conditional,
     )
+
+
+def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
+    """Parameters of the machine on which predictions and free runs of the final structure do not agree."""
+    horizons, s = state.horizons, state.problem.supermodel
+    if (runs := state.current.free_run) is None:
+        return ()
+    own = {s.mechanism.parameter_names[i] for i in state.current.hypothesis.local}
+    each = (
+        [e for e in estimates(at.problem, found.hypothesis) if e.name not in own]
+        for at, found in ((horizons.prediction, state.current), (horizons.free_run, runs))
+    )
+    return excluding(*each)
+
+
+def _resumed(count: int) -> tuple[str, ...]:
+    """That a search went on from what another one had found, in a sentence."""
+    if not count:
+        return ()
+    found = "one round" if count == 1 else f"{count} rounds"
+    return (f"The search went on after {found} of one that was stopped; the time is that of the rest.",)
 
 
 def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stage:
@@ -557,7 +679,14 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
     """Log-likelihood of predictions that an effect gains on validation data [nat]; NaN if unknown."""
     if stage.horizon == "prediction":
         return stage.log_likelihood - before.log_likelihood
-    return state.gains[location][0].gain if location in state.gains else float("nan")
+    if location in state.gains:
+        return state.gains[location][0].gain
+    current, s = state.current, state.problem.supermodel
+    if location not in current.hypothesis.locations:
+        return float("nan")
+    # A calibration of a model whose parameters are those of free runs.
+    less = refit(state.problem, [without(s, current.hypothesis, location)], alternations=1)[0]
+    return current.log_likelihood - validate(state.validation, less, current).log_likelihood
 
 
 def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:

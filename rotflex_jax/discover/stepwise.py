@@ -385,8 +385,8 @@ def assign_calibrations(
     if bare is None:
         return AssignedCalibrations(final, order, own, ())
     note = (
-        f"The training data ask for {' and '.join(map(titled, calibrations))}, but held-out runs are better "
-        "with a model fitted without; left out."
+        f"The training data ask for {' and '.join(map(titled, calibrations))}, but runs over "
+        "validation data are better with a model fitted without; left out."
     )
     return AssignedCalibrations(bare, [p for p in order if p in bare.locations], [], (note,))
 
@@ -444,7 +444,7 @@ def calibration_notes(
             trained, adapted = (", ".join(f"{v:+.3g} {unit}" for v in column) for column in columns)
             out.append(
                 f"{titled(location)} belongs to each recording, not to the machine: "
-                f"{trained} in the training data, {adapted} in the held-out data; it was fitted, "
+                f"{trained} in the training data, {adapted} in the validation data; it was fitted, "
                 f"but not carried over."
             )
     return tuple(out)

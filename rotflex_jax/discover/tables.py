@@ -3,8 +3,12 @@
 import dataclasses
 from enum import StrEnum
 
+import numpy as np
+
 from rotflex_jax.discover.assessment import Grade, grade
+from rotflex_jax.discover.coloured_noise import advice, coloured_sensors
 from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, Stage
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.text.numbers import multiple, plain_number, ratio, readable, unit_text, value_and_interval
 
@@ -181,7 +185,17 @@ def ambiguous_rounds(discovery: SearchResult) -> list[tuple[str, str]]:
 def next_steps(discovery: SearchResult) -> list[str]:
     """What to do now, in plain words."""
     hidden = sum(not r.excited for r in discovery.ranking)
-    return discovery.verdict.next_steps(ambiguous_rounds(discovery), hidden, len(discovery.ranking))
+    steps = discovery.verdict.next_steps(ambiguous_rounds(discovery), hidden, len(discovery.ranking))
+    if discovery.verdict != Verdict.UNEXPLAINED:
+        return steps
+    if discovery.rounds:
+        steps.append(
+            "Take what was found for provisional: what is missing may take its place once it is in the model."
+        )
+    i = max(range(len(discovery.validation)), key=lambda k: discovery.validation[k].N)
+    final = discovery.final
+    coloured = coloured_sensors(final.model, discovery.validation[i], np.asarray(final.simulated[i], float))
+    return [*advice(coloured), *steps]
 
 
 class Outcome(StrEnum):

@@ -6,13 +6,18 @@ arm behind (first deflection negative).
 """
 
 import math
+from collections.abc import Sequence
 
+from rotflex_jax.checks import names, shown
 from rotflex_jax.effects import Inertia, Motor, Spring, Viscous
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.springs import INCH, spring_stiffness
 from rotflex_jax.mechanism import Mechanism
 
 PORTS = {"hub": (1.0, 0.0), "joint": (0.0, 1.0), "arm": (1.0, 1.0)}
+SENSORS = {"theta": ("hub", "position"), "alpha": ("joint", "position"), "speed": ("hub", "speed")}
+"""What may be measured of a joint, and where."""
+_BOTH = ("theta", "alpha")
 
 # SRV02 in high gear: oz in/A and V/kRPM converted, efficiency of the motor times the gearbox's.
 _TORQUE_CONSTANT = 1.088 * 0.2780139 * INCH
@@ -29,6 +34,7 @@ def flexible_joint(
     motor: Motor,
     hub_damping: float = 0.0,
     joint_damping: float = 0.0,
+    sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """A rotary flexible joint of any make: motor at the hub, spring between hub and arm.
 
@@ -37,7 +43,9 @@ def flexible_joint(
 
     Angles and voltage determine torques only up to a common factor, so the arm's inertia is
     trusted, and of the motor everything but its torque constant. Free are hub inertia, stiffness,
-    torque constant and both dampers.
+    torque constant and both dampers. From the deflection alone no scale of the hub's torques follows either,
+    and the torque constant is trusted too: four numbers describe all that is linear between voltage and
+    deflection.
 
     Args:
         hub_inertia: With motor and gears, as the hub feels it [kg m^2].
@@ -46,13 +54,19 @@ def flexible_joint(
         motor: Motor with its gear.
         hub_damping: Viscous damping beside the motor's own [N m s/rad].
         joint_damping: Viscous damping of the deflection [N m s/rad].
+        sensors: What is measured: `theta`, `alpha`, the hub's `speed`; or several, as `"theta+alpha"`.
 
     Returns:
-        Mechanism with the outputs `theta` and `alpha`.
+        Mechanism with these outputs.
+
+    Raises:
+        InputError: No sensor, or another one.
 
     Source: Lagrange's equations; Quanser, Rotary Flexible Joint workbook, 2011.
     """
-    held = [name for name in motor.values if name != "torque_constant"]
+    measured = _measured(sensors)
+    alone = measured == ("alpha",)
+    held = [name for name in motor.values if name != "torque_constant" or alone]
     return Mechanism(
         coordinates=("theta", "alpha"),
         ports=PORTS,
@@ -64,9 +78,19 @@ def flexible_joint(
             Viscous(at="hub", coefficient=hub_damping),
             Viscous(at="joint", coefficient=joint_damping),
         ),
-        outputs={"theta": "hub", "alpha": "joint"},
+        outputs={sensor: SENSORS[sensor] for sensor in measured},
         trusted=("arm.inertia.inertia", *(f"{motor.at}.motor.{name}" for name in held)),
     )
+
+
+def _measured(sensors: str | Sequence[str]) -> tuple[str, ...]:
+    given = tuple(sensors.split("+")) if isinstance(sensors, str) else names(sensors, "sensors")
+    if not given or not set(given) <= set(SENSORS) or len(set(given)) < len(given):
+        raise InputError(
+            f"Argument `sensors` must be one or several of {', '.join(map(repr, SENSORS))}, but is "
+            f"{shown('+'.join(given))}; write for instance sensors='theta'."
+        )
+    return given
 
 
 def paper(
@@ -82,6 +106,7 @@ def paper(
     inductance: float | None = None,
     hub_damping: float = 0.0,
     joint_damping: float = 0.0,
+    sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The joint of the paper "Nonlinear Identification of a Rotary Flexible Joint Experiment".
 
@@ -100,15 +125,18 @@ def paper(
         inductance: [H]; the maker says 0.18 mH. None for a current that follows at once.
         hub_damping: [N m s/rad].
         joint_damping: [N m s/rad].
+        sensors: What is measured; see `flexible_joint`.
 
     Returns:
-        Mechanism with the outputs `theta` and `alpha`.
+        Mechanism with the outputs `theta` and `alpha`, or with those of the sensors given.
 
     Source: That paper's table of parameters; its stiffness is in N m/rad, not N/m as printed.
 
     >>> joint = paper(inductance=0.18e-3)
     >>> joint.channels
     ('theta', 'alpha')
+    >>> paper(sensors="alpha").channels
+    ('alpha',)
     """
     return flexible_joint(
         hub_inertia=hub_inertia,
@@ -125,6 +153,7 @@ def paper(
         ),
         hub_damping=hub_damping,
         joint_damping=joint_damping,
+        sensors=sensors,
     )
 
 
@@ -135,6 +164,7 @@ def quanser_2002(
     hub_anchor: str = "B",
     arm_anchor: int = 2,
     inductance: float | None = None,
+    sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The maker's joint on an SRV02 servo, by the files of 2002.
 
@@ -146,14 +176,15 @@ def quanser_2002(
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
         inductance: [H] or None.
+        sensors: What is measured; see `flexible_joint`.
 
     Returns:
-        Mechanism with the outputs `theta` and `alpha`.
+        Mechanism with the outputs `theta` and `alpha`, or with those of the sensors given.
 
     Source: Quanser, config_servo_exp.m and config_flexjoint.m, 2002.
     """
     stiffness = spring_stiffness(spring, hub_anchor, arm_anchor, preload_only=True)
-    return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance)
+    return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance, sensors=sensors)
 
 
 def quanser_2010(
@@ -163,6 +194,7 @@ def quanser_2010(
     hub_anchor: str = "B",
     arm_anchor: int = 2,
     inductance: float | None = None,
+    sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The maker's joint on an SRV02 servo, by the files of 2010.
 
@@ -172,14 +204,15 @@ def quanser_2010(
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
         inductance: [H] or None.
+        sensors: What is measured; see `flexible_joint`.
 
     Returns:
-        Mechanism with the outputs `theta` and `alpha`.
+        Mechanism with the outputs `theta` and `alpha`, or with those of the sensors given.
 
     Source: Quanser, config_srv02.m and config_rotflex.m, 2010.
     """
     stiffness = spring_stiffness(spring, hub_anchor, arm_anchor)
-    return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance)
+    return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance, sensors=sensors)
 
 
 def arm_inertia(arm: int = 2) -> float:
@@ -242,11 +275,19 @@ def srv02_motor(inductance: float | None = None) -> Motor:
     )
 
 
-def _srv02(arm: int, stiffness: float, *, hub_damping: float, inductance: float | None) -> Mechanism:
+def _srv02(
+    arm: int,
+    stiffness: float,
+    *,
+    hub_damping: float,
+    inductance: float | None,
+    sensors: str | Sequence[str],
+) -> Mechanism:
     return flexible_joint(
         hub_inertia=hub_inertia(),
         arm_inertia=arm_inertia(arm),
         stiffness=stiffness,
         motor=srv02_motor(inductance),
         hub_damping=hub_damping,
+        sensors=sensors,
     )

@@ -68,6 +68,16 @@ def latent_time(before: LatentTorque, after: LatentTorque | None = None) -> Figu
             left.plot(*thinned(t, d), lw=0.9, **style)
             f, size = torque.spectrum(port)
             right.loglog(f, size, lw=1.3, **style)
+        for line in (after or before).periodic(port):
+            right.axvline(line.frequency, color=MUTED, lw=0.9, ls=":", zorder=1)
+            right.annotate(
+                f"{line.frequency:.3g} Hz",
+                (line.frequency, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(2, -9),
+                textcoords="offset points",
+                fontsize="small",
+            )
         low, high = left.get_ylim()
         left.set_ylim(min(low, -floor), max(high, floor))
         left.margins(x=0)

@@ -1,21 +1,22 @@
 """The latent torque as a result: torques with bands, binned curves, spectra."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import scipy
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from rotflex_jax.effects.base import Linear
 from rotflex_jax.errors import InputError
+from rotflex_jax.latent.in_time import Drift, PeriodicTorque, drift, periodic_torques
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import effects_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.colours import FINAL, MUTED
-from rotflex_jax.text.markup import card, picture, table
+from rotflex_jax.text.markup import bullets, card, picture, table
 from rotflex_jax.text.numbers import plain_number
 from rotflex_jax.text.svg import Panel, signals
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 # Bins with fewer samples are left out.
 MIN_SAMPLES_PER_BIN = 8
+# A torque is read in time where it gains at least this [nat]; below it is what the smoother starts from.
+ASKED_FOR = 10.0
 # Number of stays in a bin that the variance over all bins counts as.
 PRIOR_STAYS = 3
 
@@ -234,6 +237,49 @@ class LatentTorque:
         f, density = scipy.signal.welch(own, 1 / self.Ts[number], nperseg=min(4096, max(16, len(own) // 5)))
         return f[1:], np.sqrt(density[1:])
 
+    def periodic(self, port: str) -> tuple[PeriodicTorque, ...]:
+        """Sines of the longest recording that the input has not; see `latent.in_time.periodic_torques`."""
+        own = self._longest()
+        return self._if_there(port, periodic_torques, self.voltage[own], self._period_of(own)) or ()
+
+    def drift(self, port: str) -> Drift | None:
+        """The rise or fall of a torque over the longest recording; None where there is none."""
+        own = self._longest()
+        return self._if_there(port, drift, self._period_of(own))
+
+    def in_time(self) -> list[str]:
+        """What the torques do in time, in sentences: periodic disturbances and slow drifts."""
+        said = []
+        for port in self.ports:
+            for line in self.periodic(port):
+                low, high = line.interval
+                said.append(
+                    f"The torque at the {port} has a sine of {line.frequency:.3g} Hz that the input has not: "
+                    f"amplitude {line.amplitude:.3g} {self.effort} [{low:.3g}, {high:.3g}], a periodic "
+                    f"disturbance (chance of none {line.p_value:.0e})."
+                )
+            if slow := self.drift(port):
+                way = "rises" if slow.change > 0 else "falls"
+                said.append(
+                    f"The torque at the {port} {way} by {abs(slow.change):.3g} {self.effort} over the "
+                    f"recording, a slow drift (chance of none {slow.p_value:.0e})."
+                )
+        return said
+
+    def _longest(self) -> Bool[np.ndarray, " N"]:
+        """Samples of the longest recording."""
+        return self.recording == int(np.argmax(np.bincount(self.recording)))
+
+    def _period_of(self, samples: Bool[np.ndarray, " N"]) -> float:
+        return self.Ts[int(self.recording[samples][0])]
+
+    def _if_there(self, port: str, read: Callable[..., Any], *given: Any) -> Any:
+        """What is read of a torque over the longest recording; None of one that the data do not ask for."""
+        i = self._index(port)
+        if self.gain_nats[port] < ASKED_FOR:
+            return None
+        return read(self.torque[self._longest(), i], *given)
+
     def plot(self, after: "LatentTorque | None" = None) -> "Figure":
         """The torques over speed, without and with the dampers given back, and over position.
 
@@ -263,6 +309,7 @@ class LatentTorque:
                 panel, label = Panel(f"{port} [{self.effort}]", lines), f"{curve.against} [{curve.unit}]"
                 svg = signals(curve.at, [panel], label, height=90)
                 drawn.append(picture(svg, f"Mean torque at the {port} over its speed, with its band."))
+        drawn.append(bullets(self.in_time()))
         return card(
             "Latent torque: what the model would have to be given to follow the measurement",
             table(("port", f"rms [{self.effort}]", "gain [nat]"), rows),
@@ -272,7 +319,7 @@ class LatentTorque:
     def __str__(self) -> str:
         lines = ["Latent torque, root mean square and log-likelihood it gains"]
         lines += [f"  {p}: {self.size(p):.3g} {self.effort}, {self.gain_nats[p]:.0f} nat" for p in self.ports]
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"  {sentence}" for sentence in self.in_time())])
 
 
 def latent_torque_result(

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Real
 
+from rotflex_jax import checks
 from rotflex_jax.checks import shown
 from rotflex_jax.effects.base import Effect, Linear
 from rotflex_jax.effects.labels import effect_label
@@ -69,11 +70,11 @@ class Mechanism:
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - frozen class
-        put("coordinates", validation.names(self.coordinates, "coordinates"))
+        put("coordinates", checks.names(self.coordinates, "coordinates"))
         put("ports", validation.ports(self.ports))
         put("effects", validation.effects(self.effects))
         put("outputs", validation.outputs(self.outputs))
-        put("trusted", frozenset(validation.names(self.trusted, "trusted parameters")))
+        put("trusted", frozenset(checks.names(self.trusted, "trusted")))
         check(self)
         for name in sorted(self.trusted):
             self._must_exist(name)
@@ -240,7 +241,7 @@ class Mechanism:
 
     def trust(self, *names: str) -> "Mechanism":
         """The mechanism with these parameters held constant in fits."""
-        validation.names(names, "trusted parameters")
+        checks.names(names, "names")
         return dataclasses.replace(self, trusted=self.trusted | set(names))
 
     def release(self, *names: str) -> "Mechanism":

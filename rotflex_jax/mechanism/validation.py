@@ -13,18 +13,6 @@ if TYPE_CHECKING:
     from rotflex_jax.mechanism.mechanism import Mechanism
 
 
-def names(given: Any, what: str) -> tuple[str, ...]:
-    """A list of names."""
-    if isinstance(given, str):
-        raise InputError(f"The {what} were given as {given!r}, but a list is needed; write [{given!r}].")
-    listed: tuple[Any, ...] = tuple(given) if isinstance(given, Iterable) else (None,)
-    if not all(isinstance(name, str) for name in listed):
-        raise InputError(
-            f"The {what} were given as {describe(given)}, but a list of names is needed; give one."
-        )
-    return listed
-
-
 def ports(given: Any) -> tuple[tuple[str, tuple[float, ...]], ...]:
     """Name and vector of each port."""
     try:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.checks import names
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
@@ -45,15 +46,16 @@ def compare_plot(
         )
     if not models:
         raise InputError("No model was given to compare with the recording; give one or several after it.")
-    if labels is not None and len(labels) != len(models):
+    named = None if labels is None else names(labels, "labels")
+    if named is not None and len(named) != len(models):
         raise InputError(
-            f"Argument `labels` has {len(labels)} names for {len(models)} models; give one for each."
+            f"Argument `labels` has {len(named)} names for {len(models)} models; give one for each."
         )
     simulators = [simulator(m) for m in models]
-    names = tuple(labels) if labels is not None else default_labels(simulators)
+    shown = default_labels(simulators) if named is None else named
     channels = shared_channels(simulators, recording)
     runs = [
-        (name, _outputs(m, recording, channels, seconds)) for name, m in zip(names, simulators, strict=True)
+        (name, _outputs(m, recording, channels, seconds)) for name, m in zip(shown, simulators, strict=True)
     ]
     from rotflex_jax.models.run_figure import run_figure  # matplotlib is loaded only where it draws
 

@@ -28,6 +28,18 @@ from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.svg import Panel, signals
 
 
+def _known_remarks(given: Any) -> tuple[Finding, ...]:
+    """Findings of whoever made the recording."""
+    listed = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    for entry in listed:
+        if not isinstance(entry, Finding):
+            raise InputError(
+                f"Argument `remarks` must be a list of findings, but has {shown(entry)}; give those "
+                "of another recording (`recording.findings`), or leave it out."
+            )
+    return listed
+
+
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class Recording:
     """One experiment: the input, the outputs and the sampling period, uniformly sampled.
@@ -137,7 +149,7 @@ class Recording:
             },
             "continues": continues,
             "constants": known_constants(constants),
-            "remarks": tuple(remarks),
+            "remarks": _known_remarks(remarks),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)

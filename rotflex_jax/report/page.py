@@ -246,6 +246,7 @@ def _latent_lines(latent: LatentTorqueComparison) -> list[str]:
         before, after = (None if x is None else x.size(port) for x in (latent.before, latent.after))
         line = f"At the {port} the baseline lacks {_size(before, latent.before)}"
         lines.append(line + ("." if after is None else f", the final model {_size(after, latent.before)}."))
+    lines += (latent.after or latent.before).in_time()
     return lines
 
 

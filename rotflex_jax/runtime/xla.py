@@ -19,6 +19,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Num
 from threadpoolctl import ThreadpoolController
 
+from rotflex_jax import checks
+from rotflex_jax.errors import InputError
+
 _OPTION, _LIMIT = "xla_cpu_small_while_loop_byte_threshold", 262144
 FAST_LOOPS_FLAG = f"--xla_backend_extra_options={_OPTION}={_LIMIT}"
 """What `enable_fast_loops` adds to `XLA_FLAGS` unless it is given another limit."""
@@ -51,6 +54,7 @@ def enable_fast_loops(limit: int = _LIMIT) -> bool:
         '--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=262144'
         >>> _ = os.environ.pop("XLA_FLAGS") if kept is None else os.environ.update(XLA_FLAGS=kept)
     """
+    limit = checks.whole(limit, "limit", 1)
     flags = os.environ.get("XLA_FLAGS", "").strip()
     if _OPTION in flags:
         return True
@@ -76,6 +80,10 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
     Returns:
         The folder in use, or None where it cannot be written (then nothing is changed).
     """
+    if not (folder is None or isinstance(folder, str | os.PathLike)):
+        raise InputError(
+            f"Argument `folder` must be a path, but is {checks.shown(folder)}; give for instance 'programs'."
+        )
     import jax
 
     chosen = jax.config.values["jax_compilation_cache_dir"]

@@ -1,0 +1,141 @@
+"""A search that was stopped goes on from the rounds that it had finished, and ends as if it had not been."""
+
+import copy
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rotflex_jax as rf
+from rotflex_jax.cli import main
+from rotflex_jax.cli.rounds_so_far import RoundsSoFar
+from rotflex_jax.effects import CATALOG, Inertia, Motor, Viscous
+from rotflex_jax.errors import InputError
+
+MOTOR = ("torque_constant", "back_emf", "resistance", "gear_ratio", "efficiency")
+SPINDLE = rf.Mechanism(
+    coordinates=["phi"],
+    ports={"shaft": (1,)},
+    effects=[
+        Motor("shaft", torque_constant=0.05, back_emf=0.05, resistance=2.0, gear_ratio=1.0, efficiency=1.0),
+        Inertia(at="shaft", inertia=0.017),
+        Viscous(at="shaft"),
+    ],
+    outputs={"tacho": ("shaft", "speed")},
+    trusted=[f"shaft.motor.{name}" for name in MOTOR],
+)
+PAIRS = [(CATALOG[name], "shaft") for name in ("coulomb", "quadratic_drag")]
+
+
+def spun(N: int = 1500, seed: int = 1) -> rf.Recording:
+    """An inertia of 0.02 kg m^2 with friction that sticks, its speed alone; Euler steps of 0.4 ms."""
+    rng, Ts, inner, level = np.random.default_rng(seed), 0.004, 10, 0.03
+    waves = zip([2.5, 2.0, 1.5, 1.0], [0.23, 0.61, 1.37, 2.9], rng.uniform(0, 6, 4), strict=True)
+    u = sum(a * np.sin(2 * np.pi * f * Ts * np.arange(N) + p) for a, f, p in waves)
+    speed, h, w = np.empty(N), Ts / inner, 0.0
+    for k in range(N):
+        speed[k] = w
+        for _ in range(inner):
+            free = w + h * (0.05 * (u[k] - 0.05 * w) / 2.0 - 0.01 * w) / 0.02
+            held = h * level / 0.02
+            w = 0.0 if abs(free) <= held else free - np.sign(free) * held
+    y = speed + 0.01 * rng.standard_normal(N)
+    return rf.Recording(u=u, y=y, Ts=Ts, channels="tacho", units="rad/s", accept="units")
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory: pytest.TempPathFactory) -> tuple[rf.Discovery, Path]:
+    """A search to its end, and what it would have left after its first round."""
+    folder = tmp_path_factory.mktemp("stopped")
+    rounds, left = RoundsSoFar(folder / "found.json"), folder / "left.json"
+
+    def follow(line: str) -> None:
+        if line.startswith("+ "):
+            assert rounds.file is not None and not left.exists()
+            shutil.copy(rounds.file, left)
+
+    result = rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, progress=rounds.following(follow))
+    rounds.remove()
+    return result, left
+
+
+def test_ends_as_if_it_had_not_been_stopped(searched: tuple[rf.Discovery, Path]) -> None:
+    whole, left = searched
+    said: list[str] = []
+    again = rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, resume=left, progress=said.append)
+    assert (again.verdict, [r.effect for r in again.rounds]) == (whole.verdict, ["coulomb"])
+    for a, b in zip(again.final.estimates, whole.final.estimates, strict=True):
+        assert a.value == pytest.approx(b.value, abs=0.02 * b.std if b.free else 0), a.name
+    assert again.rounds[0].score == whole.rounds[0].score
+    assert again.rounds[0].prediction.gain == pytest.approx(whole.rounds[0].prediction.gain, rel=1e-3)
+    assert [r.effect for r in again.ranking] == [r.effect for r in whole.ranking]
+    # Neither the baseline nor the first round is fitted once more, and the result says so.
+    assert "fitting the model as it is" not in said and not any("round 1" in line for line in said)
+    assert any("went on after one round" in note for note in again.notes)
+    assert not any("went on" in note for note in whole.notes)
+
+
+def test_rounds_found_before_count_among_the_rounds(searched: tuple[rf.Discovery, Path]) -> None:
+    said: list[str] = []
+    found = rf.discover(
+        SPINDLE, *spun().split(0.7), candidates=PAIRS, rounds=1, resume=searched[1], progress=said.append
+    )
+    assert len(found.rounds) == 1 and not any(line.startswith("round") for line in said)
+
+
+@pytest.mark.parametrize("other", ["recording", "model", "candidates", "window"])
+def test_nothing_goes_on_from_another_search(searched: tuple[rf.Discovery, Path], other: str) -> None:
+    model = SPINDLE.trust("shaft.inertia.inertia") if other == "model" else SPINDLE
+    parts = spun(seed=2 if other == "recording" else 1).split(0.7)
+    pairs, seconds = PAIRS[: 1 if other == "candidates" else 2], 1.0 if other == "window" else 2.0
+    with pytest.raises(InputError, match="left by a search of other recordings"):
+        rf.discover(model, *parts, candidates=pairs, window_seconds=seconds, resume=searched[1])
+
+
+def _damaged() -> dict[str, object]:
+    return {
+        "no JSON": "{",
+        "another file": {"schema": 1, "verdict": "found"},
+        "no stages": {"stages": []},
+        "of an older version": {"stages": [{"model": "as it is", "held_out_rmse_windows": {}}]},
+        "a list": [1, 2],
+        "deep": "[" * 100_000,
+    }
+
+
+@pytest.mark.parametrize("kind", _damaged())
+def test_files_that_hold_no_search(kind: str, tmp_path: Path) -> None:
+    path, content = tmp_path / "x.stopped.json", _damaged()[kind]
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(InputError, match=r"holds no models|left by a search"):
+        rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, resume=path)
+
+
+@pytest.mark.parametrize("where", ["z", "x0", "K", "locations", "free", "process_noise", "order"])
+def test_changed_numbers_are_refused(searched: tuple[rf.Discovery, Path], where: str, tmp_path: Path) -> None:
+    written = json.loads(searched[1].read_text())
+    stages = [copy.deepcopy(entry["search"]) for entry in written["stages"]]
+    bad = {"z": [1.0], "x0": [[["nan"]]], "K": None, "locations": [["unknown", "shaft"]], "free": [10**6]}
+    if where == "order":
+        stages.reverse()
+    else:
+        stages[0]["prediction"][where] = bad.get(where, 7)
+    path = tmp_path / "x.stopped.json"
+    path.write_text(json.dumps({"stages": [{"search": stage} for stage in stages]}))
+    with pytest.raises(InputError, match="holds no models that a search can go on from"):
+        rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, resume=path)
+
+
+def test_a_file_that_is_not_there() -> None:
+    with pytest.raises(InputError, match=r"cannot be read .No such file"):
+        rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, resume="gone.stopped.json")
+
+
+def test_option_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "run.csv"
+    file.write_text("t,u,y\n0,0,0\n")
+    with pytest.raises(SystemExit) as end:
+        main(["discover", str(file), "--each", "--continue", "x.stopped.json"])
+    assert end.value.code == 2 and "--continue and --each" in capsys.readouterr().err

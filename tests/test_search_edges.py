@@ -1,0 +1,72 @@
+"""What a search refuses before it works, and numbers that it gives in rare cases too."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from test_resume import PAIRS, SPINDLE, spun
+
+import rotflex_jax as rf
+from rotflex_jax.discover import search
+from rotflex_jax.discover.assessment import NEAR_FLOOR, Assessment, in_noise
+from rotflex_jax.errors import InputError
+
+NAN = float("nan")
+
+
+def again(recording: rf.Recording) -> rf.Recording:
+    """The same numbers, read once more."""
+    return dataclasses.replace(recording, u=recording.u.copy(), y=recording.y.copy(), source="again.csv")
+
+
+@pytest.mark.parametrize("how", ["the same", "read twice", "as training alone", "one of several"])
+def test_data_that_were_fitted_validate_nothing(how: str) -> None:
+    a, b = spun().split(0.5)
+    train, validation = {
+        "the same": (a, a),
+        "read twice": (a, again(a)),
+        "as training alone": ([a, again(a)], None),
+        "one of several": ([a, b], [spun(seed=2), again(b)]),
+    }[how]
+    with pytest.raises(InputError, match="The same recording was given to fit and to validate"):
+        rf.discover(SPINDLE, train, validation, candidates=PAIRS)
+
+
+def test_a_constant_of_what_a_search_may_add_is_refused() -> None:
+    a, b = (dataclasses.replace(r, constants={"shaft.coulomb.level": 0.03}) for r in spun().split(0.7))
+    with pytest.raises(InputError, match=r"'shaft\.coulomb\.level', but the model has no such effect"):
+        rf.discover(SPINDLE, a, b, candidates=PAIRS)
+    # One of another machine says nothing here.
+    other = [dataclasses.replace(r, constants={"belt.spring.stiffness": 3.0}) for r in (a, b)]
+    assert rf.discover(SPINDLE, *other, candidates=PAIRS, rounds=0).rounds == ()
+
+
+def test_without_known_noise_the_criterion_says_so() -> None:
+    known = Assessment({}, {"theta": NEAR_FLOOR - 0.1, "alpha": NAN}, 0.0)
+    assert not known.is_explained
+    assert known.criterion == "the sensor noise of alpha is not known, to judge what is left by"
+    assert "theta and alpha" in Assessment({}, {"theta": NAN, "alpha": NAN}, 0.0).criterion
+    # A channel that is above its noise decides, wherever it stands.
+    for remaining in ({"theta": NAN, "alpha": 2.0}, {"alpha": 2.0, "theta": NAN}):
+        assert Assessment({}, remaining, 0.0).criterion.startswith("the error of alpha in short")
+    assert in_noise({"theta": 1.2, "alpha": NAN}) == "theta 1.20, alpha an unknown number of"
+
+
+def test_a_calibration_has_its_gain_at_either_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The voltage is 0.3 V off in the machine; where free runs give the parameters, its gain is no null."""
+    run = spun()
+    parts = dataclasses.replace(run, u=run.u - 0.3).split(0.7)
+    model = SPINDLE + rf.effects.Coulomb(at="shaft")
+    found = {}
+    for horizon in ("prediction", "free_run"):
+        monkeypatch.setattr(search, "runs_clearly_better", lambda *_, h=horizon: h == "free_run")
+        found[horizon] = rf.discover(model, *parts, candidates=PAIRS[1:], rounds=0)
+        assert found[horizon].final.horizon == horizon
+    gains = {}
+    for horizon, result in found.items():
+        (offset,) = [r for r in result.rounds if r.effect == "voltage_offset"]
+        gains[horizon] = offset.to_dict()["evidence"]["held_out_gain_nats"]
+        assert offset.parameters["offset"].value == pytest.approx(0.3, abs=0.05)
+    assert math.isfinite(gains["free_run"]) and gains["free_run"] > 0
+    assert np.sign(gains["prediction"]) == np.sign(gains["free_run"])
