@@ -168,15 +168,16 @@ class SuperModel:
         return self.reduced[left_out]
 
     def families(self, candidates: Iterable[Candidate]) -> list[list[Candidate]]:
-        """Candidates by what they add to the equations: states, a contact, a torque, a changed signal."""
+        """Candidates by what they add to the equations: a memory, a contact, a torque, a changed signal.
+
+        Those with linear states of their own (a lag of a sensor, say) are with the changed signals.
+        """
         own = own_states(self.mechanism)
         found: dict[str, list[Candidate]] = {}
         for c in candidates:
             effect = self.mechanism.effects[c.effect]
-            if c.effect in own:
-                kind = "states"
-            elif effect.acts_on != "port":
-                kind = "signal"
+            if c.effect in own or effect.acts_on != "port":
+                kind = "memory" if effect.state_part == "memory" else "signal"
             else:
                 kind = "contact" if effect.dry_contact else "torque"
             found.setdefault(kind, []).append(c)
