@@ -134,6 +134,7 @@ class SuperModel:
         calibrations: Those that were added.
         candidates: By location.
         reduced: Reduced models formed so far, by the effects left out.
+        switched: Those of `active`, by what is on.
     """
 
     baseline: Mechanism
@@ -141,6 +142,7 @@ class SuperModel:
     calibrations: tuple[EffectLocation, ...]
     candidates: dict[EffectLocation, Candidate]
     reduced: dict[frozenset[int], ReducedModel] = dataclasses.field(default_factory=dict)
+    switched: dict[bytes, ReducedModel] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def transform(self) -> Transform:
@@ -156,7 +158,11 @@ class SuperModel:
 
     def active(self, gates: Shaped[np.ndarray, "*batch E"]) -> ReducedModel:
         """The super-model without the candidates whose gates are all zero."""
-        return self.with_family(np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0), ())
+        on = np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0)
+        key = on.tobytes()  # asked for at every run
+        if key not in self.switched:
+            self.switched[key] = self.with_family(on, ())
+        return self.switched[key]
 
     def with_family(self, gates: Shaped[np.ndarray, " E"], family: Iterable[Candidate]) -> ReducedModel:
         """The super-model with no other candidates than a family and those whose gate is not zero."""
