@@ -153,8 +153,8 @@ def forcing(
     return join_chunks(jax.lax.map(here, (x, w, dw)), len(X))
 
 
-def directional(f: Callable[..., jax.Array], primals: Any, tangents: Any) -> jax.Array:
-    """Derivative of `f(*primals)` along tangents, in which None stands for leaves that do not change."""
+def directional(f: Callable[..., Float[Array, "*out"]], primals: Any, tangents: Any) -> Float[Array, "*out"]:
+    """Derivative of `f(*primals)` along tangents, in which None stands for a leaf that does not change."""
     leaves, tree = jax.tree.flatten(primals)
     along = tree.flatten_up_to(tangents)
     moved = [i for i, t in enumerate(along) if t is not None]
