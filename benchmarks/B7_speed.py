@@ -166,6 +166,12 @@ def _search(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     return {"facts": searches(6.0 if chosen.quick else 20.0)}
 
 
+def _waiting(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
+    from speed.waiting import waiting
+
+    return {"facts": waiting(6.0 if chosen.quick else 20.0)}
+
+
 def _fleet(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     from speed.search import fleet
 
@@ -199,6 +205,7 @@ SUBSET: dict[str, Callable[[argparse.Namespace, Any], dict[str, Any]]] = {
     "cold": _cold,
     "devices": _devices,
     "search": _search,
+    "waiting": _waiting,
     "fleet": _fleet,
     "growth": _growth,
 }

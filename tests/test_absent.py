@@ -18,7 +18,7 @@ from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
     RunParameters,
     inactive_sensitivities,
-    predictor_jacobians,
+    linearised_run,
 )
 from rotflex_jax.mechanism.simulate import PredictorStep, read_outputs
 from rotflex_jax.runtime.xla import double_precision
@@ -133,12 +133,13 @@ def found(case: str) -> np.ndarray:
         present = jnp.array(c.present)
         values, gates = jnp.asarray(c.baseline.values), jnp.ones(len(c.baseline.effects))
         mine = RunParameters(values, gates, c.numbers.x0[present], c.numbers.K[present])
-        slopes = jax.jit(predictor_jacobians, static_argnums=(0, 1), compiler_options=ROUGH)
-        A = slopes(c.baseline.structure, SOLVER, mine, c.samples)
-        assert A.shape == (N, len(present), len(present))
-        along = jax.jit(inactive_sensitivities, static_argnums=(0, 1), compiler_options=ROUGH)
-        ways = (jnp.asarray(c.dvalues), jnp.asarray(c.dgates))
-        return np.asarray(along(c.full.structure, SOLVER, c.numbers, c.samples, present, A, *ways))
+        linearised = jax.jit(linearised_run, static_argnums=(0, 1), compiler_options=ROUGH)
+        run = linearised(c.baseline.structure, SOLVER, mine, c.samples)
+        assert run.A.shape == (N, len(present), len(present))
+        along = jax.jit(inactive_sensitivities, static_argnums=(0, 1, 2), compiler_options=ROUGH)
+        inactive = tuple(range(len(c.baseline.effects), len(c.full.effects)))
+        given = (c.numbers, c.samples, present, run, jnp.asarray(c.dvalues), jnp.asarray(c.dgates))
+        return np.asarray(along(c.full.structure, SOLVER, inactive, *given))
 
 
 @pytest.mark.parametrize("case", ["dry friction", pytest.param("memory and current", marks=pytest.mark.slow)])

@@ -9,13 +9,14 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pooch
 import pytest
+from jax.experimental import serialize_executable
 
 import rotflex_jax as rf
 from rotflex_jax.effects import Coulomb, LuGre
@@ -29,7 +30,9 @@ from rotflex_jax.runtime.persistent_jit import (
     clear_compilation_caches,
     keep_programs,
     performance,
+    program_counts,
     programs_folder,
+    release_programs,
     static_key,
 )
 from rotflex_jax.runtime.xla import double_precision
@@ -82,6 +85,43 @@ def test_what_differs_is_another_program(folder: Path) -> None:
     single = program(2.0, np.arange(3, dtype=np.float32))
     assert single.dtype == np.float32
     assert traced == [2.0, 2.0, 3.0, 2.0] and len(files(folder)) == len(program) == 4
+
+
+def test_programs_are_counted_and_one_that_is_loaded_runs_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, before, runs = np.arange(3.0, dtype=np.float32), program_counts(), []
+    load = serialize_executable.deserialize_and_load
+
+    def watched(*given: Any) -> Any:
+        program = load(*given)
+        return lambda *leaves: (runs.append(leaves), program(*leaves))[1]
+
+    monkeypatch.setattr(serialize_executable, "deserialize_and_load", watched)
+    for program in (new(), new()):
+        for _ in range(3):
+            np.testing.assert_array_equal(program(2.0, x), 2 * x)
+    found = program_counts()
+    assert (found.compiled - before.compiled, found.loaded - before.loaded) == (1, 1)
+    assert found.seconds > before.seconds and len(runs) == 3  # one of them to see whether it can
+
+
+def test_programs_not_used_for_longest_leave_the_memory(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(persistent_jit, "MOST_HELD", 6)
+    monkeypatch.setattr(persistent_jit, "LEFT_HELD", 4)
+    release_programs()
+    program, other, x = new(), new(), np.ones(2, np.float32)
+    for slope in range(12):
+        program(float(slope), x)
+        np.testing.assert_array_equal(other(0.5, x), 0.5 * x)  # always in use
+        assert len(persistent_jit._recent) <= 6
+    # 13 programs were made and at most six stay; the one that is always in use was made once.
+    assert len(program) <= 5 and len(other) == 1
+    assert traced.count(0.5) == 1 and len(files(folder)) == 13
+    np.testing.assert_array_equal(program(0.0, x), 0 * x)  # loaded again
+    assert traced.count(0.0) == 1
 
 
 @pytest.mark.parametrize("damage", ["cut", "a bit", "empty", "something else"])

@@ -16,6 +16,7 @@ TITLES = {
     "cold": "From a new process",
     "devices": "Two devices of one processor [s]",
     "search": "A search over the whole catalogue, 20 s at 500 Hz",
+    "waiting": "Waiting for a search that finds two effects, 20 s at 500 Hz",
     "fleet": "`rotflex discover FILES --each`, ten kinds of machine, 20 s at 500 Hz each",
     "growth": "Growth",
 }

@@ -113,6 +113,10 @@ class LikelihoodProblem:
         count = len(s.baseline_free) + len(s.local) + 2 * len(s.baseline.coordinates) + 4
         return _multiple_of_four(count)
 
+    def directions_of(self, h: Hypothesis) -> int:
+        """Directions per pass of the slopes of a hypothesis."""
+        return max(self.direction_count, _multiple_of_four(h.moved))
+
     @property
     def process_noise_range(self) -> tuple[float, float]:
         """Least and largest intensity of process torques that is tried [(N m)^2 s].
@@ -167,8 +171,8 @@ class LikelihoodProblem:
         Directions are filled up to the same few numbers, whatever else is fitted beside a hypothesis: each
         number is compiled once.
         """
-        s, least = self.supermodel, self.direction_count
-        directions = [h.directions(s, max(least, _multiple_of_four(h.moved))) for h in hypotheses]
+        s = self.supermodel
+        directions = [h.directions(s, self.directions_of(h)) for h in hypotheses]
         parameter_sets = [h.parameter_set(s) for h in hypotheses]
         return self.predictor.slopes(parameter_sets, directions, self.windows.index)
 

@@ -44,6 +44,7 @@ def levenberg_marquardt(
     """Fit all hypotheses with whiteners and process noise held; returns them with new whiteners."""
     seen = problem.seen
 
+    # Slopes come with every trial: most steps are taken, and a run alone is not much cheaper.
     def coordinates(h: Hypothesis) -> FitCoordinates:
         return FitCoordinates.of(h, problem.windows)
 
@@ -55,17 +56,11 @@ def levenberg_marquardt(
             equations.append(NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H))
         return equations
 
-    def costs(points: list[_Point]) -> list[float]:
-        es = problem.innovations([p.hypothesis for p in points])
-        ws = [p.whitened(e, seen) for p, e in zip(points, es, strict=True)]
-        return [0.5 * float(np.sum(w**2)) for w in ws]
-
     found = minimise_together(
         linearise,
         [_Point(h) for h in hypotheses],
         REFIT_RULES,
         limit=lambda i: coordinates(hypotheses[i]).step_limit(MAX_COORDINATE_STEP),
-        costs=costs,
         move=lambda p, step: _Point(coordinates(p.hypothesis).moved(p.hypothesis, step)),
         max_steps=max_steps,
     )

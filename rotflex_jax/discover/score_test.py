@@ -27,10 +27,11 @@ from rotflex_jax.fit.problem import each_recording
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.sensitivities import (
+    LinearisedRun,
     RecordingSamples,
     RunParameters,
     inactive_sensitivities,
-    predictor_jacobians,
+    linearised_run,
 )
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -43,9 +44,9 @@ def _run_slopes(
     parameter_set: ParameterSet,
     data: StackedRecordings,
     window: jax.Array,
-) -> jax.Array:
+) -> LinearisedRun:
     def one(values: Any, x0: Any, K: Any, *samples: Any) -> Any:
-        return predictor_jacobians(
+        return linearised_run(
             structure, solver, RunParameters(values, parameter_set.gates, x0, K), RecordingSamples(*samples)
         )
 
@@ -53,25 +54,26 @@ def _run_slopes(
     return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
 
 
-@persistent_jit(static=2, runs_rarely=True)
+@persistent_jit(static=3, runs_rarely=True)
 def _inactive_slopes(
     structure: Mechanism,
     solver: Solver,
+    inactive: tuple[int, ...],
     parameter_set: ParameterSet,
     present: jax.Array,
-    A: jax.Array,
+    run: LinearisedRun,
     directions: Directions,
     data: StackedRecordings,
     window: jax.Array,
 ) -> jax.Array:
-    def one(values: Any, x0: Any, K: Any, A: Any, dvalues: Any, *samples: Any) -> Any:
+    def one(values: Any, x0: Any, K: Any, run: Any, dvalues: Any, *samples: Any) -> Any:
         rest = jnp.broadcast_to(rest_state(structure, np.float64), (len(x0), K.shape[0]))
         numbers = RunParameters(values, parameter_set.gates, rest.at[:, present].set(x0), K)
-        slopes = (present, A, dvalues, directions.gates)
-        return inactive_sensitivities(structure, solver, numbers, RecordingSamples(*samples), *slopes)
+        given = (numbers, RecordingSamples(*samples), present, run, dvalues, directions.gates)
+        return inactive_sensitivities(structure, solver, inactive, *given)
 
     J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0, 0), out_axes=1)(
-        parameter_set.values, parameter_set.x0, parameter_set.K, A, directions.values, *data, window
+        parameter_set.values, parameter_set.x0, parameter_set.K, run, directions.values, *data, window
     )
     return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
 
@@ -112,16 +114,17 @@ def candidate_sensitivities(
         solver = dataclasses.replace(solver, passes=min(solver.passes, contacts + 1))
     with double_precision():
         structure, inputs = active.mechanism.structure, predictor.restrict(current, active)
-        A = _run_slopes(structure, solver, inputs, predictor.on_device(), jnp.asarray(window))
+        linearised = _run_slopes(structure, solver, inputs, predictor.on_device(), jnp.asarray(window))
 
     def run(job: tuple[ReducedModel, InactiveCandidates]) -> np.ndarray:
-        model, (_, parameter_set, d) = job
+        model, (family, parameter_set, d) = job
         along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
         with double_precision():
             present = jnp.array([model.states.index(i) for i in active.states])
             structure, inputs = model.mechanism.structure, predictor.restrict(parameter_set, model)
-            given = (present, A, along, predictor.on_device(), jnp.asarray(window))
-            return np.asarray(_inactive_slopes(structure, solver, inputs, *given))
+            inactive = tuple(model.effects.index(c.effect) for c in family)
+            given = (present, linearised, along, predictor.on_device(), jnp.asarray(window))
+            return np.asarray(_inactive_slopes(structure, solver, inactive, inputs, *given))
 
     jobs = [(s.with_family(current.gates, b.family), b) for b in batches]
     return np.stack(predictor.run_jobs(run, jobs, lambda job: ("probes", active.effects, job[0].effects)))

@@ -11,10 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.batched_predictor import BatchedPredictor, ParameterSet
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
 from rotflex_jax.fit.dataset import Dataset
 from rotflex_jax.fit.windows import Windows
-from rotflex_jax.mechanism.initial_state import DIFFERENCE
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
 
 # Of the fit of a window's first state to a few samples, which determine it well.
@@ -45,50 +44,43 @@ class ShortRuns:
     dataset: Dataset
     windows: Windows
 
-    def outputs(self, run: ParameterSet) -> list[Float[np.ndarray, "_ C"]]:
+    def outputs(self, run: ParameterSet, directions: int) -> list[Float[np.ndarray, "_ C"]]:
         """Outputs of each recording's runs; as measured where a sample does not count.
 
         Args:
             run: Parameters; of its first states (R, W, m) positions and speeds are where a fit starts, and
                 the others are kept. Its gain is not used.
+            directions: Of the compiled slopes: as many as fits of this structure have, one per coordinate of
+                a first state at least.
         """
         run = run._replace(K=np.zeros_like(run.K))
-        y_hat = self.dataset.data.y - self._innovations([run._replace(x0=self._first_states(run))])[0]
+        found = run._replace(x0=self._first_states(run, directions))
+        y_hat = self.dataset.data.y - self.predictor.innovations([found], self.windows.index)[0]
         return [np.asarray(y_hat[r, : recording.N]) for r, recording in enumerate(self.dataset.recordings)]
 
-    def _innovations(self, runs: list[ParameterSet]) -> Float[np.ndarray, "L R N C"]:
-        return self.predictor.innovations(runs, self.windows.index)
-
-    def _first_states(self, run: ParameterSet) -> Float[np.ndarray, "R W m"]:
+    def _first_states(self, run: ParameterSet, directions: int) -> Float[np.ndarray, "R W m"]:
         """First states whose positions and speeds suit the first samples of each window best."""
-        size = self.windows.first_states.shape[-1]
+        size, (R, P) = self.windows.first_states.shape[-1], run.values.shape
+        x0_ways = np.eye(directions, run.x0.shape[-1])
+        x0_ways[size:] = 0.0
+        ways = Directions(np.zeros((directions, R, P)), x0_ways, np.zeros((directions, len(run.gates))))
 
-        def started_at(points: list[_FirstState], change: int | None = None) -> ParameterSet:
+        def started_at(points: list[_FirstState]) -> ParameterSet:
             x0 = run.x0.copy()
             for p in points:
                 x0[p.recording, p.window, :size] = p.state
-                if change is not None:
-                    x0[p.recording, p.window, change] += DIFFERENCE
             return run._replace(x0=x0)
 
-        def head(e: np.ndarray, p: _FirstState) -> np.ndarray:
-            return e[..., p.recording, p.samples, :].reshape(*e.shape[:-3], -1)
-
         def linearise(points: list[_FirstState]) -> list[NormalEquations]:
-            changed = [started_at(points, k) for k in range(size)]
-            e = self._innovations([started_at(points), *changed])
-            rows = (head(e, p) for p in points)
-            return [NormalEquations.of((w[1:] - w[0]).T / DIFFERENCE, w[0]) for w in rows]
-
-        def costs(points: list[_FirstState]) -> list[float]:
-            e = self._innovations([started_at(points)])[0]
-            return [0.5 * float(np.sum(head(e, p) ** 2)) for p in points]
+            # Windows share each run.
+            e, J = self.predictor.slopes([started_at(points)], [ways], self.windows.index)
+            heads = ((J[0, :size, p.recording, p.samples], e[0, p.recording, p.samples]) for p in points)
+            return [NormalEquations.of(slopes.reshape(size, -1).T, w.ravel()) for slopes, w in heads]
 
         found = minimise_together(
             linearise,
             self._rough_states(),
             FIRST_STATE_RULES,
-            costs=costs,
             move=lambda p, step: p._replace(state=p.state + step),
             max_steps=MAX_FIRST_STATE_STEPS,
         )

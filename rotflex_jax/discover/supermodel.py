@@ -134,6 +134,7 @@ class SuperModel:
         calibrations: Those that were added.
         candidates: By location.
         reduced: Reduced models formed so far, by the effects left out.
+        switched: Those of `active`, by what is on.
     """
 
     baseline: Mechanism
@@ -141,6 +142,7 @@ class SuperModel:
     calibrations: tuple[EffectLocation, ...]
     candidates: dict[EffectLocation, Candidate]
     reduced: dict[frozenset[int], ReducedModel] = dataclasses.field(default_factory=dict)
+    switched: dict[bytes, ReducedModel] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def transform(self) -> Transform:
@@ -156,7 +158,11 @@ class SuperModel:
 
     def active(self, gates: Shaped[np.ndarray, "*batch E"]) -> ReducedModel:
         """The super-model without the candidates whose gates are all zero."""
-        return self.with_family(np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0), ())
+        on = np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0)
+        key = on.tobytes()  # asked for at every run
+        if key not in self.switched:
+            self.switched[key] = self.with_family(on, ())
+        return self.switched[key]
 
     def with_family(self, gates: Shaped[np.ndarray, " E"], family: Iterable[Candidate]) -> ReducedModel:
         """The super-model with no other candidates than a family and those whose gate is not zero."""
@@ -168,15 +174,16 @@ class SuperModel:
         return self.reduced[left_out]
 
     def families(self, candidates: Iterable[Candidate]) -> list[list[Candidate]]:
-        """Candidates by what they add to the equations: states, a contact, a torque, a changed signal."""
+        """Candidates by what they add to the equations: a memory, a contact, a torque, a changed signal.
+
+        Those with linear states of their own (a lag of a sensor, say) are with the changed signals.
+        """
         own = own_states(self.mechanism)
         found: dict[str, list[Candidate]] = {}
         for c in candidates:
             effect = self.mechanism.effects[c.effect]
-            if c.effect in own:
-                kind = "states"
-            elif effect.acts_on != "port":
-                kind = "signal"
+            if c.effect in own or effect.acts_on != "port":
+                kind = "memory" if effect.state_part == "memory" else "signal"
             else:
                 kind = "contact" if effect.dry_contact else "torque"
             found.setdefault(kind, []).append(c)

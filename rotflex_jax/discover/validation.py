@@ -140,7 +140,8 @@ class ValidationSet:
         known = (inner or h).initial_state_for(s, on)
         size, same = first.shape[-1], known.shape[1]
         x0[:, :same, size:] = known[..., size:]
-        runs = self.short_runs.outputs(ParameterSet(h.values(s), x0, s.gates(on), h.K))
+        start = ParameterSet(h.values(s), x0, s.gates(on), h.K)
+        runs = self.short_runs.outputs(start, self.problem.directions_of(h))
         return self.window_rmse([runs[i] for i in self.counted])
 
     def window_rmse(self, runs: Sequence[Float[np.ndarray, "_ C"]]) -> Float[np.ndarray, " C"]:
@@ -218,7 +219,7 @@ def validate(
     """Log-likelihood of validation recordings under a trained hypothesis, in blocks.
 
     Physics and process noise are the trained ones. What belongs to one recording alone (first state,
-    calibrations) is fitted to it, by least squares with secant slopes. So is the size of the innovations:
+    calibrations) is fitted to it, by least squares. So is the size of the innovations:
     where no model is complete, their size in training measures how flexible a model is, and a richer model
     would be penalised elsewhere for its smaller size, however well it predicts there.
 
@@ -262,13 +263,10 @@ def adapted_to_recordings(
         prior: For each recording the weight of the squared unconstrained values of its local parameters,
             which are in units of their usual size; zero if None.
     """
-    seen, nudge = problem.seen, 1e-6
+    seen, first = problem.seen, len(h.free)
     weight = np.zeros(len(h.x0)) if prior is None else prior
     coordinates = FitCoordinates(0, len(h.local), h.x0.shape[-1], problem.windows)
     own = [coordinates.of_recording(r) for r in range(len(h.x0))]
-
-    def cost(w: np.ndarray, here: Hypothesis, r: int) -> float:
-        return 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r] ** 2))
 
     def joined(points: list[_OwnStep]) -> Hypothesis:
         step = np.zeros(coordinates.size)
@@ -278,9 +276,9 @@ def adapted_to_recordings(
 
     def linearise(points: list[_OwnStep]) -> list[NormalEquations]:
         here = joined(points)
-        whitened = h.whitener(problem.innovations([here, *_perturbed(here, nudge)]), seen)
-        w, slopes = whitened[0], (whitened[1:] - whitened[0]) / nudge
-        H, g = coordinates.sums(w, slopes)
+        e, J = problem.slopes([here])
+        w = h.whitener(e[0], seen)
+        H, g = coordinates.sums(w, h.whitener(J[0, first : h.moved], seen))
         equations = []
         for p in points:
             r, row = p.recording, own[p.recording]
@@ -288,19 +286,14 @@ def adapted_to_recordings(
             each = np.arange(len(h.local))
             gradient[each] += weight[r] * here.local_z[r]
             curvature[each, each] += weight[r]
-            equations.append(NormalEquations(np.array([cost(w, here, r)]), gradient, curvature))
+            cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r] ** 2))
+            equations.append(NormalEquations(np.array([cost]), gradient, curvature))
         return equations
-
-    def costs(points: list[_OwnStep]) -> list[float]:
-        here = joined(points)
-        w = h.whitener(problem.innovations([here])[0], seen)
-        return [cost(w, here, p.recording) for p in points]
 
     found = minimise_together(
         linearise,
         [_OwnStep(r, np.zeros(len(row))) for r, row in enumerate(own)],
         ADAPTATION_RULES,
-        costs=costs,
         move=lambda p, step: p._replace(step=p.step + step),
         max_steps=MAX_ADAPTATION_STEPS,
     )
@@ -310,17 +303,3 @@ def adapted_to_recordings(
 def _costs(h: Hypothesis, innovations: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Half the squared size of each row of innovations (H, R, N, C); infinite where a run diverges."""
     return np.nan_to_num(0.5 * np.sum(h.whitener(innovations, seen) ** 2, axis=(1, 2, 3)), nan=np.inf)
-
-
-def _perturbed(h: Hypothesis, nudge: float) -> list[Hypothesis]:
-    """The hypothesis with each local parameter and each first state moved a little in every recording."""
-    out = []
-    for k in range(len(h.local)):
-        local_z = h.local_z.copy()
-        local_z[:, k] += nudge
-        out.append(dataclasses.replace(h, local_z=local_z))
-    for k in range(h.x0.shape[-1]):
-        x0 = h.x0.copy()
-        x0[..., k] += nudge
-        out.append(dataclasses.replace(h, x0=x0))
-    return out

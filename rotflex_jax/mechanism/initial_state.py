@@ -62,7 +62,7 @@ def _lexicographic_fit(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> np.
     return x
 
 
-@persistent_jit(static=2)
+@persistent_jit(static=2, runs_rarely=True)
 def _fitted_states(
     structure: Mechanism,
     solver: Solver,

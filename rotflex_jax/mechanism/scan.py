@@ -143,14 +143,29 @@ def state_jacobians(
 def forcing(
     step: StepFunction, X: Float[Array, "N n"], inputs: Any, dinputs: Any, constants: Any, dconstants: Any
 ) -> Float[Array, "N n"]:
-    """`b[k] = df/dw dw[k] + df/dc dc` along the states."""
+    """`b[k] = df/dw dw[k] + df/dc dc` along the states; a tangent that is None is zero and costs nothing."""
     x, w, dw = split_into_chunks((X, inputs, dinputs))
 
     def here(triple: Any) -> jax.Array:
         s, v, dv = triple
-        return jax.jvp(functools.partial(step, s), (v, constants), (dv, dconstants))[1]
+        return directional(functools.partial(step, s), (v, constants), (dv, dconstants))
 
     return join_chunks(jax.lax.map(here, (x, w, dw)), len(X))
+
+
+def directional(f: Callable[..., Float[Array, "*out"]], primals: Any, tangents: Any) -> Float[Array, "*out"]:
+    """Derivative of `f(*primals)` along tangents, in which None stands for a leaf that does not change."""
+    leaves, tree = jax.tree.flatten(primals)
+    along = tree.flatten_up_to(tangents)
+    moved = [i for i, t in enumerate(along) if t is not None]
+
+    def of_moved(*given: jax.Array) -> jax.Array:
+        every = list(leaves)
+        for i, leaf in zip(moved, given, strict=True):
+            every[i] = leaf
+        return f(*tree.unflatten(every))
+
+    return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(along[i] for i in moved))[1]
 
 
 def tangent_recursion(

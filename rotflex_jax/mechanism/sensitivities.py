@@ -25,9 +25,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
 from rotflex_jax.effects.base import Actuation, Gear, Memory
-from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
+from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, stamped
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.scan import forcing, state_jacobians, states, tangent_recursion
+from rotflex_jax.mechanism.scan import directional, forcing, state_jacobians, states, tangent_recursion
 from rotflex_jax.mechanism.simulate import (
     FreeStep,
     PredictorStep,
@@ -82,10 +82,22 @@ class RecordingSamples(NamedTuple):
         return first, (*measured, *restart)
 
 
-def predictor_jacobians(
+class LinearisedRun(NamedTuple):
+    """A run, and how each of its steps answers to a change of the state before it.
+
+    Attributes:
+        X: States.
+        A: Jacobians of the step; entry [k, j] is column j of `A[k]`.
+    """
+
+    X: Float[Array, "*batch N n"]
+    A: Float[Array, "*batch N n n"]
+
+
+def linearised_run(
     structure: Mechanism, solver: Solver, parameters: RunParameters, samples: RecordingSamples
-) -> Float[Array, "N n n"]:
-    """Jacobians of the step `A[k]` along a predictor run.
+) -> LinearisedRun:
+    """States of a predictor run, and the Jacobians of its steps.
 
     Args:
         structure: Without the inactive effects; static.
@@ -97,51 +109,68 @@ def predictor_jacobians(
     _, v, c = prepared_run(structure, solver, parameters.values, parameters.gates, samples.u, samples.Ts)
     x0, measured = samples.started_at(parameters.x0)
     inputs, constants = (v, *measured), (c, parameters.K)
-    return state_jacobians(step, states(step, x0, inputs, constants), inputs, constants)
+    X = states(step, x0, inputs, constants)
+    return LinearisedRun(X, state_jacobians(step, X, inputs, constants))
 
 
 def inactive_sensitivities(
     structure: Mechanism,
     solver: Solver,
+    inactive: tuple[int, ...],
     parameters: RunParameters,
     samples: RecordingSamples,
     active: Integer[Array, " r"],
-    A: Float[Array, "N r r"],
+    run: LinearisedRun,
     dvalues: Float[Array, "D P"],
     dgates: Float[Array, "D E"],
 ) -> Float[Array, "D N C"]:
     """Derivatives of the predicted outputs along effects that are inactive.
 
+    What no inactive effect enters (the matrices of the step, say, if none of them is linear) has no
+    derivative in the program either.
+
     Args:
         structure: With all effects; static.
         solver: Integration rule; static.
+        inactive: Indices of the effects that the directions move; static.
         parameters: Every inactive effect at zero amplitude, or with its gate closed.
         samples: The recording.
         active: Places of the states that do not belong to inactive effects.
-        A: From `predictor_jacobians` without the inactive effects.
+        run: From `linearised_run` without the inactive effects.
         dvalues: Directions in the parameter values.
         dgates: Directions in the gates.
     """
-    step = PredictorStep(structure, solver)
+    step, effects = PredictorStep(structure, solver), structure.effects
+    counts = [len(e.values) for e in effects]
+    own = [sum(counts[:i]) + k for i in inactive for k in range(counts[i])]
+    enters_matrices = any(i in inactive for i, _ in stamped(structure))
+    changes_voltage = any(isinstance(effects[i], Actuation) for i in inactive)
+    switched = any(not effects[i].amplitudes for i in inactive)
 
     def prepared(values: Array, gates: Array) -> Any:
         return prepared_run(structure, solver, values, gates, samples.u, samples.Ts)[1:]
 
     v, c = prepared(parameters.values, parameters.gates)
     x0, measured = samples.started_at(parameters.x0)
-    inputs, constants = (v, *measured), (c, parameters.K)
-    X = states(step, x0, inputs, constants)
-    still = tuple(jnp.zeros_like(a) for a in measured)
+    X = run.X
+    if X.shape[1] < len(x0):  # with the inactive effects' own states, driven by the run
+        X = states(step, x0, (v, *measured), (c, parameters.K))
+    # One by one, so that numbers of other effects have no derivative.
+    scalars = list(parameters.values)
+    inputs, constants = (v, *measured), (c._replace(values=scalars), parameters.K)
 
     def derivative(dv: Array, dg: Array) -> Array:
         direction = (parameters.values, parameters.gates), (dv, dg)
-        dvoltage, dc = jax.jvp(prepared, *direction)[1]
-        dK = jax.tree.map(jnp.zeros_like, parameters.K)
-        b = forcing(step, X, inputs, (dvoltage, *still), constants, (dc, dK))
-        dx = tangent_recursion(A, b[:, active], jnp.zeros_like(x0[active]))
+        still = jax.tree.map(lambda _: None, c)
+        dc = jax.jvp(prepared, *direction)[1][1] if enters_matrices else still
+        dc = dc._replace(values=[dv[i] if i in own else None for i in range(len(scalars))])
+        dc = dc._replace(gates=dg if switched else None)
+        dvoltage = jax.jvp(prepared, *direction)[1][0] if changes_voltage else None
+        b = forcing(step, X, inputs, (dvoltage, *(None for _ in measured)), constants, (dc, None))
+        dx = tangent_recursion(run.A, b[:, active], jnp.zeros_like(x0[active]))
         dX = jnp.zeros_like(X).at[:, active].set(dx)
         read = lambda x, values, gates: read_outputs(structure.with_values(values), gates, x)  # noqa: E731
-        return jax.jvp(read, (X.T, *direction[0]), (dX.T, *direction[1]))[1].T
+        return directional(read, (X.T, scalars, parameters.gates), (dX.T, dc.values, dc.gates)).T
 
     return jax.vmap(derivative)(dvalues, dgates)
 

@@ -11,10 +11,13 @@ another hash. A file carries the hash of its own content; one that is damaged is
 machine code: its folder must not be shared with people who are not trusted.
 """
 
+import collections
 import contextlib
+import ctypes
 import dataclasses
 import enum
 import functools
+import gc
 import hashlib
 import os
 import pickle
@@ -27,7 +30,7 @@ import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +60,20 @@ _FOR_COMPILER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen
 # For programs that run a few times: a third to half of the time to compile, a run up to three times as long.
 _QUICK_TO_COMPILE = {"xla_backend_optimization_level": 0}
 _programs: list["PersistentJit"] = []
+# Programs held in memory, that used last at the end: each takes some 14 MB, and loading it again 0.1 s. Where
+# there are more than the first number, those not used for longest are released down to the second.
+MOST_HELD, LEFT_HELD = 96, 72
+_recent: collections.OrderedDict["_Held", None] = collections.OrderedDict()
+_recent_lock = threading.Lock()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Held:
+    """A program in memory, and where it is held."""
+
+    program: Callable[..., Any]
+    place: dict[Any, "_Held"]
+    key: Any
 
 
 @dataclasses.dataclass
@@ -90,7 +107,7 @@ class PersistentJit:
         self._runs_rarely = runs_rarely
         self._static = static
         self._name = f"{function.__module__}.{function.__qualname__}"
-        self._held: dict[Any, Callable[..., Any]] = {}
+        self._held: dict[Any, _Held] = {}
         _programs.append(self)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -103,14 +120,18 @@ class PersistentJit:
         kinds = tuple(jax.typeof(leaf) for leaf in leaves)
         settings = tuple(getattr(jax.config, s) for s in _SETTINGS)
         key = (known, tree, kinds, settings)
-        program = self._held.get(key)
-        if program is None:
-            texts, folder, file = [static_key(x) for x in known], programs_folder(), None
-            if folder is not None and all(texts) and _unchanged():
-                name = f"{self._name}{texts}{tree}{kinds}{settings}"
-                file = folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
-            program = self._held[key] = self._made(known, tree, leaves, file)
-        return program(*leaves)
+        held = self._held.get(key)
+        if held is not None:
+            _used(held)
+            return held.program(*leaves)
+        texts, folder, file = [static_key(x) for x in known], programs_folder(), None
+        if folder is not None and all(texts) and _unchanged():
+            name = f"{self._name}{texts}{tree}{kinds}{settings}"
+            file = folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
+        program, result = self._made(known, tree, leaves, file)
+        held = self._held[key] = _Held(program, self._held, key)
+        _used(held)
+        return result
 
     def __len__(self) -> int:
         """How many programs the process holds: one per structure and shapes of the arguments."""
@@ -122,21 +143,30 @@ class PersistentJit:
 
     def _made(
         self, known: tuple[Any, ...], tree: Any, leaves: list[Any], file: Path | None
-    ) -> Callable[..., Any]:
-        """The program for arguments like these as a function of their leaves; kept in the file, if any."""
+    ) -> tuple[Callable[..., Any], Any]:
+        """The program for arguments like these as a function of their leaves, and what it gives for them.
+
+        It is kept in the file, if any.
+        """
 
         def flat(*leaves: Any) -> Any:
             return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
 
         options = _options() | (_QUICK_TO_COMPILE if self._runs_rarely else {})
         program = jax.jit(flat, compiler_options=options)
+        began = time.perf_counter()
+        stored = None if file is None else _read(file, leaves)
+        if stored is not None:
+            _count(loaded=1)
+            return stored
         if file is None:
-            return program
-        stored = _read(file, leaves)
-        if stored is None:
-            stored = program.lower(*leaves).compile()
-            _write(stored, file)
-        return stored
+            result = program(*leaves)
+            _count(compiled=1, seconds=time.perf_counter() - began)
+            return program, result
+        compiled = program.lower(*leaves).compile()
+        _count(compiled=1, seconds=time.perf_counter() - began)
+        _write(compiled, file)
+        return compiled, compiled(*leaves)
 
 
 def persistent_jit(static: int, runs_rarely: bool = False) -> Callable[[Callable[..., Any]], PersistentJit]:
@@ -240,8 +270,60 @@ def _usual_folder() -> Path:
 
 def release_programs() -> None:
     """Releases all programs in memory; those on disk stay."""
+    with _recent_lock:
+        _recent.clear()
     for program in _programs:
         program.release_programs()
+    _return_memory()
+
+
+class ProgramCounts(NamedTuple):
+    """Programs that this process has made so far.
+
+    Attributes:
+        compiled: How many it compiled.
+        loaded: How many it loaded from disk.
+        seconds: What tracing and compiling took by the clock, added over all threads [s].
+    """
+
+    compiled: int = 0
+    loaded: int = 0
+    seconds: float = 0.0
+
+
+_counts = [ProgramCounts()]
+
+
+def program_counts() -> ProgramCounts:
+    """Programs that this process has made so far; the difference of two calls is what lay between them."""
+    return _counts[0]
+
+
+def _count(compiled: int = 0, loaded: int = 0, seconds: float = 0.0) -> None:
+    with _recent_lock:
+        c = _counts[0]
+        _counts[0] = ProgramCounts(c.compiled + compiled, c.loaded + loaded, c.seconds + seconds)
+
+
+def _used(held: _Held) -> None:
+    """Notes that a program was used; where too many are held, those not used for longest are released."""
+    with _recent_lock:
+        _recent[held] = None
+        _recent.move_to_end(held)
+        if len(_recent) <= MOST_HELD:
+            return
+        released = [_recent.popitem(last=False)[0] for _ in range(len(_recent) - LEFT_HELD)]
+    for old in released:
+        old.place.pop(old.key, None)
+    del released
+    _return_memory()
+
+
+def _return_memory() -> None:
+    """Gives memory that programs have left back to the system, where the C library can."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def static_key(value: Any) -> str:
@@ -329,8 +411,8 @@ def _prepare_loading() -> None:
     jax.jit(jnp.linalg.solve).lower(np.eye(1, dtype=np.float32), np.ones(1, np.float32))
 
 
-def _read(file: Path, leaves: list[Any]) -> Any:
-    """The program in a file; None where there is none, or none that runs with arguments like these."""
+def _read(file: Path, leaves: list[Any]) -> tuple[Callable[..., Any], Any] | None:
+    """The program in a file and what it gives for arguments; None without one that runs with these."""
     try:
         data = file.read_bytes()
         digest, content = data[:32], data[32:]
@@ -340,10 +422,10 @@ def _read(file: Path, leaves: list[Any]) -> Any:
             _prepare_loading()
         program = serialize_executable.deserialize_and_load(*pickle.loads(content))
         # What JAX had loaded from its own cache, and not compiled, may be stored without its functions.
-        jax.block_until_ready(program(*leaves))
+        result = jax.block_until_ready(program(*leaves))
         os.utime(file)  # what was used last is deleted last
         os.utime(file.parent)
-        return program
+        return program, result
     except Exception:  # missing, or of another version: it is compiled again
         return None
 
