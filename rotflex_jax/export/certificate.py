@@ -69,7 +69,7 @@ class Certificate:
             lines += [f"{title}:", *(f"  - {entry}" for entry in entries)] if entries else []
         if not self.left_out:
             lines.append("Left out: nothing")
-        return "\n".join(one_line(line) for line in lines)
+        return "\n".join(map(one_line, lines))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,20 +110,32 @@ class Subject:
     on: str
 
     @classmethod
-    def of(cls, model: Mechanism | Model, Ts: float, u: Real[np.ndarray, " N"] | Sequence[float] | None) -> "Subject":
+    def of(
+        cls, model: Mechanism | Model, Ts: float, u: Real[np.ndarray, " N"] | Sequence[float] | None
+    ) -> "Subject":
         """Checked arguments of an export.
 
         Raises:
-            InputError: No model, no sampling period, no signal of finite numbers, effects that are on in part.
+            InputError: No model, no sampling period, no finite signal, effects that are on in part.
         """
         model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
         model = _switched_on(model)
         unit = model.mechanism.units.input
         if u is None:
             size = _AMPLITUDES.get(unit, 1.0)
-            return cls(model, Ts, standard_input(Ts, size), f"{_SECONDS:g} s of three sines up to {size:g} {unit}, with rests")
+            return cls(
+                model,
+                Ts,
+                standard_input(Ts, size),
+                f"{_SECONDS:g} s of three sines up to {size:g} {unit}, with rests",
+            )
         given = signal(u).astype(float)
-        return cls(model, Ts, given, f"{len(given)} samples of the user's own, up to {np.max(np.abs(given)):.3g} {unit}")
+        return cls(
+            model,
+            Ts,
+            given,
+            f"{len(given)} samples of the user's own, up to {np.max(np.abs(given)):.3g} {unit}",
+        )
 
     @property
     def mechanism(self) -> Mechanism:
@@ -151,14 +163,26 @@ class Subject:
         """
         m = self.mechanism
         units = tuple(q.unit(m.units) for q in m.quantities)
-        plain = (form, simulated_by, why_not, self.on, m.channels, units)
-        told = {"left_out": tuple(left_out), "approximated": tuple(approximated)}
+        told = Certificate(
+            form,
+            simulated_by,
+            why_not,
+            self.on,
+            m.channels,
+            units,
+            left_out=tuple(left_out),
+            approximated=tuple(approximated),
+        )
         if y is None:
-            return Certificate(*plain, **told)
+            return told
         own = simulate(m, self.u, self.Ts, solver=self.model.solver)
         apart = np.abs(y - own)
-        numbers = (apart.max(axis=0), np.sqrt(np.mean(apart**2, axis=0)), np.ptp(own, axis=0))
-        return Certificate(*plain, *(tuple(n.tolist()) for n in numbers), **told)
+        return dataclasses.replace(
+            told,
+            largest=tuple(apart.max(axis=0).tolist()),
+            rms=tuple(np.sqrt(np.mean(apart**2, axis=0)).tolist()),
+            spans=tuple(np.ptp(own, axis=0).tolist()),
+        )
 
 
 def standard_input(Ts: float, size: float) -> Float[np.ndarray, " N"]:
@@ -168,8 +192,12 @@ def standard_input(Ts: float, size: float) -> Float[np.ndarray, " N"]:
         Ts: Sampling period [s].
         size: Largest value [unit of the input].
     """
-    t = Ts * np.arange(max(int(round(_SECONDS / Ts)), 2))
-    u = 0.5 * np.sin(2 * np.pi * 0.4 * t) + 0.35 * np.sin(2 * np.pi * 1.9 * t) + 0.15 * np.sin(2 * np.pi * 5.3 * t)
+    t = Ts * np.arange(max(round(_SECONDS / Ts), 2))
+    u = (
+        0.5 * np.sin(2 * np.pi * 0.4 * t)
+        + 0.35 * np.sin(2 * np.pi * 1.9 * t)
+        + 0.15 * np.sin(2 * np.pi * 5.3 * t)
+    )
     u[(t >= 2.4) & (t < 3.2)] = 0.0
     u[(t >= 4.0) & (t < 4.4)] = 0.05
     return size * u

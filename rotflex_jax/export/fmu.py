@@ -48,9 +48,9 @@ def to_fmu(
 ) -> Exported:
     """A model as an FMU for co-simulation (FMI 3.0), with its certificate.
 
-    Inside are the C code of `to_c`, so that every effect is in it, and where a C compiler is found the library
-    for this machine. A step is a whole multiple of `Ts`; another one is refused with a message. The input is
-    held over the step. First positions and speeds are parameters that hold from the start on.
+    Inside are the C code of `to_c`, so that every effect is in it, and where a C compiler is found the
+    library for this machine. A step is a whole multiple of `Ts`; another one is refused with a message. The
+    input is held over the step. First positions and speeds are parameters that hold from the start on.
 
     Args:
         model: Mechanism with its parameter values, or a Model.
@@ -86,7 +86,9 @@ def to_fmu(
     return Exported(_archive(identifier, header, wrapper, library, description), certificate)
 
 
-def run_in_fmpy(fmu: bytes, u: Real[np.ndarray, " N"] | Sequence[float], Ts: float) -> Float[np.ndarray, "N C"]:
+def run_in_fmpy(
+    fmu: bytes, u: Real[np.ndarray, " N"] | Sequence[float], Ts: float
+) -> Float[np.ndarray, "N C"]:
     """What the outputs of an FMU of `to_fmu` are in co-simulation, from rest.
 
     Args:
@@ -98,7 +100,10 @@ def run_in_fmpy(fmu: bytes, u: Real[np.ndarray, " N"] | Sequence[float], Ts: flo
         InputError: FMPy is not installed.
     """
     optional("fmpy", "A run of an FMU")
-    reader, slave = optional("fmpy.model_description", "A run of an FMU"), optional("fmpy.fmi3", "A run of an FMU")
+    reader, slave = (
+        optional("fmpy.model_description", "A run of an FMU"),
+        optional("fmpy.fmi3", "A run of an FMU"),
+    )
     y = []
     with tempfile.TemporaryDirectory() as folder:
         with zipfile.ZipFile(io.BytesIO(fmu)) as archive:
@@ -127,7 +132,9 @@ def platform_folder() -> str | None:
     """Name that FMI has for this kind of machine, such as `x86_64-linux`; None where none is known."""
     systems = {"linux": "linux", "darwin": "darwin"}
     system = systems.get(sys.platform)
-    machine = {"arm64": "aarch64", "amd64": "x86_64"}.get(platform.machine().lower(), platform.machine().lower())
+    machine = {"arm64": "aarch64", "amd64": "x86_64"}.get(
+        platform.machine().lower(), platform.machine().lower()
+    )
     return f"{machine}-{system}" if system else None
 
 
@@ -165,8 +172,8 @@ def _compiled(identifier: str, header: str, wrapper: str) -> bytes | None:
         if done.returncode:
             raise InputError(
                 f"The C compiler {os.path.basename(compiler)} did not accept the source of {identifier}: "
-                f"{one_line(done.stderr.strip())[:300]}; mend the compiler, or take it off the path for an FMU of "
-                "source alone."
+                f"{one_line(done.stderr.strip())[:300]}; mend the compiler, or take it off the path for an "
+                "FMU of source alone."
             )
         return Path(folder, "model.so").read_bytes()
 
@@ -215,7 +222,9 @@ def _description(subject: Subject, name: str, identifier: str, token: str) -> ET
     categories = ET.SubElement(root, "LogCategories")
     ET.SubElement(categories, "Category", {"name": "logStatusError", "description": "What was refused"})
     stop = repr(float(len(subject.u) * subject.Ts))
-    ET.SubElement(root, "DefaultExperiment", {"startTime": "0", "stopTime": stop, "stepSize": repr(subject.Ts)})
+    ET.SubElement(
+        root, "DefaultExperiment", {"startTime": "0", "stopTime": stop, "stepSize": repr(subject.Ts)}
+    )
     variables = ET.SubElement(root, "ModelVariables")
     for reference, (variable, unit, kind) in enumerate(listed):
         told = {"name": variable, "valueReference": str(reference), "unit": unit}
@@ -237,7 +246,9 @@ def _free(name: str, taken: set[str]) -> str:
     return name
 
 
-def _archive(identifier: str, header: str, wrapper: str, library: bytes | None, description: ET.Element) -> bytes:
+def _archive(
+    identifier: str, header: str, wrapper: str, library: bytes | None, description: ET.Element
+) -> bytes:
     build = ET.Element("fmiBuildDescription", {"fmiVersion": "3.0"})
     configuration = ET.SubElement(build, "BuildConfiguration", {"modelIdentifier": identifier})
     sources = ET.SubElement(configuration, "SourceFileSet", {"language": "C99"})

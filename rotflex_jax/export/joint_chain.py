@@ -134,7 +134,9 @@ class Chain:
         if isinstance(effect, PositionServo):
             self._add_servo(effect, vector, place)
         elif isinstance(effect, Motor) and effect.inductance is not None:
-            gain, emf = (effect.gear_ratio * k for k in (effect.efficiency * effect.torque_constant, effect.back_emf))
+            gain, emf = (
+                effect.gear_ratio * k for k in (effect.efficiency * effect.torque_constant, effect.back_emf)
+            )
             self.drives.append(
                 Drive(
                     f"{effect.at}.{effect.name}",
@@ -217,7 +219,9 @@ def body_of(vector: Vector) -> int | None:
     return moved - 1 if moved and vector == (1.0,) * moved + (0.0,) * (len(vector) - moved) else None
 
 
-def mass_and_lever(inertia: float, amplitudes: tuple[float, float], free_fall: float) -> tuple[float, float, float]:
+def mass_and_lever(
+    inertia: float, amplitudes: tuple[float, float], free_fall: float
+) -> tuple[float, float, float]:
     """Mass and its place on a body (x, z) that has this inertia about the axis and this weight.
 
     The axis is y, weight pulls along -z. Half of the inertia is that of the mass on its lever.

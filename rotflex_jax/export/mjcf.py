@@ -254,7 +254,7 @@ def _actuator(
     limit = chain.input_limit
     clip = {"ctrlrange": f"{number(-limit)} {number(limit)}"} if math.isfinite(limit) else {}
     if drive.coil is not None and drive.coil[1] > 0 and drive.coil[0] > 0:
-        # MuJoCo has one motor constant: current, resistance and inductance are scaled so that it is the EMF's.
+        # MuJoCo has one motor constant: the electric side is scaled so that it is the EMF's.
         gain, emf, resistance, inductance = drive.coil
         electric = {"resistance": resistance * emf / gain, "inductance": inductance * emf / gain}
         motor = {k: number(v) for k, v in electric.items()}
