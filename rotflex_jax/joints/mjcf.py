@@ -378,8 +378,8 @@ class _Reader:
         self, told: dict[str, str], gear: float, torque: float, stiffness: float, brake: float, damping: float
     ) -> float:
         """A position loop: linear, or where its force is limited a servo that has the joint's damping."""
-        if abs(torque - stiffness) > 1e-9 * abs(stiffness) or stiffness <= 0:
-            self.unable("an actuator that pulls towards another place than its control", "actuator law")
+        if stiffness < 0 or torque <= 0:
+            self.unable("an actuator that pushes away from its goal", "actuator law")
         self.input_unit = "m" if self.hub.slides else "rad"
         force = self._range(told, "forcerange") * abs(gear)
         if math.isinf(force):
@@ -388,6 +388,8 @@ class _Reader:
                 Spring(at=self.port, stiffness=stiffness),
             ]
             return damping + brake
+        if abs(torque - stiffness) > 1e-9 * stiffness:
+            self.unable("a forcerange at a position loop with a gear or an offset", "forcerange")
         if brake > 0:
             self.unable("a forcerange at a position loop with a damping of its own (kv)", "forcerange")
         constant = math.sqrt(damping) if damping > 0 else _NO_BRAKE
