@@ -174,6 +174,20 @@ def test_without_mujoco_the_certificate_says_so(monkeypatch):
         ET.fromstring(exported.content)
 
 
+def test_a_mujoco_that_does_not_know_an_element_is_named(monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+
+    def refuse(text: str) -> None:
+        raise ValueError("unrecognized element\nline 3")
+
+    monkeypatch.setattr(mujoco, "MjModel", type("Old", (), {"from_xml_string": staticmethod(refuse)}))
+    told = to_mjcf(JOINT, Ts, u=U[:9]).certificate.not_simulated
+    assert (
+        told.startswith(f"MuJoCo {mujoco.__version__} does not read the file: unrecognized")
+        and "\n" not in told
+    )
+
+
 def test_a_machine_that_neither_turns_nor_slides_is_refused():
     from rotflex_jax.joints import silverbox
 

@@ -1,6 +1,7 @@
 """A mechanism from a joint of an MJCF file moves as MuJoCo moves the joint."""
 
 import math
+import re
 import sys
 
 import numpy as np
@@ -252,6 +253,29 @@ def test_what_cannot_be_said_is_refused_by_name(tmp_path, change, words, ignore)
 def test_files_of_others_are_read_safely(tmp_path, text, words):
     with pytest.raises(InputError, match=words):
         loaded(tmp_path, text)
+
+
+def test_damaged_files_end_in_one_sentence(tmp_path):
+    """Whatever stands in an attribute or is lost on the way: a machine, or an InputError."""
+    rng = np.random.default_rng(5)
+    whole = SHAPES.format(actuator=ACTUATORS["general"][0], sequence="xyz")
+    attributes = [m.span(1) for m in re.finditer(r'="([^"]*)"', whole)]
+    junk = ["", "0", "-1", "1e400", "nan", "a b", "1 2", "0 0 0", "\x01", "free", "mesh", "1e-300", "-5 5"]
+    refused = 0
+    for k in range(200):
+        text = whole
+        if k % 4:
+            a, b = attributes[rng.integers(len(attributes))]
+            text = whole[:a] + junk[rng.integers(len(junk))] + whole[b:]
+        else:
+            a, b = sorted(rng.integers(len(whole), size=2))
+            text = whole[:a] + whole[b:]
+        try:
+            assert isinstance(loaded(tmp_path, text), rf.Mechanism)
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error) and str(error).endswith(".")
+    assert 50 < refused < 190
 
 
 def test_a_large_file_is_not_read(tmp_path, monkeypatch):

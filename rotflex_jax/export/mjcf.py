@@ -73,14 +73,15 @@ def to_mjcf(
     chain = Chain.of(subject.mechanism, "MJCF")
     tree = _mujoco(subject.mechanism, chain, name, subject.Ts)
     text = _written(tree)
+    by, why_not, y = "", "", None
     try:
-        mujoco = optional("mujoco", "A certificate of MJCF")
-    except InputError as missing:
-        certificate = subject.certificate("MJCF", "", None, chain.left_out, chain.approximated, str(missing))
-    else:
+        by = f"MuJoCo {optional('mujoco', 'A certificate of MJCF').__version__}"
         y = run_in_mujoco(text, subject.u, subject.Ts)
-        version = f"MuJoCo {mujoco.__version__}"
-        certificate = subject.certificate("MJCF", version, y, chain.left_out, chain.approximated)
+    except InputError as missing:
+        why_not = str(missing)
+    except ValueError as error:  # an earlier MuJoCo lacks elements of a later one
+        why_not = f"{by} does not read the file: {one_line(str(error))[:200]}"
+    certificate = subject.certificate("MJCF", by, y, chain.left_out, chain.approximated, why_not)
     tree.insert(0, ET.Comment(in_comment(str(certificate))))
     return Exported(_written(tree), certificate)
 

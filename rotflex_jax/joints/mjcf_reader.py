@@ -103,12 +103,12 @@ class _Reader:
             self.effects.append(Inertia(at="arm", inertia=self._inertia(outer)))
             if told(arm.told, "armature"):
                 self.effects.append(Inertia(at="joint", inertia=told(arm.told, "armature")))
-        damping = self._joint_damping(hub)
+        damping = self._own_damping(hub)
         damping = self._drive(damping)
         self.effects.append(Viscous(at=self.port, coefficient=damping))
         self._contact(hub, self.port)
         if arm is not None:
-            self.effects.append(Viscous(at="joint", coefficient=self._joint_damping(arm)))
+            self.effects.append(Viscous(at="joint", coefficient=self._own_damping(arm)))
             self._contact(arm, "joint", always=True)
         self._weight(inner, self.port)
         self._weight(outer, "arm")
@@ -165,7 +165,8 @@ class _Reader:
 
     # -- joints ------------------------------------------------------------------------------------
 
-    def _joint_damping(self, joint: FileJoint) -> float:
+    def _own_damping(self, joint: FileJoint) -> float:
+        """Damping of a joint, which says nothing that no effect has."""
         for name in ("springdamper", "springyield", "actuatorgravcomp"):
             if any(x not in ("0", "0.0", "false") for x in joint.told.get(name, "0").split()):
                 self.unable(f"{name} at the joint {one_line(joint.name)!r}", name)

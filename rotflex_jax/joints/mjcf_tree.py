@@ -24,6 +24,12 @@ DEEPEST = 200
 # They change the file or its bodies before anything is read.
 _UNREAD = ("include", "attach", "replicate", "frame", "composite", "flexcomp", "model")
 
+LARGEST_NUMBER = 1e12
+"""Numbers beyond it are no masses, sizes or torques of a machine."""
+
+SMALLEST = 1e-9
+"""Sizes of shapes below it are none [m]."""
+
 WATER = 1000.0
 """Density of a shape that says none [kg/m^3]."""
 
@@ -152,7 +158,11 @@ class FileModel:
             found = np.array([float(x) for x in told[name].split()])
         except ValueError:
             found = np.array([math.nan])
-        if not len(found) or not np.isfinite(found).all() or (count is not None and len(found) != count):
+        if (
+            not len(found)
+            or not (np.abs(found) < LARGEST_NUMBER).all()
+            or (count is not None and len(found) != count)
+        ):
             need = "numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
             raise self.error(f'has {name}="{one_line(told[name])[:40]}"', f"write {need}")
         return found
@@ -274,9 +284,9 @@ class FileModel:
     def _solid(self, kind: str, size: np.ndarray) -> tuple[float, np.ndarray]:
         """Volume, and moments of inertia per mass."""
         need = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
-        if kind not in need or len(size) < need[kind]:
+        if kind not in need or len(size) < need[kind] or not (size[: need[kind]] > SMALLEST).all():
             what = f"has a shape of type {one_line(kind)!r} that counts towards a mass"
-            raise self.error(what, "give its body an <inertial>, with sizes for shapes that have some")
+            raise self.error(what, "give its body an <inertial>, or the shape sizes above zero")
         if kind == "sphere":
             return 4 / 3 * math.pi * size[0] ** 3, np.full(3, 0.4 * size[0] ** 2)
         a = size[:3] ** 2
@@ -296,11 +306,11 @@ class FileModel:
 
     def below(self, body: int) -> list[int]:
         """A body and all that hang on it."""
-        found = [body]
+        found = {body}
         for k in range(body + 1, len(self.bodies)):
             if self.bodies[k].parent in found:
-                found.append(k)
-        return found
+                found.add(k)
+        return sorted(found)
 
 
 def _parsed(path: str | os.PathLike[str]) -> ET.Element:
