@@ -29,6 +29,7 @@ from .fit import (
     least_squares as least_squares,
     many_starts as many_starts,
 )
+from .joints import load_mjcf as load_mjcf
 from .latent import LatentTorque as LatentTorque, latent_torque as latent_torque
 from .mechanism import (
     Exponential as Exponential,

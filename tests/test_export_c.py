@@ -141,9 +141,8 @@ def models() -> dict[str, Model]:
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    """All models, compiled together with every warning an error."""
-    folder = tmp_path_factory.mktemp("c")
+def source():
+    """All models as C code, each with a function that is called from elsewhere."""
     text = []
     for k, model in enumerate(models().values()):
         C = len(model.mechanism.channels)
@@ -153,7 +152,14 @@ def library(tmp_path_factory):
             f"{{ m{k}_state s; m{k}_init(&s); s.x[0] = x0[0];\n"
             f"  for (int i = 0; i < n; i++) m{k}_step(&s, u[i], y + {C} * i); }}\n"
         )
-    (folder / "all.c").write_text("\n".join(text))
+    return "\n".join(text)
+
+
+@pytest.fixture(scope="module")
+def library(source, tmp_path_factory):
+    """All models, compiled together with every warning an error."""
+    folder = tmp_path_factory.mktemp("c")
+    (folder / "all.c").write_text(source)
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]
     assert gcc is not None
     subprocess.run([gcc, *flags, "all.c", "-o", "all.so", "-lm"], cwd=folder, check=True)
@@ -178,6 +184,33 @@ def test_c_code_equals_the_simulator(library, name):
     expected = simulate(kept, u, Ts, x0=np.array([0.3]), solver=model.solver)
     assert np.ptp(expected, axis=0).min() > 0.05  # it moves
     np.testing.assert_allclose(y, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+ALLOCATIONS = {"malloc", "calloc", "realloc", "free", "alloca", "aligned_alloc"}
+
+
+def undefined_names(source: str, compiler: str, nm: str, folder, *flags: str) -> set[str]:
+    """What the object code of all models takes from elsewhere."""
+    (folder / "all.c").write_text(source)
+    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Os", "-c", "all.c", "-o", "all.o"]
+    subprocess.run([compiler, *flags, *strict], cwd=folder, check=True)
+    done = subprocess.run([nm, "-u", "all.o"], cwd=folder, check=True, capture_output=True, text=True)
+    return {line.split()[-1].lstrip("_") for line in done.stdout.splitlines() if line.strip()}
+
+
+@needs_compiler
+def test_allocates_nothing(source, tmp_path):
+    assert gcc is not None
+    names = undefined_names(source, gcc, "nm", tmp_path)
+    assert {"exp", "tanh"} <= names and not names & ALLOCATIONS
+
+
+def test_compiles_for_a_microcontroller_of_32_bits_without_allocation(source, tmp_path):
+    arm = shutil.which("arm-none-eabi-gcc")
+    if arm is None:
+        pytest.skip("no cross compiler arm-none-eabi-gcc on this machine")
+    names = undefined_names(source, arm, "arm-none-eabi-nm", tmp_path, "-mcpu=cortex-m4", "-mthumb")
+    assert {"exp", "tanh", "aeabi_dadd"} <= names and not names & ALLOCATIONS
 
 
 def test_says_which_effect_it_cannot_write():

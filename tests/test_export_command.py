@@ -102,10 +102,27 @@ def test_other_forms(run, saved):
     assert linear["dropped"] == ["Coulomb friction at hub has no slope at rest"]
 
 
+def test_simulators_with_their_certificates(run, saved, tmp_path):
+    """To a file, with the certificate on stdout; to stdout, with the certificate beside it."""
+    target = tmp_path / "joint.xml"
+    status, out, err = run("export", saved, "--to", "mjcf", "--out", target)
+    assert (status, err) == (0, "") and out.startswith("Certificate of the export to MJCF")
+    assert "<!--" in target.read_text() and 'model="model"' in target.read_text()
+    status, out, err = run("export", "xl330_pendulum:gain=200", "--to", "bam", "--length", "0.05")
+    assert status == 0 and err.startswith("Certificate of the export to BAM") and "gain 200" in err
+    assert json.loads(out)["armature"] == pytest.approx(0.0069 - 0.49 * 0.1 * 0.05)
+    status, out, _ = run("export", f"{target}:joint=theta,child=alpha", "--to", "text")
+    assert status == 0 and "level = 0.0312 N m" in out
+
+
 def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
     for arguments, words in (
         ((saved, "--to", "fortran"), ("'fortran'", "c, latex, text, statespace")),
         (("paper", "--to", "c"), ("needs a sampling period", "--Ts")),
+        (("paper", "--to", "fmu", "--out", tmp_path / "x.fmu"), ("needs a sampling period", "--Ts")),
+        ((saved, "--to", "fmu"), ("archive", "--out")),
+        (("paper", "--to", "bam"), ("one servo", "xl330_pendulum")),
+        ((tmp_path / "no.xml", "--to", "text"), ("cannot be read",)),
         ((saved, "--to", "c", "--Ts", "-1"), ("`Ts` must be a finite number above 0", "-1")),
         ((tmp_path / "no.json", "--to", "text"), ("does not exist",)),
         ((saved, "--to", "text", "--out", tmp_path / "no" / "where.txt"), ("does not", "exist")),

@@ -103,6 +103,11 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "export.latex": (export.latex, {"model": JOINT}),
     "export.text": (export.text, {"model": JOINT}),
     "export.state_space": (export.state_space, {"model": JOINT}),
+    "export.to_mjcf": (export.to_mjcf, {"model": JOINT, "Ts": 0.002}),
+    "export.to_urdf": (export.to_urdf, {"model": JOINT, "Ts": 0.002}),
+    "export.to_fmu": (export.to_fmu, {"model": JOINT, "Ts": 0.002}),
+    "export.to_bam": (export.to_bam, {"model": joints.xl330_pendulum(), "Ts": 0.005}),
+    "load_mjcf": (rf.load_mjcf, {"path": "no-such.xml"}),
     "export.save": (export.save, {"path": "never-made"}),
     "export.read": (export.read, {}),
     "kernels.local_kernels": (
@@ -375,6 +380,26 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("export.state_space", "model"): NO_MODEL,
     ("export.state_space", "Ts"): NO_SECONDS,
     ("export.state_space", "voltage"): NO_NUMBER,
+    **{
+        (f"export.to_{form}", argument): rows
+        for form in ("mjcf", "urdf", "fmu", "bam")
+        for argument, rows in (
+            ("model", NO_MODEL),
+            ("Ts", NO_SECONDS),
+            (
+                "u",
+                [([NAN], "is nan"), ("a", "`u` must be real numbers"), ([], "`u` must be"), (U[None], "`u`")],
+            ),
+        )
+    },
+    **{
+        (f"export.to_{form}", "name"): [(3, "a name, but 3"), (" ", "needs a name"), (None, "but None")]
+        for form in ("mjcf", "urdf", "fmu")
+    },
+    ("export.to_bam", "actuator"): [(3, "a name, but 3"), ("", "needs a name")],
+    ("export.to_bam", "length"): [(0, "is 0"), (NAN, "is nan"), ("a", "is 'a'")],
+    ("load_mjcf", "path"): [(3, "3 was given"), ("no-such.xml", "cannot be read"), (".", "cannot be read")],
+    ("load_mjcf", "ignore"): [("ref", "list of names"), (["x"], "one of 'forcerange'"), (3, "is 3")],
     ("export.save", "saved"): [(3, "3 was given")],
     ("export.read", "path"): [(3, "but 3 was given"), ("no-such.json", "does not exist")],
     ("kernels.local_kernels", "model"): NO_MODEL,

@@ -162,7 +162,7 @@ before = dict(jax.config.values), dict(os.environ)
 rf.fit, rf.joints.paper, rf.effects, rf.Recording, rf.load
 changed = before != (dict(jax.config.values), dict(os.environ))
 late = {"equinox", "optimistix", "scipy.linalg", "scipy.signal", "rotflex_jax.discover", "rotflex_jax.basis"}
-late |= {"matplotlib", "pandas", "pysindy", "h5py", "numba", "pyarrow", "typer"}
+late |= {"matplotlib", "pandas", "pysindy", "h5py", "numba", "pyarrow", "typer", "mujoco", "fmpy"}
 loaded = sorted(late & set(sys.modules))
 print(json.dumps({"nothing": nothing, "loaded": loaded, "changed": changed}))
 """

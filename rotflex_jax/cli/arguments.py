@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
-EXPORT_FORMS = ("c", "latex", "text", "statespace")
+SIMULATORS = ("mjcf", "urdf", "fmu", "bam")
+EXPORT_FORMS = ("c", "latex", "text", "statespace", *SIMULATORS)
 
 Files = Annotated[
     list[Path],
@@ -196,11 +197,15 @@ ExportPeriod = Annotated[
     typer.Option(
         "--Ts",
         metavar="SECONDS",
-        help="Sampling period of the C code (that of the model's data unless given) "
-        "or of a discrete state space (continuous unless given).",
+        help="Sampling period of the C code, of an FMU and of a simulator's certificate (that of the model's "
+        "data unless given) or of a discrete state space (continuous unless given).",
     ),
 ]
 Prefix = Annotated[str, typer.Option(metavar="NAME", help="What the names in the C code begin with.")]
+PendulumLength = Annotated[
+    float, typer.Option("--length", metavar="M", help="Length of the servo's pendulum, for bam.")
+]
+ServoName = Annotated[str, typer.Option("--actuator", metavar="NAME", help="The servo's name in bam.")]
 OwnEffects = Annotated[
     list[str] | None,
     typer.Option("--with", metavar="FILE.py", help="Python file that registers effects of your own."),

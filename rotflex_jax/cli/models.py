@@ -1,6 +1,7 @@
 """`rotflex simulate` and `rotflex export`: a model's free run, and a saved model for use elsewhere."""
 
 import json
+from pathlib import Path
 
 from rotflex_jax.cli import arguments as given, terminal
 from rotflex_jax.errors import InputError
@@ -70,29 +71,49 @@ def export(
     Ts: given.ExportPeriod = None,
     prefix: given.Prefix = "rotflex",
     effects: given.OwnEffects = None,
+    length: given.PendulumLength = 0.1,
+    actuator: given.ServoName = "xl330",
 ) -> None:
-    """Give a model as C code for a controller, as equations, or as state space."""
+    """Give a model as C code for a controller, as equations, as state space, or for a simulator."""
     form = by_name.choose(to, given.EXPORT_FORMS, "form of export")
     given.check_writable(json_file=out)
+    if form == "fmu" and out in (None, given.STDOUT):
+        raise InputError("An FMU is an archive, which is not shown as text; give --out FILE.fmu.")
     from rotflex_jax import export as forms
     from rotflex_jax.joints.by_name import imported
 
     for file in effects or []:
         imported(file)
     subject, period = by_name.model(model), Ts
-    if form == "c" and period is None and model.endswith(".json"):
+    sampled = form == "c" or form in given.SIMULATORS
+    if sampled and period is None and model.endswith(".json"):
         period = forms.read(model).Ts
-    if form == "c" and period is None:
+    if form in ("c", "fmu") and period is None:
         raise InputError(
             f"{model} does not say how its data were sampled, but C code needs a sampling period; give --Ts."
         )
-    if form == "c":
+    text: str | bytes
+    if form in given.SIMULATORS:
+        from rotflex_jax.runtime.xla import enable_fast_start
+
+        enable_fast_start()
+        period = 0.002 if period is None else float(period)
+        name = Path(model.partition(":")[0]).stem
+        if form == "bam":
+            exported = forms.to_bam(subject, period, actuator, length)
+        else:
+            exported = {"mjcf": forms.to_mjcf, "urdf": forms.to_urdf, "fmu": forms.to_fmu}[form](
+                subject, period, name
+            )
+        text = exported.content
+        terminal.message(str(exported.certificate), error=out in (None, given.STDOUT))
+    elif form == "c":
         text = forms.to_c(subject, float(period or 0), prefix)
     elif form == "statespace":
         text = json.dumps(forms.state_space(subject, period).to_dict(), indent=2) + "\n"
     else:
         text = forms.latex(subject) if form == "latex" else forms.text(subject)
     if out is None or out == given.STDOUT:
-        print(text, end="")
+        print(text if isinstance(text, str) else "", end="")
     else:
         write_file(out, text)

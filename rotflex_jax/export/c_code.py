@@ -31,6 +31,8 @@ def to_c(model: Mechanism | Model, Ts: float, prefix: str = "rotflex") -> str:
         rotflex_init(&s);
         for (;;) rotflex_step(&s, u, y);    /* y at the start of the sample over which u is held */
 
+    `rotflex_read(&s, y)` gives the outputs without a step.
+
     It agrees with `Model.simulate` to rounding. Not for another sampling period: its matrix exponential
     holds for `Ts`.
 
@@ -139,10 +141,15 @@ def _lines(model: Model, Ts: float, prefix: str, code: SampleProgram) -> Iterato
     x = ", ".join(map(_number, start))
     yield f"    static const {prefix}_state rest = {{.x = {{{x}}}, .started = 0}};"
     yield "    *s = rest;\n}\n"
+    yield "/* y: what the sensors read now. */"
+    outputs = f"double y[{len(mechanism.channels)}]"
+    yield f"static void {prefix}_read(const {prefix}_state *s, {outputs})\n{{"
+    yield from _reading(code)
+    yield "}\n"
     unit = _comment(mechanism.units.input)
     yield f"/* y: what the sensors read now. u: command that is held from now over one sample [{unit}]. */"
-    yield f"static void {prefix}_step({prefix}_state *s, double u, double y[{len(mechanism.channels)}])\n{{"
-    yield from _reading(code)
+    yield f"static void {prefix}_step({prefix}_state *s, double u, {outputs})\n{{"
+    yield f"    {prefix}_read(s, y);"
     yield from _driving(code, firsts, pasts)
     if counted:
         yield "    s->count += 1;"
@@ -181,10 +188,8 @@ def _sequence_states(code: SampleProgram) -> tuple[list[Expression], list[Expres
 def _reading(code: SampleProgram) -> Iterator[str]:
     printer = _Printer(lambda e: f"s->x[{e.args[0]}]", code.outputs)
     lines = list(printer.statements(code.outputs))
-    yield "    {"
-    yield from (f"    {line}" for line in lines)
-    yield from (f"        y[{i}] = {_bare(printer(y))};" for i, y in enumerate(code.outputs))
-    yield "    }"
+    yield from lines
+    yield from (f"    y[{i}] = {_bare(printer(y))};" for i, y in enumerate(code.outputs))
 
 
 def _driving(code: SampleProgram, firsts: list[Expression], pasts: list[Expression]) -> Iterator[str]:

@@ -1,6 +1,7 @@
-"""Ready-made mechanisms: joints of the paper and the maker, a link, an inertia, servos, public machines."""
+"""Ready-made mechanisms: joints of the paper and the maker, a link, an inertia, servos, machines; MJCF."""
 
 from rotflex_jax.joints.flexible_link import flexible_link
+from rotflex_jax.joints.mjcf import load_mjcf
 from rotflex_jax.joints.public_machines import emps, rotary_arm, silverbox, two_dof_link
 from rotflex_jax.joints.rotary_flexible import (
     arm_inertia,
@@ -27,6 +28,7 @@ __all__ = [
     "two_dof_link",
     "position_servo",
     "xl330_pendulum",
+    "load_mjcf",
     "arm_inertia",
     "hub_inertia",
     "spring_stiffness",

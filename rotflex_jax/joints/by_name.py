@@ -39,7 +39,7 @@ def joint(text: str) -> Any:
 
 
 def model(text: str, add: Iterable[str] = ()) -> Any:
-    """The model meant by a joint, by `FILE.py:NAME`, or by a saved `MODEL.json`, with effects added."""
+    """The model meant by a joint, `FILE.py:NAME`, `FILE.xml:joint=NAME` or `MODEL.json`, and effects."""
     found = _model(text)
     for each in add:
         found = found + effect(each)
@@ -51,6 +51,9 @@ def _model(text: str) -> Any:
     from rotflex_jax.models.model import Model
 
     name, separator, values = text.partition(":")
+    if name.endswith(".xml"):
+        named_joints = _numbers(values, ("joint", "child"), f"option of {name}")
+        return Model(joints.load_mjcf(name, **{key: str(value) for key, value in named_joints.items()}))
     if text.endswith(".json") or (separator and "=" not in values and name not in JOINTS):
         return named(text)
     preset = getattr(joints, choose(name, JOINTS, "joint"))

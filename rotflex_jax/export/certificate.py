@@ -1,0 +1,226 @@
+"""What an export to a simulator is worth: simulated against the toolkit, and what could not be said."""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Real
+
+from rotflex_jax.checks import positive, shown, signal
+from rotflex_jax.effects.base import Effect
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import Mechanism, simulate
+from rotflex_jax.models.model import Model
+from rotflex_jax.text.files import write_file
+from rotflex_jax.text.plain import one_line
+
+# Amplitude of the input that a certificate is given on, by the unit of the input.
+_AMPLITUDES = {"V": 2.0, "rad": 0.6, "A": 0.5}
+
+_SECONDS = 5.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Certificate:
+    """An export simulated by another program, against the toolkit on the same input.
+
+    Attributes:
+        form: Form of the export, such as `MJCF`.
+        simulated_by: Program that simulated the exported file; empty where none did.
+        not_simulated: Why none did; empty where one did.
+        on: The input, in words.
+        channels: Names of the outputs.
+        units: Their units.
+        largest: Largest difference per channel [unit of the channel].
+        rms: Root mean square difference per channel [unit of the channel].
+        spans: How far each channel moves in the toolkit's run, largest less smallest.
+        left_out: What the form cannot say, by name, with the reason.
+        approximated: What it says otherwise than the toolkit.
+    """
+
+    form: str
+    simulated_by: str
+    not_simulated: str
+    on: str
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    largest: tuple[float, ...] = ()
+    rms: tuple[float, ...] = ()
+    spans: tuple[float, ...] = ()
+    left_out: tuple[str, ...] = ()
+    approximated: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        lines = [f"Certificate of the export to {self.form}"]
+        if self.not_simulated:
+            lines.append(f"Not simulated: {self.not_simulated}")
+        else:
+            lines.append(f"Simulated by {self.simulated_by} and by rotflex_jax on the same input: {self.on}")
+            for row in zip(self.channels, self.units, self.largest, self.rms, self.spans, strict=True):
+                channel, unit, largest, rms, span = row
+                small = f" = {np.degrees(largest):.3g} deg" if unit == "rad" else ""
+                lines.append(
+                    f"  {channel}: largest difference {largest:.3g} {unit}{small}, rms {rms:.3g} {unit}, "
+                    f"of a motion over {span:.3g} {unit}"
+                )
+        for title, entries in (("Left out", self.left_out), ("Said otherwise", self.approximated)):
+            lines += [f"{title}:", *(f"  - {entry}" for entry in entries)] if entries else []
+        if not self.left_out:
+            lines.append("Left out: nothing")
+        return "\n".join(map(one_line, lines))
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """A model in the form of a simulator, with its certificate.
+
+    Attributes:
+        content: What goes into the file: text, or bytes.
+        certificate: How well the simulator follows the toolkit with it.
+    """
+
+    content: str | bytes
+    certificate: Certificate
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the file.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        return write_file(path, self.content)
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What is exported, and how its certificate is made.
+
+    Attributes:
+        model: The model without effects that are switched off.
+        Ts: Sampling period [s].
+        u: Input of the certificate, held over each sample.
+        on: That input in words.
+    """
+
+    model: Model
+    Ts: float
+    u: Float[np.ndarray, " N"]
+    on: str
+
+    @classmethod
+    def of(
+        cls, model: Mechanism | Model, Ts: float, u: Real[np.ndarray, " N"] | Sequence[float] | None
+    ) -> "Subject":
+        """Checked arguments of an export.
+
+        Raises:
+            InputError: No model, no sampling period, no finite signal, effects that are on in part.
+        """
+        model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
+        model = _switched_on(model)
+        unit = model.mechanism.units.input
+        if u is None:
+            size = _AMPLITUDES.get(unit, 1.0)
+            return cls(
+                model,
+                Ts,
+                standard_input(Ts, size),
+                f"{_SECONDS:g} s of three sines up to {size:g} {unit}, with rests",
+            )
+        given = signal(u).astype(float)
+        return cls(
+            model,
+            Ts,
+            given,
+            f"{len(given)} samples of the user's own, up to {np.max(np.abs(given)):.3g} {unit}",
+        )
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The mechanism."""
+        return self.model.mechanism
+
+    def certificate(
+        self,
+        form: str,
+        simulated_by: str,
+        y: Float[np.ndarray, "N C"] | None,
+        left_out: Sequence[str] = (),
+        approximated: Sequence[str] = (),
+        why_not: str = "",
+    ) -> Certificate:
+        """The certificate for what the other program gave.
+
+        Args:
+            form: Form of the export.
+            simulated_by: The program.
+            y: What it gave from rest, or None where nothing ran.
+            left_out: What the form cannot say.
+            approximated: What it says otherwise.
+            why_not: Why nothing ran.
+        """
+        m = self.mechanism
+        units = tuple(q.unit(m.units) for q in m.quantities)
+        told = Certificate(
+            form,
+            simulated_by,
+            why_not,
+            self.on,
+            m.channels,
+            units,
+            left_out=tuple(left_out),
+            approximated=tuple(approximated),
+        )
+        if y is None:
+            return told
+        own = simulate(m, self.u, self.Ts, solver=self.model.solver)
+        apart = np.abs(y - own)
+        return dataclasses.replace(
+            told,
+            largest=tuple(apart.max(axis=0).tolist()),
+            rms=tuple(np.sqrt(np.mean(apart**2, axis=0)).tolist()),
+            spans=tuple(np.ptp(own, axis=0).tolist()),
+        )
+
+
+def standard_input(Ts: float, size: float) -> Float[np.ndarray, " N"]:
+    """The input that certificates are given on: three sines, two rests, in which dry friction holds.
+
+    Args:
+        Ts: Sampling period [s].
+        size: Largest value [unit of the input].
+    """
+    t = Ts * np.arange(max(round(_SECONDS / Ts), 2))
+    u = (
+        0.5 * np.sin(2 * np.pi * 0.4 * t)
+        + 0.35 * np.sin(2 * np.pi * 1.9 * t)
+        + 0.15 * np.sin(2 * np.pi * 5.3 * t)
+    )
+    u[(t >= 2.4) & (t < 3.2)] = 0.0
+    u[(t >= 4.0) & (t < 4.4)] = 0.05
+    return size * u
+
+
+def label(effect: Effect) -> str:
+    """An effect as certificates name it."""
+    return f"{effect.title} {effect.location} ({effect.name})"
+
+
+def _switched_on(model: Model) -> Model:
+    if model.gates is None:
+        return model
+    if any(g not in (0.0, 1.0) for g in model.gates):
+        raise InputError(
+            f"The gates of the model are {shown(model.gates)}, but a simulator knows effects that are on or "
+            "off; give 1 or 0 for each."
+        )
+    on = [e for e, g in zip(model.mechanism.effects, model.gates, strict=True) if g]
+    mechanism = dataclasses.replace(model.mechanism, effects=tuple(on), trusted=frozenset())
+    return Model(mechanism, model.solver)
+
+
+def in_comment(text: str) -> str:
+    """A text that may stand in a comment of XML, in which no two hyphens follow each other."""
+    return "\n" + text.replace("--", "- -").replace("--", "- -") + "\n"

@@ -1,0 +1,379 @@
+"""What an MJCF file says of its bodies and joints at rest: read safely, with classes of defaults resolved."""
+
+import dataclasses
+import math
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.text.files import path_of
+from rotflex_jax.text.plain import one_line
+
+LARGEST_FILE = 10_000_000
+"""Size of an MJCF file beyond which it is none [bytes]."""
+
+DEEPEST = 200
+"""Elements inside one another in a file."""
+
+# They change the file or its bodies before anything is read.
+_UNREAD = ("include", "attach", "replicate", "frame", "composite", "flexcomp", "model")
+
+LARGEST_NUMBER = 1e12
+"""Numbers beyond it are no masses, sizes or torques of a machine."""
+
+SMALLEST = 1e-9
+"""Sizes of shapes below it are none [m]."""
+
+WATER = 1000.0
+"""Density of a shape that says none [kg/m^3]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FileJoint:
+    """A joint at rest, in the frame of the world.
+
+    Attributes:
+        name: Of the joint.
+        body: Number of its body.
+        slides: Whether it slides; it turns otherwise.
+        axis: Unit vector.
+        anchor: A point of the axis [m].
+        told: Its attributes, those of its class among them.
+    """
+
+    name: str
+    body: int
+    slides: bool
+    axis: Float[np.ndarray, "3"]
+    anchor: Float[np.ndarray, "3"]
+    told: dict[str, str]
+
+
+@dataclasses.dataclass
+class FileBody:
+    """A body at rest, in the frame of the world.
+
+    Attributes:
+        name: Of the body.
+        parent: Number of its parent; -1 for the world.
+        mass: [kg].
+        centre: Of its mass [m].
+        inertia: About that [kg m^2].
+    """
+
+    name: str
+    parent: int
+    mass: float
+    centre: Float[np.ndarray, "3"]
+    inertia: Float[np.ndarray, "3 3"]
+
+
+class FileModel:
+    """An MJCF file.
+
+    Args:
+        path: Of the file.
+
+    Raises:
+        InputError: It cannot be read, is no MJCF, or holds what this reader does not know.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = str(path)
+        self.root = _parsed(path)
+        if self.root.tag != "mujoco":
+            raise self.error(
+                f"begins with <{one_line(self.root.tag)[:40]}>", "an MJCF file begins with <mujoco>"
+            )
+        for element in self.root.iter():
+            if element.tag in _UNREAD:
+                raise self.error(
+                    f"has the element <{element.tag}>",
+                    "load it in MuJoCo and save it again, which resolves these",
+                )
+        self.settings: dict[str, str] = {}
+        for element in self.root.findall("compiler"):
+            self.settings |= element.attrib
+        for name in (
+            "settotalmass",
+            "inertiagrouprange",
+            "coordinate",
+            "boundmass",
+            "boundinertia",
+            "balanceinertia",
+        ):
+            if name in self.settings:
+                raise self.error(f"has the setting {name} of the compiler", "write masses and inertias out")
+        self.degrees = self.settings.get("angle", "degree") != "radian"
+        self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+        for element in self.root.findall("default"):
+            self._read_classes(element, element.get("class", "main"), {})
+        self.bodies: list[FileBody] = []
+        self.joints: list[FileJoint] = []
+        for world in self.root.findall("worldbody"):
+            for element in world.findall("body"):
+                self._read_body(element, -1, np.zeros(3), np.eye(3), world.get("childclass"))
+
+    def error(self, what: str, instead: str) -> InputError:
+        """A sentence on this file."""
+        return InputError(f"{one_line(self.path)} {what}, which cannot be read; {instead}.")
+
+    # -- attributes --------------------------------------------------------------------------------
+
+    def _read_classes(self, element: ET.Element, name: str, above: dict[str, dict[str, str]]) -> None:
+        own = {tag: dict(told) for tag, told in above.items()}
+        for child in element:
+            if child.tag != "default":
+                own[child.tag] = own.get(child.tag, {}) | child.attrib
+        self.classes[name] = own
+        for child in element.findall("default"):
+            self._read_classes(child, child.get("class", ""), own)
+
+    def told(self, element: ET.Element, childclass: str | None = None, *also: str) -> dict[str, str]:
+        """Attributes of an element with those of its class; `also` names tags whose defaults count."""
+        name = element.get("class", childclass or "main")
+        if name not in self.classes:
+            raise self.error(f"names the class {one_line(name)!r}", "define it under <default>")
+        known = self.classes[name]
+        found: dict[str, str] = {}
+        for tag in (*also, element.tag):
+            found |= known.get(tag, {})
+        return found | element.attrib
+
+    def numbers(self, told: dict[str, str], name: str, count: int | None, default: Any = None) -> Any:
+        """Numbers of an attribute; the default where it lacks.
+
+        Raises:
+            InputError: Something else than that many finite numbers.
+        """
+        if name not in told:
+            return default
+        try:
+            found = np.array([float(x) for x in told[name].split()])
+        except ValueError:
+            found = np.array([math.nan])
+        if (
+            not len(found)
+            or not (np.abs(found) < LARGEST_NUMBER).all()
+            or (count is not None and len(found) != count)
+        ):
+            need = "numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
+            raise self.error(f'has {name}="{one_line(told[name])[:40]}"', f"write {need}")
+        return found
+
+    def number(self, told: dict[str, str], name: str, default: float = 0.0) -> float:
+        """One number of an attribute."""
+        found = self.numbers(told, name, 1)
+        return default if found is None else float(found[0])
+
+    def _turn(self, told: dict[str, str]) -> np.ndarray:
+        """The matrix of the orientation that an element has."""
+        unit = math.pi / 180 if self.degrees else 1.0
+        if "quat" in told:
+            w, *xyz = self.numbers(told, "quat", 4)
+            return _turned(np.array(xyz), 2 * math.atan2(float(np.linalg.norm(xyz)), w))
+        if "axisangle" in told:
+            *axis, angle = self.numbers(told, "axisangle", 4)
+            return _turned(np.array(axis), angle * unit)
+        if "euler" in told:
+            matrix = np.eye(3)
+            sequence = self.settings.get("eulerseq", "xyz")
+            if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
+                raise self.error(f'has eulerseq="{one_line(sequence)[:20]}"', "write three of x, y, z")
+            for letter, angle in zip(sequence, self.numbers(told, "euler", 3), strict=True):
+                one = _turned(np.eye(3)["xyz".index(letter.lower())], angle * unit)
+                # Small letters are axes that turn with the body.
+                matrix = matrix @ one if letter.islower() else one @ matrix
+            return matrix
+        if "xyaxes" in told:
+            six = self.numbers(told, "xyaxes", 6)
+            x = _unit(six[:3])
+            y = _unit(six[3:] - (six[3:] @ x) * x)
+            return np.column_stack([x, y, np.cross(x, y)])
+        if "zaxis" in told:
+            return _turn_to(self.numbers(told, "zaxis", 3))
+        return np.eye(3)
+
+    # -- bodies ------------------------------------------------------------------------------------
+
+    def _read_body(
+        self, element: ET.Element, parent: int, at: np.ndarray, turn: np.ndarray, childclass: str | None
+    ) -> None:
+        told, number = dict(element.attrib), len(self.bodies)
+        childclass = told.get("childclass", childclass)
+        if self.number(told, "gravcomp"):
+            raise self.error("has gravcomp on a body", "leave it out")
+        at = at + turn @ (self.numbers(told, "pos", 3, np.zeros(3)))
+        turn = turn @ self._turn(told)
+        mass, centre, inertia = self._mass(element, childclass)
+        inertia = turn @ inertia @ turn.T
+        name = told.get("name", f"body {number}")
+        self.bodies.append(FileBody(name, parent, mass, at + turn @ (centre), inertia))
+        for joint in element.findall("joint"):
+            own = self.told(joint, childclass)
+            kind = own.get("type", "hinge")
+            if kind not in ("hinge", "slide"):
+                continue  # moves in more than one way: no machine of one joint, and named by nobody
+            axis = _unit(turn @ (self.numbers(own, "axis", 3, np.array([0.0, 0.0, 1.0]))))
+            anchor = at + turn @ (self.numbers(own, "pos", 3, np.zeros(3)))
+            label = own.get("name", f"joint {len(self.joints)}")
+            self.joints.append(FileJoint(label, number, kind == "slide", axis, anchor, own))
+        for child in element.findall("body"):
+            self._read_body(child, number, at, turn, childclass)
+
+    def _mass(self, body: ET.Element, childclass: str | None) -> tuple[float, np.ndarray, np.ndarray]:
+        """Mass, centre and inertia of a body, in its frame."""
+        inertial, mode = body.find("inertial"), self.settings.get("inertiafromgeom", "auto")
+        if inertial is not None and mode != "true":
+            told = dict(inertial.attrib)
+            mass = self.number(told, "mass", math.nan)
+            if not mass >= 0:
+                raise self.error("has an <inertial> without a mass", 'write mass="..."')
+            matrix = self._turn(told)
+            inertia = np.diag(self.numbers(told, "diaginertia", 3, np.zeros(3)))
+            if "fullinertia" in told:
+                xx, yy, zz, xy, xz, yz = self.numbers(told, "fullinertia", 6)
+                inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            return mass, self.numbers(told, "pos", 3, np.zeros(3)), matrix @ inertia @ matrix.T
+        parts = [] if mode == "false" else list(self._shapes(body, childclass))
+        mass = sum(m for m, _, _ in parts)
+        if not mass:
+            return 0.0, np.zeros(3), np.zeros((3, 3))
+        centre = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass
+        inertia = np.zeros((3, 3))
+        for m, c, own in parts:
+            r = c - centre
+            inertia += own + m * (r @ r * np.eye(3) - np.outer(r, r))
+        return mass, centre, inertia
+
+    def _shapes(
+        self, body: ET.Element, childclass: str | None
+    ) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+        for element in body.findall("geom"):
+            told = self.told(element, childclass)
+            density = self.number(told, "density", WATER)
+            if told.get("mass") is not None and not self.number(told, "mass"):
+                continue
+            if "mass" not in told and not density:
+                continue
+            kind, size = told.get("type", "sphere"), self.numbers(told, "size", None, np.zeros(1))
+            if told.get("shellinertia") == "true":
+                raise self.error(
+                    "has a shape of which only the shell has mass", "give its body an <inertial>"
+                )
+            place, turn = self.numbers(told, "pos", 3, np.zeros(3)), self._turn(told)
+            if "fromto" in told:
+                ends = self.numbers(told, "fromto", 6)
+                place, turn = (ends[:3] + ends[3:]) / 2, _turn_to(ends[3:] - ends[:3])
+                half = float(np.linalg.norm(ends[3:] - ends[:3])) / 2
+                size = (
+                    np.array([size[0], size[0], half])
+                    if kind in ("box", "ellipsoid")
+                    else np.array([size[0], half])
+                )
+            volume, per_mass = self._solid(kind, size)
+            mass = self.number(told, "mass", density * volume)
+            yield mass, place, turn @ np.diag(mass * per_mass) @ turn.T
+
+    def _solid(self, kind: str, size: np.ndarray) -> tuple[float, np.ndarray]:
+        """Volume, and moments of inertia per mass."""
+        need = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
+        if kind not in need or len(size) < need[kind] or not (size[: need[kind]] > SMALLEST).all():
+            what = f"has a shape of type {one_line(kind)!r} that counts towards a mass"
+            raise self.error(what, "give its body an <inertial>, or the shape sizes above zero")
+        if kind == "sphere":
+            return 4 / 3 * math.pi * size[0] ** 3, np.full(3, 0.4 * size[0] ** 2)
+        a = size[:3] ** 2
+        if kind in ("box", "ellipsoid"):
+            share, volume = (1 / 3, 8.0) if kind == "box" else (1 / 5, 4 / 3 * math.pi)
+            return volume * float(np.prod(size[:3])), share * np.array(
+                [a[1] + a[2], a[0] + a[2], a[0] + a[1]]
+            )
+        r, half = float(size[0]), float(size[1])
+        tube, ball = 2 * math.pi * r**2 * half, 4 / 3 * math.pi * r**3
+        if kind == "cylinder":
+            across = r**2 / 4 + half**2 / 3
+            return tube, np.array([across, across, r**2 / 2])
+        across = tube * (r**2 / 4 + half**2 / 3) + ball * (0.4 * r**2 + half**2 + 0.75 * half * r)
+        along = tube * r**2 / 2 + ball * 0.4 * r**2
+        return tube + ball, np.array([across, across, along]) / (tube + ball)
+
+    def below(self, body: int) -> list[int]:
+        """A body and all that hang on it."""
+        found = {body}
+        for k in range(body + 1, len(self.bodies)):
+            if self.bodies[k].parent in found:
+                found.add(k)
+        return sorted(found)
+
+
+def _parsed(path: str | os.PathLike[str]) -> ET.Element:
+    """The tree of an XML file that declares no types and no entities."""
+    place = path_of(path)
+    shown = one_line(str(place))
+    try:
+        size = place.stat().st_size
+        data = place.read_bytes() if size <= LARGEST_FILE else b""
+    except OSError as error:
+        raise InputError(
+            f"{shown} cannot be read ({error.strerror or error}); give the path of an MJCF file."
+        ) from error
+    if size > LARGEST_FILE:
+        raise InputError(
+            f"{shown} has {size} bytes, but an MJCF file has at most {LARGEST_FILE}; give one of these."
+        )
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+    depth = 0
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise InputError(
+                f"{shown} has more than {DEEPEST} elements inside one another; give an MJCF file."
+            )
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    def refuse(*declared: Any) -> None:
+        raise InputError(
+            f"{shown} declares a document type, which may hide entities; take the declaration out."
+        )
+
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(data, True)
+        return builder.close()
+    except expat.ExpatError as error:
+        raise InputError(f"{shown} is no XML ({error}); give the path of an MJCF file.") from error
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length else np.array([0.0, 0.0, 1.0])
+
+
+def _turned(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Matrix of a turn about an axis (Rodrigues)."""
+    x, y, z = _unit(axis)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * across + (1 - math.cos(angle)) * across @ across
+
+
+def _turn_to(direction: np.ndarray) -> np.ndarray:
+    """Matrix of the turn that takes z into a direction by the shortest way."""
+    z = _unit(direction)
+    axis = np.cross([0.0, 0.0, 1.0], z)
+    sine = float(np.linalg.norm(axis))
+    return _turned(axis if sine > 1e-12 else np.array([1.0, 0.0, 0.0]), math.atan2(sine, float(z[2])))
