@@ -24,6 +24,7 @@ class Table:
         units: by name, where the file has a line of them.
         cut: what may be missing at the end, in a sentence; empty where nothing is.
         objects: by name, the class of what only the program that wrote the file can read.
+        clocks: by name, the column with the times of a column, where the file says it.
     """
 
     label: str
@@ -33,6 +34,7 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     cut: str = ""
     objects: Mapping[str, str] = field(default_factory=dict)
+    clocks: Mapping[str, str] = field(default_factory=dict)
 
     def find(self, name: str, *others: str) -> str:
         """The column that is meant by a name: that one, or one in other capitals or with a unit behind it.
