@@ -18,7 +18,7 @@ from jaxtyping import Real
 
 from rotflex_jax.data.binary import table_from_frame, table_from_mat, table_from_npz, table_from_parquet
 from rotflex_jax.data.logs import Channel, table_from_mcap, table_from_mdf, table_from_tdms, table_of_channels
-from rotflex_jax.data.resampling import resampled, resampled_apart
+from rotflex_jax.data.resampling import TimedSignal, resampled, resampled_apart
 from rotflex_jax.data.spreadsheet import table_from_xlsx
 from rotflex_jax.data.tables import (
     MAX_BYTES,
@@ -376,7 +376,9 @@ def load(
             c: _stamps(table, c, Ts, time_unit, len(table.columns[c]), any_unit) for c in dict.fromkeys(own)
         }
         signals = [
-            (stamps_of[c := table.clocks[name]], x[:, None], k == 0, f"{table.label}: the time {c!r}")
+            TimedSignal(
+                stamps_of[c := table.clocks[name]], x[:, None], k == 0, f"{table.label}: the time {c!r}"
+            )
             for k, (name, x) in enumerate(zip(names, [u, *y.values()], strict=True))
         ]
         start, period, brought, told = resampled_apart(signals, resample, table.where, table.first)

@@ -1,7 +1,7 @@
 """Unevenly sampled signals on an even grid, on request."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -51,13 +51,29 @@ def resampled(
     >>> Ts, u, said.message
     (0.01, array([0., 1., 1., 3., 4.]), 'Resampled every 0.01 s from steps of 0.009 to 0.011 s.')
     """
-    both = [(t, u[:, None], True, label), (t, y, False, label)]
+    both = [TimedSignal(t, u[:, None], True, label), TimedSignal(t, y, False, label)]
     start, Ts, (held, lines), finding = resampled_apart(both, period, where, first)
     return start, Ts, held[:, 0], lines, finding
 
 
+class TimedSignal(NamedTuple):
+    """A signal with times of its own.
+
+    Attributes:
+        t: Times, which may repeat but not fall [s].
+        x: Values.
+        held: Whether it keeps its value from one sample to the next; otherwise it follows straight lines.
+        label: First words of an error.
+    """
+
+    t: Float[np.ndarray, " N"]
+    x: Float[np.ndarray, "N C"]
+    held: bool
+    label: str
+
+
 def resampled_apart(
-    signals: Sequence[tuple[np.ndarray, np.ndarray, bool, str]],
+    signals: Sequence[TimedSignal],
     period: Any,
     where: str = "row",
     first: int = 1,
@@ -65,8 +81,7 @@ def resampled_apart(
     """Signals with times of their own at common even times, from where all have begun to where one ends.
 
     Args:
-        signals: of each its times [s], its values by row, whether it is held between its samples, and the
-            first words of an error.
+        signals: Signals; those with the same array of times share a clock.
         period: Sampling period to have [s], or "auto" for the longest of the median steps.
         where: What one entry is called.
         first: Number of the first entry.
@@ -78,7 +93,8 @@ def resampled_apart(
         InputError: As `resampled`, or signals that no time has in common.
 
     >>> k = np.arange(5.0)
-    >>> fast, slow = (0.01 * k, k[:, None], True, "u"), (0.004 + 0.02 * k, k[:, None], False, "y")
+    >>> fast = TimedSignal(0.01 * k, k[:, None], True, "u")
+    >>> slow = TimedSignal(0.004 + 0.02 * k, k[:, None], False, "y")
     >>> start, Ts, (u, y), _ = resampled_apart([fast, slow], "auto")
     >>> start, Ts, u[:, 0], y[:, 0]
     (0.004, 0.02, array([0., 2.]), array([0., 1.]))
