@@ -71,7 +71,7 @@ def export(
     prefix: given.Prefix = "rotflex",
     effects: given.OwnEffects = None,
 ) -> None:
-    """Give a model as C code for a controller, as equations, or as state space."""
+    """Give a model or a controller of it as C code, as equations, or as state space."""
     form = by_name.choose(to, given.EXPORT_FORMS, "form of export")
     given.check_writable(json_file=out)
     from rotflex_jax import export as forms
@@ -80,14 +80,19 @@ def export(
     for file in effects or []:
         imported(file)
     subject, period = by_name.model(model), Ts
-    if form == "c" and period is None and model.endswith(".json"):
+    in_c = form in ("c", "controller")
+    if in_c and period is None and model.endswith(".json"):
         period = forms.read(model).Ts
-    if form == "c" and period is None:
+    if in_c and period is None:
         raise InputError(
             f"{model} does not say how its data were sampled, but C code needs a sampling period; give --Ts."
         )
     if form == "c":
         text = forms.to_c(subject, float(period or 0), prefix)
+    elif form == "controller":
+        from rotflex_jax.control import controller, controller_to_c
+
+        text = controller_to_c(controller(subject, float(period or 0)), prefix=prefix)
     elif form == "statespace":
         text = json.dumps(forms.state_space(subject, period).to_dict(), indent=2) + "\n"
     else:

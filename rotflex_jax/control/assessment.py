@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from rotflex_jax.checks import number, seed as checked_seed, shown, whole
 from rotflex_jax.control.closed_loop import ClosedLoop, run_loop
-from rotflex_jax.control.controller import Controller
+from rotflex_jax.control.design import Controller
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import Fit
 from rotflex_jax.mechanism import Mechanism

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from rotflex_jax.checks import shown
-from rotflex_jax.control.controller import Controller
+from rotflex_jax.control.design import Controller
 from rotflex_jax.errors import InputError
 from rotflex_jax.text.plain import one_line
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from rotflex_jax.checks import number, seed as checked_seed, shown
-from rotflex_jax.control.controller import Controller
+from rotflex_jax.control.design import Controller
 from rotflex_jax.control.motion import PlannedMotion
 from rotflex_jax.effects.base import Actuation
 from rotflex_jax.errors import InputError
