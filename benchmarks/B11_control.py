@@ -5,7 +5,8 @@
 
 A recording of ten seconds is fitted by the joint with the effect in it; the controller is designed on the fit
 alone. It then drives the simulator along a reference, once with the found torque along the planned motion
-and once without, and every model that the fit leaves possible. Writes results/B11.json.
+and once without, and every model that the fit leaves possible. Writes results/B11.json, and for the first
+machine docs/figures/control.png.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from rotflex_jax.control import close_loop
 from rotflex_jax.text.files import write_file
 
 RESULT = Path(__file__).resolve().parent / "results" / "B11.json"
+FIGURE = Path(__file__).resolve().parents[1] / "docs" / "figures" / "control.png"
 DRAWS = 20
 
 # What is hidden in the simulator, and the effect with which the fit starts.
@@ -39,7 +41,7 @@ MACHINES: dict[str, tuple[dict, fx.Effect]] = {
         fx.Stribeck("hub", level=0.05),
     ),
     "asymmetric": (
-        {("coulomb_asymmetric", "hub"): {"forward": 0.14, "backward": 0.06}},
+        {("coulomb_asymmetric", "hub"): {"level_plus": 0.14, "level_minus": 0.06}},
         fx.CoulombAsymmetric("hub", forward=0.05, backward=0.05),
     ),
 }
@@ -60,12 +62,17 @@ def measured(name: str) -> dict[str, Any]:
     wanted = reference(r["Ts"])
     row: dict[str, Any] = {"status": fit.status}
     row["found"] = {e.name: e.value for e in fit.parameters if effect.name in e.name}
+    runs = {}
     for compensate in ("nothing", "feedforward", "observer", "both"):
         controller = rf.controller(fit, r["Ts"], compensate=compensate)
         run = close_loop(controller, Machine.of(r), wanted)
         row[compensate] = run.to_dict()
         if compensate == "feedforward":
             row["credible"] = rf.assess(controller, fit, wanted, count=DRAWS).to_dict()
+        runs[compensate] = run
+    if name == next(iter(MACHINES)):
+        runs["feedforward"].plot(runs["nothing"]).savefig(FIGURE, dpi=110)
+    row["degrees"] = {compensate: float(np.rad2deg(run.rms)) for compensate, run in runs.items()}
     row["ratio"] = row["feedforward"]["rms"] / row["nothing"]["rms"]
     return row
 
@@ -79,9 +86,10 @@ def main() -> None:
     rows = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     for name in parser.parse_args().machines:
         rows[name] = measured(name)
+        rows = {machine: rows[machine] for machine in MACHINES if machine in rows}
         write_file(RESULT, json.dumps(rows, indent=1) + "\n")
-        each = {k: rows[name][k]["rms"] for k in ("nothing", "feedforward", "observer", "both")}
-        told = ", ".join(f"{k} {np.rad2deg(v):.3f}" for k, v in each.items())
+        each = rows[name]["degrees"]
+        told = ", ".join(f"{k} {v:.3f}" for k, v in each.items())
         cycles = [k for k in each if rows[name][k]["limit_cycle"]]
         broken = rows[name]["credible"]["broken"]
         ratio = rows[name]["ratio"]

@@ -16,7 +16,7 @@ from rotflex_jax.cli import main
 from rotflex_jax.control import close_loop, controller_to_c, credible_models
 from rotflex_jax.control.closed_loop import run_loop
 from rotflex_jax.control.design import AT_REST
-from rotflex_jax.control.motion import torques_along
+from rotflex_jax.control.motion import Tracking, torques_along
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.linear import zero_order_hold
 
@@ -139,6 +139,30 @@ def test_a_planned_voltage_alone_moves_the_model_along_the_reference(port):
     assert np.max(np.abs(position - wanted)) < 2e-3
 
 
+def test_a_tracked_motion_is_the_best_one():
+    """Beside the dense least squares of the same sum; the end has nothing to follow, so it ends for both."""
+    A, B = np.array([[1.0, 0.1], [-0.2, 0.9]]), np.array([0.005, 0.1])
+    c, effort, N = np.array([1.0, 0.0]), 1e-2, 300
+    rng = np.random.default_rng(5)
+    r, pushes = np.zeros(N), np.zeros((N, 2))
+    r[20:100], pushes[10:120] = 1.0, 0.1 * rng.normal(size=(110, 2))
+    X, u = Tracking(A, B, c, effort).solve(r, pushes)
+    # x_k = sum over j < k of A^(k-1-j) (B u_j + d_j)
+    powers = [np.eye(2)]
+    for _ in range(N):
+        powers.append(A @ powers[-1])
+    G = np.zeros((N, N))
+    free = np.zeros(N)
+    for k in range(N):
+        for j in range(k):
+            G[k, j] = c @ powers[k - 1 - j] @ B
+            free[k] += c @ powers[k - 1 - j] @ pushes[j]
+    whole = np.vstack([G, np.sqrt(effort) * np.eye(N)])
+    best = np.linalg.lstsq(whole, np.append(r - free, np.zeros(N)), rcond=None)[0]
+    np.testing.assert_allclose(u, best, atol=1e-6)
+    np.testing.assert_allclose(X @ c, free + G @ best, atol=1e-6)
+
+
 def test_the_plan_with_friction_moves_the_model_that_has_it():
     """Without feedback: friction is an integrator's error, so the plan must be right at every reversal."""
     wanted = swing(still=0.0)
@@ -207,9 +231,15 @@ def test_the_voltage_keeps_its_limit_and_the_observer_does_not_wind_up():
     assert run.position.max() < 2.3 and abs(run.error[-1]) < 0.01
 
 
-@pytest.mark.parametrize(("decay", "found"), [(0.0, True), (0.5, False)], ids=["sustained", "dies out"])
-def test_a_limit_cycle_is_told_with_its_size_and_frequency(decay, found):
-    wobble = lambda k: 0.05 * np.exp(-decay * TS * k) * np.sin(2 * np.pi * 3.0 * TS * k)  # noqa: E731
+@pytest.mark.parametrize(
+    ("decay", "drift", "found"),
+    [(0.0, 0.0, True), (0.5, 0.0, False), (40.0, 0.02, False)],
+    ids=["sustained", "dies out", "drifts"],
+)
+def test_a_limit_cycle_is_told_with_its_size_and_frequency(decay, drift, found):
+    def wobble(k: int) -> float:
+        return drift * TS * k + 0.05 * np.exp(-decay * TS * k) * np.sin(2 * np.pi * 3.0 * TS * k)
+
     run = close_loop(rf.controller(JOINT, TS), Linear(wobble=wobble), np.zeros(3000))
     assert (run.limit_cycle is not None) == found
     if run.limit_cycle is not None:

@@ -25,7 +25,7 @@ MOST_DRAWS = 200
 """Draws for one model before parameters count as lying outside of their bounds."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class ControlAssessment:
     """Runs of one controller on several models.
 
@@ -94,6 +94,9 @@ class ControlAssessment:
     def _repr_html_(self) -> str:
         headings, rows = self._rows()
         return card("Control of every model", paragraph(self.sentence), table(headings, rows, words=2))
+
+    def __repr__(self) -> str:
+        return str(self)
 
     def __str__(self) -> str:
         headings, rows = self._rows()

@@ -68,7 +68,7 @@ class Plant(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class ClosedLoop:
     """A run under a controller.
 
@@ -162,6 +162,9 @@ class ClosedLoop:
             "saturated": self.saturated,
             "limit_cycle": None if cycle is None else cycle._asdict(),
         }
+
+    def __repr__(self) -> str:
+        return str(self)
 
     def __str__(self) -> str:
         if not self.bounded:

@@ -39,7 +39,7 @@ ENCODER = 2 * np.pi / 4096
 """Step of the sensors unless it is given [rad]."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Controller:
     """Discrete feedback about a planned motion: from `controller`.
 
@@ -119,6 +119,9 @@ class Controller:
         """States of the linear part at rest at a position of the port."""
         n = len(self.row)
         return at_rest(self.A[:n, :n], self.B[:n], self.row, position)
+
+    def __repr__(self) -> str:
+        return str(self)
 
     def __str__(self) -> str:
         slowest = np.min(np.abs(np.real(self.poles)))
