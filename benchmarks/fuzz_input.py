@@ -93,7 +93,20 @@ def mat_seeds() -> list[bytes]:
     for values, how in ((plain, {}), (plain, {"format": "4"}), (rich, {}), (rich, {"do_compression": True})):
         scipy.io.savemat(out := io.BytesIO(), values, **how)  # type: ignore[arg-type]
         found.append(out.getvalue())
-    return found
+    return [*found, timetable_seed()]
+
+
+def timetable_seed() -> bytes:
+    """Version 5 with a timetable and the signals beside it."""
+    import matio
+    import pandas as pd
+
+    plain = columns()
+    index = pd.to_timedelta(1000 * plain["t"], unit="ms")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "run.mat"
+        matio.save_to_mat(str(file), {"log": pd.DataFrame(plain, index=index), **plain}, version="v7")
+        return file.read_bytes()
 
 
 def hdf5_seeds() -> list[bytes]:

@@ -2,6 +2,9 @@
 
 import io
 import re
+import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +45,71 @@ def exact(recording) -> None:
     assert recording.Ts == pytest.approx(0.002, rel=1e-9)
     np.testing.assert_array_equal(recording.u, VOLTAGE)
     np.testing.assert_array_equal(recording.y, np.column_stack([THETA, ALPHA]))
+
+
+# -- MATLAB ----------------------------------------------------------------------------------------------
+
+
+def timetable(path: Path, index, version: str = "v7", **others) -> Path:
+    """A file with the timetable `log`, written by another implementation of MATLAB's objects."""
+    matio, pd = pytest.importorskip("matio"), pytest.importorskip("pandas")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        values = {"log": pd.DataFrame(SIGNALS, index=index), **others}
+        matio.save_to_mat(str(path), values, version=version)
+    return path
+
+
+PARTS = {"input": "log.voltage", "outputs": ("log.theta", "log.alpha")}
+
+
+@pytest.mark.parametrize("kind", ["durations", "dates"])
+def test_a_timetable_of_matlab_is_read_with_its_times(tmp_path, kind):
+    pd = pytest.importorskip("pandas")
+    index = pd.to_timedelta(2 * K, unit="ms")
+    if kind == "dates":
+        index = pd.Timestamp("2025-03-01 10:00") + index
+    path = timetable(tmp_path / "run.mat", index, gain=7.0)
+    recording = load(path, **PARTS)
+    assert recording.Ts == pytest.approx(0.002, rel=1e-6)
+    np.testing.assert_array_equal(recording.u, VOLTAGE)
+    np.testing.assert_array_equal(recording.y, np.column_stack([THETA, ALPHA]))
+    refused(path, r"log\.voltage", input="log.volts", outputs=PARTS["outputs"])
+
+
+def test_a_table_beside_a_structure_is_read(tmp_path):
+    pd = pytest.importorskip("pandas")
+    path = timetable(tmp_path / "run.mat", pd.RangeIndex(N), of={"t": T})
+    exact(load(path, time="of.t", **PARTS))
+
+
+def test_a_timetable_of_version_7_3_is_refused_with_its_cure(tmp_path):
+    pytest.importorskip("h5py")
+    pd = pytest.importorskip("pandas")
+    path = timetable(tmp_path / "run.mat", pd.to_timedelta(2 * K, unit="ms"), "v7.3")
+    refused(path, r"log \(timetable\): save .* a timetable with -v7", **PARTS)
+
+
+def test_a_damaged_timetable_is_left_out_and_named(tmp_path):
+    """The numbers of its properties are gone, the file around them is whole."""
+    pd = pytest.importorskip("pandas")
+    path = timetable(tmp_path / "run.mat", pd.to_timedelta(2 * K, unit="ms"), also=np.arange(9.0))
+    data = path.read_bytes()
+    parts, at = [data[:128]], 128
+    place = struct.unpack_from("<Q", data, 116)[0]
+    while at < len(data):
+        size = struct.unpack_from("<I", data, at + 4)[0]
+        plain = zlib.decompress(data[at + 8 : at + 8 + size])
+        if at == place:
+            assert b"rowTimes" in plain and plain.count(b"millis") == 1
+            plain = plain.replace(b"millis", b"milles")
+        packed = zlib.compress(plain)
+        if at == place:
+            parts[0] = data[:116] + struct.pack("<Q", sum(map(len, parts))) + data[124:128]
+        parts.append(struct.pack("<II", 15, len(packed)) + packed)
+        at += 8 + size
+    path.write_bytes(b"".join(parts))
+    refused(path, r"objects that only MATLAB reads .* log \(timetable\)", **PARTS)
 
 
 # -- LabVIEW ---------------------------------------------------------------------------------------------

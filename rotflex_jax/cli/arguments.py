@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
-EXPORT_FORMS = ("c", "controller", "latex", "text", "statespace")
+EXPORT_FORMS = ("c", "latex", "text", "statespace", "controller")
 
 Files = Annotated[
     list[Path],

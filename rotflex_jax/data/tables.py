@@ -94,7 +94,8 @@ class Table:
         names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
         if objects:
-            then += f"; objects that only MATLAB reads are left out, {objects}: save their .Time and .Data"
+            cure = "save their .Time and .Data, a timetable with -v7"
+            then += f"; objects that only MATLAB reads are left out, {objects}: {cure}"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
 
 
