@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import scipy
 from numpy.typing import NDArray
 
 import rotflex_jax as rf
@@ -147,16 +148,12 @@ def test_a_tracked_motion_is_the_best_one():
     r, pushes = np.zeros(N), np.zeros((N, 2))
     r[20:100], pushes[10:120] = 1.0, 0.1 * rng.normal(size=(110, 2))
     X, u = Tracking(A, B, c, effort).solve(r, pushes)
-    # x_k = sum over j < k of A^(k-1-j) (B u_j + d_j)
-    powers = [np.eye(2)]
-    for _ in range(N):
-        powers.append(A @ powers[-1])
-    G = np.zeros((N, N))
-    free = np.zeros(N)
+    # c x_k = sum over j < k of c A^(k-1-j) B u_j, and what the pushes make of a state at rest.
+    response, free, b, x = np.zeros(N), np.zeros(N), B, np.zeros(2)
     for k in range(N):
-        for j in range(k):
-            G[k, j] = c @ powers[k - 1 - j] @ B
-            free[k] += c @ powers[k - 1 - j] @ pushes[j]
+        free[k], x = c @ x, A @ x + pushes[k]
+        response[k], b = (0.0, B) if k == 0 else (c @ b, A @ b)
+    G = scipy.linalg.toeplitz(response, np.zeros(N))
     whole = np.vstack([G, np.sqrt(effort) * np.eye(N)])
     best = np.linalg.lstsq(whole, np.append(r - free, np.zeros(N)), rcond=None)[0]
     np.testing.assert_allclose(u, best, atol=1e-6)
