@@ -71,7 +71,13 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
     if isinstance(source, str | os.PathLike) and os.path.isdir(source):
         folder = Path(source)
         files = sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS and p.is_file())
-        return _together(files, f"{folder!s:.300}", max_bytes, time)
+        try:
+            return _together(files, f"{folder!s:.300}", max_bytes, time)
+        except InputError as error:
+            if not files:
+                raise
+            told = f"The folder {folder!s:.100} as one recording with a file for each channel: {error}"
+            raise InputError(told) from error
     path = readable_file(source)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
