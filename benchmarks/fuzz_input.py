@@ -93,7 +93,20 @@ def mat_seeds() -> list[bytes]:
     for values, how in ((plain, {}), (plain, {"format": "4"}), (rich, {}), (rich, {"do_compression": True})):
         scipy.io.savemat(out := io.BytesIO(), values, **how)  # type: ignore[arg-type]
         found.append(out.getvalue())
-    return found
+    return [*found, timetable_seed()]
+
+
+def timetable_seed() -> bytes:
+    """Version 5 with a timetable and the signals beside it."""
+    import matio
+    import pandas as pd
+
+    plain = columns()
+    index = pd.to_timedelta(1000 * plain["t"], unit="ms")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "run.mat"
+        matio.save_to_mat(str(file), {"log": pd.DataFrame(plain, index=index), **plain}, version="v7")
+        return file.read_bytes()
 
 
 def hdf5_seeds() -> list[bytes]:
@@ -146,6 +159,63 @@ def parquet_seeds() -> list[bytes]:
     found = []
     for table, how in ((plain, {}), (rich, {"compression": "gzip"}), (rich, {"compression": "none"})):
         pyarrow.parquet.write_table(table, out := io.BytesIO(), **how)
+        found.append(out.getvalue())
+    return found
+
+
+def tdms_seeds() -> list[bytes]:
+    """Waveforms, and a channel of times beside whole numbers and text."""
+    import nptdms
+
+    found = []
+    for waveform in (True, False):
+        signals = columns() | ({} if waveform else {"count": np.arange(60), "word": ["a", "bc"] * 30})
+        about = {"wf_increment": 0.002} if waveform else {"unit_string": "rad"}
+        if waveform:
+            del signals["t"]
+        with nptdms.TdmsWriter(out := io.BytesIO()) as writer:
+            for part in (slice(40), slice(40, None)):
+                channels = [nptdms.ChannelObject("run", n, x[part], about) for n, x in signals.items()]
+                writer.write_segment(channels)
+        found.append(out.getvalue())
+    return found
+
+
+def mdf_seeds() -> list[bytes]:
+    """Plain and packed, one group and two."""
+    import asammdf
+
+    found = []
+    for packed in (0, 1, 2):
+        with asammdf.MDF(version="4.10") as file:
+            signals = columns()
+            t = signals.pop("t")
+            file.append([asammdf.Signal(x, t, name=name, unit="rad") for name, x in signals.items()])
+            if packed:
+                file.append([asammdf.Signal(np.arange(9, dtype=np.int16), np.arange(9.0), name="slow")])
+            file.save(out := io.BytesIO(), overwrite=True, compression=packed)
+        found.append(out.getvalue())
+    return found
+
+
+def mcap_seeds() -> list[bytes]:
+    """Joint states and a number, plain and packed."""
+    from mcap.writer import CompressionType
+    from mcap_ros2.writer import Writer
+
+    signals = columns()
+    found = []
+    for packed in CompressionType:
+        writer = Writer(out := io.BytesIO(), compression=packed)
+        plain = writer.register_msgdef("std_msgs/msg/Float64", "float64 data")
+        lists = writer.register_msgdef("my/msg/Log", "float64[] values\nstring word\nint16[2] pair")
+        for k, at in enumerate((1e9 * signals["t"]).astype(int).tolist()):
+            for name in ("voltage", "theta", "alpha"):
+                message = {"data": float(signals[name][k])}
+                writer.write_message(f"/{name}", plain, message, log_time=at, publish_time=at)
+            message = {"values": [1.0, 2.0], "word": "x", "pair": [1, 2]}
+            writer.write_message("/log", lists, message, log_time=at, publish_time=at)
+        writer.finish()
         found.append(out.getvalue())
     return found
 
@@ -349,6 +419,9 @@ FORMATS = {
     "hdf5": Format(".mat", hdf5_seeds),
     "parquet": Format(".parquet", parquet_seeds),
     "xlsx": Format(".xlsx", xlsx_seeds, mutated_npz),
+    "tdms": Format(".tdms", tdms_seeds),
+    "mdf": Format(".mf4", mdf_seeds),
+    "mcap": Format(".mcap", mcap_seeds),
     "model": Format(".json", model_seeds, text=True),
     "fleet": Format(".row", fleet_seeds, text=True),
     "command": Format(".line", command_seeds, mutated_command),

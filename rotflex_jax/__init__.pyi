@@ -1,6 +1,7 @@
 from . import (
     adaptive as adaptive,
     basis as basis,
+    control as control,
     data as data,
     effects as effects,
     export as export,
@@ -10,6 +11,7 @@ from . import (
 )
 from .batch import Fleet as Fleet, fleet as fleet
 from .compare import Comparison as Comparison, compare as compare
+from .control import Controller as Controller, assess as assess, controller as controller
 from .data import load as load
 from .discover import (
     Discovery as Discovery,

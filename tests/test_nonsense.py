@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax import adaptive, basis, checks, export, joints, kernels, metrics
+from rotflex_jax import adaptive, basis, checks, control, export, joints, kernels, metrics
 from rotflex_jax.data import excitation, save_csv
 from rotflex_jax.discover.probabilities import Probabilities
 from rotflex_jax.errors import InputError
@@ -31,6 +31,7 @@ MODEL = Model(JOINT)
 FRAME = pd.DataFrame({"t": 0.002 * np.arange(N), "voltage": U, "theta": Y[:, 0], "alpha": Y[:, 1]})
 SERIES = basis.Volterra(basis.Delays(3))
 LIMITS = rf.Limits(voltage=5.0)
+CONTROLLER = rf.controller(JOINT, 0.002)
 NOISE = {"theta": 1e-3, "alpha": 1e-3}
 AT_REST = rf.Recording(
     u=U, y=np.column_stack([Y[:, 0], np.zeros(N)]), Ts=0.002, accept=("constant", "saturated")
@@ -99,6 +100,15 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "Model.save": (MODEL.save, {"path": "never-made"}),
     "Mechanism.with_values": (JOINT.with_values, {}),
+    "controller": (rf.controller, {"model": JOINT, "Ts": 0.002}),
+    "Controller.plan": (CONTROLLER.plan, {"reference": np.zeros(50)}),
+    "close_loop": (
+        control.close_loop,
+        {"controller": CONTROLLER, "plant": JOINT, "reference": np.zeros(50)},
+    ),
+    "assess": (rf.assess, {"controller": CONTROLLER, "models": [JOINT], "reference": np.zeros(50)}),
+    "credible_models": (control.credible_models, {"fit": None}),
+    "controller_to_c": (control.controller_to_c, {"controller": CONTROLLER}),
     "export.to_c": (export.to_c, {"model": JOINT, "Ts": 0.002}),
     "export.latex": (export.latex, {"model": JOINT}),
     "export.text": (export.text, {"model": JOINT}),
@@ -261,6 +271,38 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ],
     ("simulate", "solver"): [("rk4", r"must be Exponential\(...\) or SmoothRK4\(...\), but is 'rk4'")],
     ("linearise", "mechanism"): [*NO_MODEL, (joints.paper(arm_inertia=0.0), "inertia")],
+    ("controller", "model"): [*NO_MODEL, (joints.paper(arm_inertia=0.0), "inertia")],
+    ("controller", "Ts"): [*NO_SECONDS, (None, "is None")],
+    ("controller", "accuracy"): NO_SECONDS,
+    ("controller", "limit"): NO_SECONDS,
+    ("controller", "port"): [("x", "one of 'hub', 'joint', 'arm', but is 'x'"), (3, "but is 3")],
+    ("controller", "load"): [("x", "one of 'hub', 'joint', 'arm', but is 'x'"), (3, "but is 3")],
+    ("controller", "compensate"): [("all", "one of 'nothing', .* but is 'all'"), (None, "is None")],
+    ("controller", "poles"): [
+        ([-1.0, -2.0], "must be 4 poles .* but is a list"),
+        ([-1.0, -2.0, -3.0, 4.0], "negative real parts"),
+        ([-1.0, -1.0, -3.0, -4.0], "must be different ones"),
+        ([-1.0 + 2j, -1.0, -3.0, -4.0], "complex ones in pairs"),
+        ("fast", "but is 'fast'"),
+    ],
+    ("controller", "resolution"): [(0, "above 0"), ({"x": 1.0}, "one of 'theta', 'alpha', but is 'x'")],
+    ("Controller.plan", "reference"): [
+        ([NAN] * 9, "is nan at sample 0"),
+        (3.0, "of shape"),
+        ([], "of shape"),
+    ],
+    ("close_loop", "plant"): [(None, "but is None"), (3, "a model, or an object with read")],
+    ("close_loop", "noise"): [(-1, "is -1"), (NAN, "is nan")],
+    ("close_loop", "seed"): [(-1, "is -1"), ("a", "is 'a'")],
+    ("assess", "models"): [
+        ([], "is a list"),
+        (3, "is 3"),
+        ([3], "'model 1' is 3"),
+        (JOINT, "is a Mechanism"),
+    ],
+    ("assess", "hold"): [(-1, "is -1"), (NAN, "is nan")],
+    ("credible_models", "fit"): [(None, "is None"), (3, "is 3")],
+    ("controller_to_c", "prefix"): [("1a", "begins no name in C"), (3, "begins no name in C")],
     ("locate", "recording"): NO_RECORDINGS[:3],
     ("locate", "residual"): [(Y[:5], "a finite number for each"), (np.full_like(Y, NAN), "400 of them")],
     ("locate", "window_seconds"): NO_SECONDS,

@@ -22,6 +22,7 @@ PACKAGES = {
     "rotflex_jax.discover": "Discovery",
     "rotflex_jax.latent": "Latent torque",
     "rotflex_jax.experiment": "The next experiment",
+    "rotflex_jax.control": "Controllers",
     "rotflex_jax.compare": "Every method on the same recording",
     "rotflex_jax.batch": "Many recordings",
     "rotflex_jax.notebook": "In a notebook",

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
 STDOUT = Path("-")
 SIMULATORS = ("mjcf", "urdf", "fmu", "bam")
-EXPORT_FORMS = ("c", "latex", "text", "statespace", *SIMULATORS)
+EXPORT_FORMS = ("c", "latex", "text", "statespace", "controller", *SIMULATORS)
 
 Files = Annotated[
     list[Path],
     typer.Argument(
         metavar="FILE...",
-        help="Recordings: .csv, .tsv, .xlsx, .mat, .npz, .parquet; or rotflex, the public data set.",
+        help="Recordings: .csv, .tsv, .xlsx, .mat, .npz, .parquet, .tdms, .mf4, .mcap; a folder with a file "
+        "for each channel; or rotflex, the public data set.",
     ),
 ]
 JointName = Annotated[
@@ -320,8 +321,6 @@ class Columns:
         """The recording in a file."""
         if not file.exists():
             raise InputError(f"{file} does not exist; give the path of a recording.")
-        if file.is_dir():
-            raise InputError(f"{file} is a folder, but a recording is one file; name the file.")
         from rotflex_jax.data import load
 
         try:

@@ -74,7 +74,7 @@ def export(
     length: given.PendulumLength = 0.1,
     actuator: given.ServoName = "xl330",
 ) -> None:
-    """Give a model as C code for a controller, as equations, as state space, or for a simulator."""
+    """Give a model as C code, as equations, as state space or for a simulator, or a controller of it in C."""
     form = by_name.choose(to, given.EXPORT_FORMS, "form of export")
     given.check_writable(json_file=out)
     if form == "fmu" and out in (None, given.STDOUT):
@@ -85,10 +85,10 @@ def export(
     for file in effects or []:
         imported(file)
     subject, period = by_name.model(model), Ts
-    sampled = form == "c" or form in given.SIMULATORS
+    sampled = form in ("c", "controller", *given.SIMULATORS)
     if sampled and period is None and model.endswith(".json"):
         period = forms.read(model).Ts
-    if form in ("c", "fmu") and period is None:
+    if form in ("c", "controller", "fmu") and period is None:
         raise InputError(
             f"{model} does not say how its data were sampled, but C code needs a sampling period; give --Ts."
         )
@@ -109,6 +109,10 @@ def export(
         terminal.message(str(exported.certificate), error=out in (None, given.STDOUT))
     elif form == "c":
         text = forms.to_c(subject, float(period or 0), prefix)
+    elif form == "controller":
+        from rotflex_jax.control import controller, controller_to_c
+
+        text = controller_to_c(controller(subject, float(period or 0)), prefix=prefix)
     elif form == "statespace":
         text = json.dumps(forms.state_space(subject, period).to_dict(), indent=2) + "\n"
     else:

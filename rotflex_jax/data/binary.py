@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from rotflex_jax.data.matlab import MatlabObject, variables_of_mat
+from rotflex_jax.data.matlab import variables_of_mat
+from rotflex_jax.data.matlab_objects import MatlabObject, Timetable
 from rotflex_jax.data.parquet import columns_of_parquet
 from rotflex_jax.data.tables import MAX_BYTES, Table, check_size, distinct, unreadable
 from rotflex_jax.errors import InputError, optional
@@ -36,7 +37,22 @@ def table_from_mat(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     with path.open("rb") as file:
         is_hdf5 = b"\x89HDF\r\n\x1a\n" in file.read(1024)  # MATLAB 7.3 puts 512 bytes in front
     values = _read_hdf5(path, max_bytes) if is_hdf5 else read_mat(path, max_bytes)
-    return Table(path.name, dict(_flat(values)), objects=dict(_objects(values)))
+    columns = dict(_flat(values))
+    clocks = {
+        name: f"{start}Time" for start in _timetables(values) for name in columns if name.startswith(start)
+    }
+    return Table(path.name, columns, objects=dict(_objects(values)), clocks=clocks)
+
+
+def _timetables(values: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Beginnings of the names of columns that stand in timetables."""
+    found: list[str] = []
+    for key, value in values.items():
+        if isinstance(value, Timetable):
+            found.append(f"{prefix}{key}.")
+        elif isinstance(value, Mapping):
+            found += _timetables(value, f"{prefix}{key}.")
+    return found
 
 
 def _objects(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -86,7 +102,9 @@ def _read_hdf5(path: Path, max_bytes: int) -> dict[str, Any]:
             if address in seen:
                 raise ValueError(f"{item.name!r} stands in two places")
             seen.add(address)
-            if isinstance(item, h5py.Group):
+            if "MATLAB_object_decode" in item.attrs:  # numbers that lead to the object's insides
+                found[name] = MatlabObject(np.bytes_(item.attrs.get("MATLAB_class", b"object")).decode())
+            elif isinstance(item, h5py.Group):
                 found[name] = values(item, depth + 1)
             elif isinstance(item, h5py.Dataset) and is_signal(item):
                 found[name] = array(item)

@@ -18,7 +18,8 @@ from jaxtyping import Real
 
 from rotflex_jax.checks import real, shown
 from rotflex_jax.data.binary import table_from_frame, table_from_mat, table_from_npz, table_from_parquet
-from rotflex_jax.data.resampling import resampled
+from rotflex_jax.data.logs import Channel, table_from_mcap, table_from_mdf, table_from_tdms, table_of_channels
+from rotflex_jax.data.resampling import TimedSignal, resampled, resampled_apart
 from rotflex_jax.data.spreadsheet import table_from_xlsx
 from rotflex_jax.data.tables import (
     MAX_BYTES,
@@ -43,15 +44,20 @@ READERS: dict[str, Callable[[Path, int], Table]] = {
     ".npz": table_from_npz,
     ".parquet": table_from_parquet,
     ".xlsx": table_from_xlsx,
+    ".tdms": table_from_tdms,
+    ".mf4": table_from_mdf,
+    ".mcap": table_from_mcap,
 }
 
 
-def read_table(source: Any, max_bytes: int = MAX_BYTES) -> Table:
-    """Reads a file by its ending, or takes a DataFrame.
+def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None) -> Table:
+    """Reads a file by its ending, files with one channel each, or takes a DataFrame.
 
     Args:
-        source: path, or pandas DataFrame.
-        max_bytes: largest size of the file, and of what it unpacks to [bytes].
+        source: path of a file, several, or that of a folder with one file for each channel; or a pandas
+            DataFrame.
+        max_bytes: largest size of a file, and of what it unpacks to [bytes].
+        time: column of the time in each of several files, where it has another name than `t` or `time`.
 
     Returns:
         The table.
@@ -61,6 +67,18 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES) -> Table:
     """
     if hasattr(source, "columns") and hasattr(source, "to_numpy"):
         return table_from_frame(source)
+    if isinstance(source, list | tuple):
+        return _together(source, f"{len(source)} files", max_bytes, time)
+    if isinstance(source, str | os.PathLike) and os.path.isdir(source):
+        folder = Path(source)
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS and p.is_file())
+        try:
+            return _together(files, f"{folder!s:.300}", max_bytes, time)
+        except InputError as error:
+            if not files:
+                raise
+            told = f"The folder {folder!s:.100} as one recording with a file for each channel: {error}"
+            raise InputError(told) from error
     path = readable_file(source)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
@@ -73,6 +91,45 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES) -> Table:
         return reader(path, max_bytes)
     except (OSError, MemoryError, csv.Error) as error:
         raise unreadable(path, "a recording", error) from error
+
+
+def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | None) -> Table:
+    """One table of files with a channel or more each.
+
+    Channels have the names of the columns; where two are equal and each file has one, those of the files.
+    """
+    if not sources:
+        raise InputError(
+            f"{label} is a folder, but a recording is one file, or a folder with a file for each channel, "
+            f"which end in {', '.join(READERS)}; name the file."
+        )
+    paths = [readable_file(source) for source in sources]
+    tables = [read_table(path, max_bytes) for path in paths]
+    clocks: dict[str, Any] = {}
+    units: set[str] = set()
+    channels: list[Channel] = []
+    for path, table in zip(paths, tables, strict=True):
+        clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
+        own = [name for name in table.columns if name != clock]
+        if not own:
+            raise InputError(f"{table.label} has no column beside the time; export that channel again.")
+        group = path.stem
+        if clock in table.columns:
+            t = real_numbers(
+                table.columns[clock], f"{table.label}: column {clock!r}", table.where, table.first
+            )
+            units.add(name_and_unit(clock)[1] or table.units.get(clock, ""))
+            # Files with equal times share their clock.
+            group = next((g for g, other in clocks.items() if np.array_equal(t, other)), group)
+            clocks.setdefault(group, t)
+        channels += [Channel(group, name, table.units.get(name, ""), table.columns[name]) for name in own]
+    if len(units) > 1:
+        named = " and ".join(repr(unit) for unit in sorted(units))
+        raise InputError(f"{label}: the times are in {named}, but must have one unit; export them alike.")
+    if len({channel.name for channel in channels}) < len(channels) == len(paths):
+        channels = [c._replace(name=path.stem) for c, path in zip(channels, paths, strict=True)]
+    unit = "".join(units)
+    return table_of_channels(label, channels, clocks, f"t [{unit}]" if unit else "t")
 
 
 def readable_file(source: Any) -> Path:
@@ -224,14 +281,17 @@ def load(
     """Reads a recording and checks it; nothing is repaired unless it is asked for by name.
 
     Text (.csv, .tsv, .txt; any delimiter), MATLAB (.mat of any version), NumPy (.npz), Parquet,
-    spreadsheets (.xlsx), or a pandas DataFrame. Columns `t,voltage,theta,alpha` in seconds, volts and
-    radians unless other names are given; capitals and a unit behind the name, as in `Theta [deg]`, are
-    understood. In .mat and .npz, a matrix `log` gives the columns `log[0]`, `log[1]`, and a
-    structure `log` with a field `u` the column `log.u`. An object that has `u`, `y` and `sampling_time`,
-    such as those of `nonlinear_benchmarks`, is taken as it is, with the channels named in `outputs`.
+    spreadsheets (.xlsx), LabVIEW (.tdms), MDF4 (.mf4), ROS 2 (.mcap), or a pandas DataFrame; a folder or a
+    list of files with one channel each is one recording. Columns `t,voltage,theta,alpha` in seconds,
+    volts and radians unless other names are given; capitals and a unit behind the name, as in
+    `Theta [deg]`, are understood. In .mat and .npz, a matrix `log` gives the columns `log[0]`, `log[1]`,
+    and a structure `log` with a field `u` the column `log.u`. An object that has `u`, `y` and
+    `sampling_time`, such as those of `nonlinear_benchmarks`, is taken as it is, with the channels named in
+    `outputs`.
 
     Args:
-        source: path, DataFrame, or an object with `u` and `y`.
+        source: path of a file, or of a folder with a file for each channel; a list of such files; a
+            DataFrame; or an object with `u` and `y`.
         input: column of the motor voltage [V].
         outputs: columns of theta, then of alpha [rad]; or a mapping of channel name to column.
         degrees: whether the outputs are in degrees.
@@ -244,7 +304,8 @@ def load(
             counts, the others being angles.
         arm_absolute: whether alpha is the angle of the arm in the room, from which theta is then subtracted.
         time_unit: of the time, "s", "ms" or "us"; what the header says, else seconds.
-        resample: sampling period to have [s], or "auto" for the usual one, where times are uneven: the
+        resample: sampling period to have [s], or "auto" for the usual one, where times are uneven, or signals
+            have times of their own: the
             input is held, outputs follow straight lines, and a finding says what was done.
 
     Returns:
@@ -273,7 +334,7 @@ def load(
     if is_foreign(source):
         names = list(outputs) if isinstance(outputs, Mapping) else outputs
         return from_foreign(source, names, units, Ts, accepted)
-    table = read_table(source, sys.maxsize if "huge" in accepted else max_bytes)
+    table = read_table(source, sys.maxsize if "huge" in accepted else max_bytes, time)
     u_name = table.find("voltage" if input is None else input)
     chosen = {
         channel: table.find(name, *OTHER_NAMES.get(name, ())) for channel, name in _outputs(outputs).items()
@@ -284,6 +345,11 @@ def load(
             "only one; correct input= or outputs=."
         )
     clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
+    names = [u_name, *chosen.values()]
+    own = list(dict.fromkeys(clock for name, clock in table.clocks.items() if name in names))
+    if own and clock not in table.columns:  # the file says what times a signal has
+        clock = own[0]
+    apart = len(own) > 1 and any(not np.array_equal(table.columns[c], table.columns[own[0]]) for c in own)
     stamps = [] if Ts is not None and time is None else [(clock, "time=")]
     table.check([(u_name, "input="), *((name, "outputs=") for name in chosen.values()), *stamps])
     u = _column(table, u_name, "input=", {"mv": "volts"})
@@ -302,7 +368,7 @@ def load(
             )
         else:
             y[channel] = values
-        if len(values) != len(u):
+        if len(values) != len(u) and not apart:
             raise InputError(
                 f"{table.label}: {u_name!r} has {len(u)} samples and {name!r} has "
                 f"{len(values)}, but they must be measured together; cut both to the same ones."
@@ -310,10 +376,31 @@ def load(
     if arm_absolute:
         y = _deflection(y)
     remarks: list[Finding] = []
-    together = np.column_stack(list(y.values()))
-    if resample is None:
+    if apart:
+        if resample is None:
+            raise InputError(
+                f"{table.label}: {', '.join(map(repr, names))} have times of their own "
+                f"({', '.join(own)}), but are needed at the same ones; bring them together with "
+                "resample='auto', or give a sampling period in its place."
+            )
+        any_unit = "units" in accepted
+        stamps_of = {
+            c: _stamps(table, c, time_unit, len(table.columns[c]), any_unit) for c in dict.fromkeys(own)
+        }
+        signals = [
+            TimedSignal(
+                stamps_of[c := table.clocks[name]], x[:, None], k == 0, f"{table.label}: the time {c!r}"
+            )
+            for k, (name, x) in enumerate(zip(names, [u, *y.values()], strict=True))
+        ]
+        start, period, brought, told = resampled_apart(signals, resample, table.where, table.first)
+        u, together = brought[0][:, 0], np.column_stack(brought[1:])
+        remarks.append(told)
+    elif resample is None:
+        together = np.column_stack(list(y.values()))
         start, period = _timing(table, clock, time, Ts, time_unit, len(u), "units" in accepted)
     else:
+        together = np.column_stack(list(y.values()))
         t = _stamps(table, clock, time_unit, len(u), "units" in accepted)
         at = f"{table.label}: the time {clock!r}", table.where, table.first
         start, period, u, together, told = resampled(t, u, together, resample, *at)

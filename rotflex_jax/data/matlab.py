@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rotflex_jax.data.matlab_objects import MatlabObject, StoredObjects
 from rotflex_jax.data.tables import check_size
 
 DEEPEST_NESTING = 50
@@ -29,17 +30,6 @@ _OPAQUE = 17  # class of an object
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15  # types of elements
 _CELL, _STRUCT, _OBJECT, _CHAR, _FIRST_NUMBER, _LAST_NUMBER = 1, 2, 3, 4, 6, 15  # classes of arrays
 _VERSION_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
-
-
-@dataclass(frozen=True)
-class MatlabObject:
-    """Stands for an object whose insides only MATLAB knows, such as a timeseries.
-
-    Args:
-        kind: its class.
-    """
-
-    kind: str
 
 
 SKIPPED = object()
@@ -66,8 +56,11 @@ def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
     order = "<" if mark == b"IM" else ">"
     file = _Elements(data, order)
     found: dict[str, Any] = {}
+    inside: Any = None  # of the objects
+    place = struct.unpack_from(f"{order}Q", data, 116)[0]
     at, unpacked = 128, len(data)
     while at < len(data):
+        begin = at
         kind, start, end, _ = file.element(at, len(data))
         part = file
         if kind == _COMPRESSED:
@@ -82,12 +75,28 @@ def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
         name, value = part.array(first, last, 0)
         file.parts = part.parts
         at = end
+        if begin == place and not name:
+            inside = value
         if value is SKIPPED or not name:  # without a name: data of MATLAB's own
             continue
         if name in found:
             raise ValueError(f"it has two variables {name!r}")
         found[name] = value
-    return found
+    stored = None if inside is None else _stored_objects(inside, order)
+    return found if stored is None else stored.opened(found)
+
+
+def _stored_objects(inside: Any, order: str) -> StoredObjects | None:
+    """The insides of the objects, None where they are of a version that is not known."""
+    try:
+        data = np.asarray(inside, np.uint8).tobytes()
+        part = _Elements(data, order)
+        kind, first, last, _ = part.element(8, len(data))
+        if kind != _MATRIX:
+            return None
+        return StoredObjects(part.array(first, last, 0)[1]["MCOS"].content, order)
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, struct.error):
+        return None
 
 
 def _unpack(data: bytes, label: str, before: int, max_bytes: int) -> bytes:
@@ -161,7 +170,7 @@ class _Elements:
             raise ValueError("a variable lacks its flags")
         kind, is_complex = int(flags[0]) & 0xFF, bool(flags[0] & 0x800)
         if not (kind in (_CELL, _STRUCT, _OBJECT, _CHAR) or _FIRST_NUMBER <= kind <= _LAST_NUMBER):
-            return self.object(at, end) if kind == _OPAQUE else ("", SKIPPED)
+            return self.object(at, end, depth) if kind == _OPAQUE else ("", SKIPPED)
         sizes, at = self.numbers(at, end, (_INT32, _UINT32))
         shape = [int(n) for n in sizes]
         if not 2 <= len(shape) <= 32 or min(shape) < 0:
@@ -185,11 +194,13 @@ class _Elements:
             raise ValueError(f"the variable {name!r} of shape {tuple(shape)} has {len(values)} numbers")
         return name, _squeezed(values, shape)
 
-    def object(self, at: int, end: int) -> tuple[str, Any]:
-        """Name and class of an object."""
+    def object(self, at: int, end: int, depth: int) -> tuple[str, Any]:
+        """Name and class of an object, and what is stored in its place."""
         name, at = self.text(at, end)
         _, at = self.text(at, end)  # the system it belongs to
-        return name, MatlabObject(self.text(at, end)[0])
+        kind, at = self.text(at, end)
+        content = self.parts_of(at, end, 1, depth)[0] if at < end else None
+        return name, MatlabObject(kind, content)
 
     def parts_of(self, at: int, end: int, count: int, depth: int) -> list[Any]:
         """So many arrays, one behind the other."""

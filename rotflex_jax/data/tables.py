@@ -24,6 +24,7 @@ class Table:
         units: by name, where the file has a line of them.
         cut: what may be missing at the end, in a sentence; empty where nothing is.
         objects: by name, the class of what only the program that wrote the file can read.
+        clocks: by name, the column with the times of a column, where the file says it.
     """
 
     label: str
@@ -33,6 +34,7 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     cut: str = ""
     objects: Mapping[str, str] = field(default_factory=dict)
+    clocks: Mapping[str, str] = field(default_factory=dict)
 
     def find(self, name: str, *others: str) -> str:
         """The column that is meant by a name: that one, or one in other capitals or with a unit behind it.
@@ -92,7 +94,8 @@ class Table:
         names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
         if objects:
-            then += f"; objects that only MATLAB reads are left out, {objects}: save their .Time and .Data"
+            cure = "save their .Time and .Data, a timetable with -v7"
+            then += f"; objects that only MATLAB reads are left out, {objects}: {cure}"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
 
 

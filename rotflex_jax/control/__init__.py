@@ -1,0 +1,21 @@
+"""From a fitted model to a controller: designed, simulated on every model that is possible, written as C."""
+
+from rotflex_jax.control.assessment import ControlAssessment, assess, credible_models
+from rotflex_jax.control.c_code import controller_to_c
+from rotflex_jax.control.closed_loop import ClosedLoop, LimitCycle, Plant, close_loop
+from rotflex_jax.control.design import Controller, controller
+from rotflex_jax.control.motion import PlannedMotion
+
+__all__ = [
+    "ClosedLoop",
+    "ControlAssessment",
+    "Controller",
+    "LimitCycle",
+    "Plant",
+    "PlannedMotion",
+    "assess",
+    "close_loop",
+    "controller",
+    "controller_to_c",
+    "credible_models",
+]

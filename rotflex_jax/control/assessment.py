@@ -1,0 +1,210 @@
+"""One controller on every model that the data leave possible: the worst case, and which model breaks it."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from rotflex_jax.checks import number, seed as checked_seed, shown, whole
+from rotflex_jax.control.closed_loop import ClosedLoop, run_loop
+from rotflex_jax.control.design import Controller
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit import Fit
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.models.model import Model
+from rotflex_jax.text.markup import card, paragraph, table
+from rotflex_jax.text.numbers import plain_number, readable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MOST_DRAWS = 200
+"""Draws for one model before parameters count as lying outside of their bounds."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ControlAssessment:
+    """Runs of one controller on several models.
+
+    Attributes:
+        controller: That drives all of them.
+        runs: By the name of the model.
+    """
+
+    controller: Controller
+    runs: dict[str, ClosedLoop]
+
+    @property
+    def worst(self) -> str:
+        """The model with the largest tracking error; one that diverges comes first."""
+        return max(self.runs, key=lambda name: self.runs[name].rms)
+
+    @property
+    def broken(self) -> dict[str, str]:
+        """The models that the controller does not hold: name -> what happens."""
+        found = {}
+        for name, run in self.runs.items():
+            if not run.bounded:
+                found[name] = "diverges"
+            elif run.limit_cycle is not None:
+                size, unit = readable(run.limit_cycle.amplitude, run.unit)
+                found[name] = f"limit cycle of {size:.3g} {unit} at {run.limit_cycle.frequency:.3g} Hz"
+        return found
+
+    @property
+    def sentence(self) -> str:
+        """Worst case and what breaks it, in words."""
+        (rms, unit), worst = readable(self.runs[self.worst].rms, self.runs[self.worst].unit), self.worst
+        error = "no bound" if not np.isfinite(rms) else f"{rms:.3g} {unit} rms"
+        said = f"Worst case of {len(self.runs)} models: {error} with {worst}"
+        if not self.broken:
+            return f"{said}; no limit cycle with any of them."
+        return f"{said}; " + "; ".join(f"{name}: {what}" for name, what in self.broken.items()) + "."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "worst": self.worst,
+            "broken": self.broken,
+            "runs": {name: run.to_dict() for name, run in self.runs.items()},
+        }
+
+    def plot(self) -> "Figure":
+        """All runs over each other."""
+        first, *others = self.runs.values()
+        return first.plot(*others)
+
+    def _rows(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+        _, unit = readable(1.0, next(iter(self.runs.values())).unit)
+        rows = [
+            (
+                name,
+                self.broken.get(name, "held"),
+                plain_number(readable(run.rms, run.unit)[0]),
+                plain_number(readable(run.largest, run.unit)[0]),
+                plain_number(100 * run.saturated),
+            )
+            for name, run in self.runs.items()
+        ]
+        return ("model", "", f"error rms [{unit}]", f"largest [{unit}]", "at the limit [%]"), rows
+
+    def _repr_html_(self) -> str:
+        headings, rows = self._rows()
+        return card("Control of every model", paragraph(self.sentence), table(headings, rows, words=2))
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        headings, rows = self._rows()
+        widths = [max(len(row[k]) for row in (headings, *rows)) for k in range(len(headings))]
+        lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in (headings, *rows)]
+        return "\n".join([self.sentence, *(line.rstrip() for line in lines)])
+
+
+def assess(
+    controller: Controller,
+    models: Fit | Mapping[str, Any] | Sequence[Any],
+    reference: Float[ArrayLike, " N"] | Sequence[float],
+    *,
+    hold: float = 6.0,
+    noise: float = 0.0,
+    count: int = 20,
+    seed: int = 0,
+) -> ControlAssessment:
+    """The controller on every model that is still possible: tracking error, limit cycles, worst case.
+
+    The reference stands still at its last value for a while, where a limit cycle would show.
+
+    Args:
+        controller: From `controller`.
+        models: By name, or one after the other, such as those between which a search could not decide; or a
+            `Fit`, from whose distribution of the parameters models are drawn.
+        reference: Of the port's position, one value for each sample.
+        hold: Time at the last value [s].
+        noise: Standard deviation of the noise of the sensors [rad].
+        count: How many models are drawn from a fit.
+        seed: Of draws and noise.
+
+    Returns:
+        ControlAssessment.
+
+    Raises:
+        InputError: No models, or one that is none.
+    """
+    hold = number(hold, "hold", least=0.0, unit="s", example="6.0")
+    noise = number(noise, "noise", least=0.0, unit="rad", example="0.001")
+    named: Mapping[str, Any]
+    if isinstance(models, Fit):
+        named = credible_models(models, count, seed)
+    elif isinstance(models, Mapping):
+        named = models
+    elif isinstance(models, Sequence) and not isinstance(models, str):
+        named = {f"model {k + 1}": model for k, model in enumerate(models)}
+    else:
+        named = {}
+    if not named:
+        raise InputError(
+            f"Argument `models` must be models by name, a list of them, or a fit, but is {shown(models)}; "
+            "give for instance {'found': model}."
+        )
+    named = {name: getattr(model, "model", model) for name, model in named.items()}
+    for name, model in named.items():
+        if not isinstance(model, Model | Mechanism):
+            raise InputError(
+                f"The model {name!r} is {shown(model)}, but a controller is assessed on models; give a "
+                "Model, a mechanism or a fit."
+            )
+    motion = controller.plan(reference)
+    longer = np.append(motion.reference, np.full(round(hold / controller.Ts), motion.reference[-1]))
+    motion = controller.plan(longer)
+    runs = {name: run_loop(controller, m, motion, noise, seed) for name, m in named.items()}
+    return ControlAssessment(controller, runs)
+
+
+def credible_models(fit: Fit, count: int = 20, seed: int = 0) -> dict[str, Model]:
+    """The fitted model, and models drawn from the distribution of its parameters.
+
+    Args:
+        fit: Its covariance is that of a normal distribution about the estimates; draws outside of the bounds
+            of a parameter are left out.
+        count: How many models are drawn.
+        seed: Of the draws.
+
+    Returns:
+        Models by name.
+
+    Raises:
+        InputError: No fit, or estimates whose intervals lie outside of their bounds.
+    """
+    if not isinstance(fit, Fit):
+        raise InputError(f"Argument `fit` must be the result of a fit, but is {shown(fit)}; call rf.fit.")
+    count, rng = whole(count, "count", 1), np.random.default_rng(checked_seed(seed))
+    mechanism = fit.model.mechanism
+    bounds = dict(zip(mechanism.parameter_names, mechanism.parameter_specifications, strict=True))
+    known = [k for k, name in enumerate(fit.free_names) if name in bounds]
+    names = [fit.free_names[k] for k in known]
+    mean = np.array([fit[name].value for name in names])
+    low = np.array([bounds[name].lower for name in names], float)
+    high = np.array([bounds[name].upper for name in names], float)
+    covariance = fit.covariance[np.ix_(known, known)]
+    # An estimate without an interval, such as one at a bound, stays where it is.
+    certain = ~np.isfinite(np.diag(covariance))
+    covariance = np.where(certain[:, None] | certain[None, :], 0.0, covariance)
+    found = {"fitted": fit.model}
+    for k in range(count):
+        for _ in range(MOST_DRAWS):
+            values = rng.multivariate_normal(mean, covariance, method="eigh")
+            if np.all((values >= low) & (values <= high)):
+                break
+        else:
+            raise InputError(
+                "The intervals of the estimates lie almost wholly outside of what the parameters may be; fit "
+                "more data first."
+            )
+        drawn = mechanism.with_values(dict(zip(names, values.tolist(), strict=True)))
+        found[f"draw {k + 1}"] = dataclasses.replace(fit.model, mechanism=drawn)
+    return found

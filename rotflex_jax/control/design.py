@@ -1,0 +1,321 @@
+"""A controller of a fitted model: state feedback, an observer of the load, compensation of what was found."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, get_args
+
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Complex, Float
+from numpy.typing import ArrayLike
+
+from rotflex_jax.checks import one_of, positive, shown, signal
+from rotflex_jax.control.motion import PASSES, PlannedMotion, Tracking, at_rest, torques_along
+from rotflex_jax.effects.base import Actuation
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.assembly import Layout, effects_of, equations
+from rotflex_jax.mechanism.linear import check_movable, process_covariance, state_names, zero_order_hold
+from rotflex_jax.models.model import Model
+from rotflex_jax.runtime.xla import double_precision
+
+Compensation = Literal["nothing", "feedforward", "observer", "both"]
+
+PLANNED_EFFORT = 1e-4
+"""Weight of the voltage in a planned motion, next to that of the feedback: no noise comes with it."""
+
+LOAD_PER_SECOND = 0.1
+"""How fast the load may change: standard deviation over a second, as a share of the motor's torque."""
+
+WHITE_SHARE = 0.01
+"""Torque noise of a sample at each port, for what the model lacks, as a share of the motor's torque."""
+
+AT_REST = 20.0
+"""A port that moves slower than so many steps of its sensor in a second is to stand [1/s]."""
+
+ENCODER = 2 * np.pi / 4096
+"""Step of the sensors unless it is given [rad]."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Controller:
+    """Discrete feedback about a planned motion: from `controller`.
+
+        e  = e_hat + L (y - y_plan - C e_hat)                state and load, corrected by the sensors
+        u  = clip(u_plan - K e)
+        e_hat+ = A e + B (u - u_plan)                        the voltage that was really given
+
+    Attributes:
+        model: What it was designed for.
+        Ts: Sampling period [s].
+        port: Whose position follows the reference.
+        limit: Largest voltage [V].
+        compensate: What counters the torques beside the linear part.
+        A: Of the states and the load torque, from sample to sample.
+        B: Of the voltage.
+        C: Sensors.
+        K: Feedback of states and load.
+        L: Gain of the observer.
+        row: The controlled position as a combination of the states.
+        push: What torques at the torque ports do to the states within a sample.
+        states: Names of the states; the last one is the load torque.
+        resolution: Step of each sensor.
+        effort: What a square volt costs next to a square error [rad^2/V^2].
+        left_out: Effects that nothing compensates, one sentence each.
+    """
+
+    model: Model
+    Ts: float
+    port: str
+    limit: float
+    compensate: Compensation
+    A: Float[np.ndarray, "m m"]
+    B: Float[np.ndarray, " m"]
+    C: Float[np.ndarray, "C m"]
+    K: Float[np.ndarray, " m"]
+    L: Float[np.ndarray, "m C"]
+    row: Float[np.ndarray, " n"]
+    push: Float[np.ndarray, "n p"]
+    states: tuple[str, ...]
+    resolution: Float[np.ndarray, " C"]
+    effort: float
+    left_out: tuple[str, ...]
+
+    @functools.cached_property
+    def poles(self) -> Complex[np.ndarray, " n"]:
+        """Poles of the loop on the linear part, as those of continuous time [1/s]."""
+        n = len(self.row)
+        inside = self.A[:n, :n] - np.outer(self.B[:n], self.K[:n])
+        return np.log(np.linalg.eigvals(inside).astype(complex)) / self.Ts
+
+    def plan(self, reference: Float[ArrayLike, " N"] | Sequence[float]) -> PlannedMotion:
+        """The motion for a reference that is known beforehand.
+
+        The linear part is to follow it as closely as a moderate voltage allows, with the torques of friction
+        and all other effects along that motion in the equations where they are compensated.
+
+        Args:
+            reference: Of the port's position, one value for each sample.
+
+        Raises:
+            InputError: No signal of finite numbers.
+        """
+        r = signal(reference, "reference").astype(float)
+        n, N = len(self.row), len(r)
+        tracking = Tracking(self.A[:n, :n], self.B[:n], self.row, PLANNED_EFFORT * self.effort)
+        tau = np.zeros((N, self.push.shape[1]))
+        X, u = tracking.solve(r, tau @ self.push.T)
+        if self.compensate in ("feedforward", "both") and tau.size:
+            # Of all sensors the finest says what a slow motion is.
+            rest = AT_REST * float(self.resolution.min())
+            for _ in range(PASSES):
+                tau = torques_along(self.model, X, u, rest, self.Ts)
+                X, u = tracking.solve(r, tau @ self.push.T)
+        return PlannedMotion(r, X, X @ self.C[:, :n].T, u, tau)
+
+    def first_state(self, position: float) -> Float[np.ndarray, " n"]:
+        """States of the linear part at rest at a position of the port."""
+        n = len(self.row)
+        return at_rest(self.A[:n, :n], self.B[:n], self.row, position)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        slowest = np.min(np.abs(np.real(self.poles)))
+        lines = [
+            f"Controller of {self.port} every {1000 * self.Ts:g} ms, {len(self.row)} states and the load, "
+            f"voltage up to {self.limit:g} V, compensation: {self.compensate}",
+            f"  slowest pole {slowest:.3g} 1/s, gains {np.array2string(self.K, precision=3)}",
+        ]
+        return "\n".join(lines + [f"  {sentence}" for sentence in self.left_out])
+
+
+def controller(
+    model: Mechanism | Model | Any,
+    Ts: float,
+    *,
+    port: str = "hub",
+    accuracy: float = 0.1,
+    limit: float = 10.0,
+    poles: Sequence[complex] | None = None,
+    compensate: Compensation = "feedforward",
+    load: str | None = None,
+    resolution: float | Mapping[str, float] = ENCODER,
+) -> Controller:
+    """A controller for the position of a port, from a fitted model.
+
+    Feedback and observer are those of the linear part: a linear quadratic regulator that gives the whole
+    voltage for an error of `accuracy` in the position or any coordinate (Bryson's rule), or the gains for
+    given poles, and a steady Kalman filter of the states and of a load torque that walks at random. What the
+    model has beside its linear part is compensated along the planned motion ("feedforward"), by the observed
+    load ("observer", which also counters what the model does not know, but may hunt where a joint sticks), or
+    by both.
+
+    Not for an unstable plan: a position whose zeros are unstable, such as the tip of a long arm, follows
+    with the voltage that is allowed, not exactly.
+
+    Args:
+        model: Fitted model, mechanism, or a `Fit`.
+        Ts: Sampling period of the controller [s].
+        port: Whose position follows the reference.
+        accuracy: Error that is worth the whole voltage [rad].
+        limit: Largest voltage [V].
+        poles: Of the loop in continuous time [1/s], one for each state; the regulator's unless given.
+        compensate: "nothing", "feedforward", "observer" or "both".
+        load: Port where the load torque acts; `port` unless given.
+        resolution: Step of the sensors [rad], or by channel.
+
+    Returns:
+        Controller.
+
+    Raises:
+        InputError: An argument that makes no sense, or a motor that cannot move the port.
+
+    Source: B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990; G. F.
+    Franklin, J. D. Powell and M. Workman, Digital Control of Dynamic Systems, 3rd ed., 1998, chapter 8.
+
+    >>> from rotflex_jax.joints import paper
+    >>> found = controller(paper(), 0.002)
+    >>> bool(np.all(found.poles.real < 0)), found.states[-1]
+    (True, 'load at hub')
+    """
+    model = Model.of(getattr(model, "model", model) if not isinstance(model, Model) else model)
+    Ts = positive(Ts, "Ts", example="0.002")
+    accuracy = positive(accuracy, "accuracy", unit="rad", example="0.1")
+    limit = positive(limit, "limit", unit="V", example="10.0")
+    one_of(compensate, "compensate", get_args(Compensation))
+    mechanism = model.mechanism
+    for name, given in (("port", port), ("load", port if load is None else load)):
+        one_of(given, name, mechanism.port_vectors)
+    load = load or port
+    step = _steps(resolution, mechanism)
+    check_movable(mechanism)
+    layout = Layout.of(mechanism.structure)
+    n, size = layout.n, layout.rotor  # where a gear has play, its rotor moves with its port
+    with double_precision():
+        eq = equations(mechanism, jnp.asarray(model.parameters_and_gates()[1]))
+        A, B, ports, inverse = (
+            np.asarray(m) for m in (eq.A[:size, :size], eq.B[:size], eq.ports[:size], eq.inverse_mass)
+        )
+    row = np.zeros(size)
+    row[:n] = mechanism.port_vectors[port]
+    torque_at = {p: np.zeros(size) for p in mechanism.port_vectors}
+    for p, column in torque_at.items():
+        column[n : 2 * n] = inverse @ np.array(mechanism.port_vectors[p], float)
+    balance = _balance(A, B, row, torque_at[load])
+    if not np.any(B) or balance is None:
+        raise InputError(
+            f"The motor cannot move the port {port!r} against a torque at {load!r}; name a port that the "
+            "voltage moves, or add a motor to the model."
+        )
+    held = zero_order_hold(A, np.column_stack([B, torque_at[load], ports]), Ts)
+    Ad, Bd, pushed, push = held[0], held[1][:, 0], held[1][:, 1], held[1][:, 2:]
+    effort = (accuracy / limit) ** 2
+    shown_by = np.vstack([row, np.eye(n, size)])  # the position, and all that swings beside it
+    K = _placed(Ad, Bd, poles, Ts) if poles is not None else _regulator(Ad, Bd, shown_by, effort)
+    C = np.zeros((len(mechanism.channels), size + 1))
+    C[:, : 2 * n] = layout.output_rows
+    full = np.block([[Ad, pushed[:, None]], [np.zeros((1, size)), np.ones((1, 1))]])
+    stall = limit / abs(balance)
+    Q = np.zeros((size + 1, size + 1))
+    for column in torque_at.values():
+        Q[:size, :size] += (WHITE_SHARE * stall) ** 2 * Ts * process_covariance(A, column[n : 2 * n], n, Ts)
+    Q[size, size] = (LOAD_PER_SECOND * stall) ** 2 * Ts
+    counters = balance if compensate in ("observer", "both") else 0.0
+    return Controller(
+        model=model,
+        Ts=Ts,
+        port=port,
+        limit=limit,
+        compensate=compensate,
+        A=full,
+        B=np.append(Bd, 0.0),
+        C=C,
+        K=np.append(K, -counters),
+        L=_observer(full, C, Q, np.diag(step**2 / 12)),
+        row=row,
+        push=push,
+        states=(*state_names(mechanism)[:size], f"load at {load}"),
+        resolution=step,
+        effort=effort,
+        left_out=_left_out(model),
+    )
+
+
+def _steps(resolution: Any, mechanism: Mechanism) -> np.ndarray:
+    """Step of each sensor."""
+    named = isinstance(resolution, Mapping)
+    given = dict(resolution) if named else dict.fromkeys(mechanism.channels, resolution)
+    for channel in given:
+        one_of(channel, "resolution", mechanism.channels)
+    return np.array(
+        [
+            positive(given.get(c, ENCODER), "resolution", unit="rad", example="0.0015")
+            for c in mechanism.channels
+        ]
+    )
+
+
+def _balance(A: np.ndarray, B: np.ndarray, row: np.ndarray, torque: np.ndarray) -> float | None:
+    """Steady voltage that balances a unit torque and leaves the position; None where there is none."""
+    n = len(row)
+    rows = np.block([[A, B[:, None]], [row[None], np.zeros((1, 1))]])
+    found = np.linalg.lstsq(rows, np.append(-torque, 0.0), rcond=None)[0]
+    wrong = np.linalg.norm(rows @ found + np.append(torque, 0.0))
+    return None if wrong > 1e-6 * np.linalg.norm(torque) or found[n] == 0 else float(found[n])
+
+
+def _regulator(A: np.ndarray, B: np.ndarray, rows: np.ndarray, effort: float) -> np.ndarray:
+    try:
+        P = scipy.linalg.solve_discrete_are(A, B[:, None], rows.T @ rows, [[effort]])
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise InputError(
+            "No regulator holds this model, since the voltage does not reach all that moves by itself; give "
+            "a model whose motor acts on it."
+        ) from error
+    return (B @ P @ A) / (effort + B @ P @ B)
+
+
+def _placed(A: np.ndarray, B: np.ndarray, poles: Any, Ts: float) -> np.ndarray:
+    """Gains for poles in continuous time."""
+    try:
+        wanted = np.asarray(poles, complex)
+    except (TypeError, ValueError):
+        wanted = np.zeros(0, complex)
+    pairs = np.sort_complex(wanted)
+    if wanted.shape != (len(A),) or not np.all(np.isfinite(wanted)) or np.any(np.real(wanted) >= 0):
+        raise InputError(
+            f"Argument `poles` must be {len(A)} poles with negative real parts [1/s], one for each state, "
+            f"but is {shown(poles)}; give for instance {[-20.0 - 5 * k for k in range(len(A))]}."
+        )
+    if len(np.unique(pairs)) < len(A) or not np.allclose(pairs, np.sort_complex(wanted.conj())):
+        raise InputError(
+            "Argument `poles` must be different ones, complex ones in pairs, but one stands twice or without "
+            "its conjugate; move it a little, or add the other."
+        )
+    return scipy.signal.place_poles(A, B[:, None], np.exp(wanted * Ts)).gain_matrix[0]
+
+
+def _observer(A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Gain of the steady Kalman filter, for the correction by the present sample."""
+    try:
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise InputError(
+            "The sensors do not show all states and the load, so no observer follows them; give a model with "
+            "a sensor of each position."
+        ) from error
+    return np.linalg.solve(C @ P @ C.T + R, C @ P).T
+
+
+def _left_out(model: Model) -> tuple[str, ...]:
+    gates = model.gates or (1.0,) * len(model.mechanism.effects)
+    inputs = [i for i, _ in effects_of(model.mechanism, Actuation)]
+    return tuple(
+        f"{e.title} at {e.at} is not compensated."
+        for i, e in enumerate(model.mechanism.effects)
+        if gates[i] and (i in inputs or e.state_part == "rotor")
+    )

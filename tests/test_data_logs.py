@@ -1,0 +1,329 @@
+"""Logs of LabVIEW, MDF4 and ROS 2, each written by the library of its format; one file for each channel."""
+
+import io
+import re
+import struct
+import warnings
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rotflex_jax.cli import main
+from rotflex_jax.data import load
+from rotflex_jax.errors import InputError
+
+N = 80
+K = np.arange(N)
+T = 0.002 * K
+VOLTAGE = np.random.default_rng(3).normal(size=N)
+THETA, ALPHA = 0.3 * np.sin(K / 9), 0.1 * np.cos(K / 4)
+SIGNALS = {"voltage": VOLTAGE, "theta": THETA, "alpha": ALPHA}
+
+JOINT_STATE = """std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+
+
+def refused(source, phrase: str, **how) -> None:
+    with pytest.raises(InputError) as caught:
+        load(source, **how)
+    sentence = str(caught.value)
+    assert re.search(phrase, sentence), sentence
+    assert sentence.endswith(".") and "\n" not in sentence and len(sentence) < 400, sentence
+
+
+def exact(recording) -> None:
+    assert recording.Ts == pytest.approx(0.002, rel=1e-9)
+    np.testing.assert_array_equal(recording.u, VOLTAGE)
+    np.testing.assert_array_equal(recording.y, np.column_stack([THETA, ALPHA]))
+
+
+# -- MATLAB ----------------------------------------------------------------------------------------------
+
+
+def timetable(path: Path, index, version: str = "v7", **others) -> Path:
+    """A file with the timetable `log`, written by another implementation of MATLAB's objects."""
+    matio, pd = pytest.importorskip("matio"), pytest.importorskip("pandas")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        values = {"log": pd.DataFrame(SIGNALS, index=index), **others}
+        matio.save_to_mat(str(path), values, version=version)
+    return path
+
+
+PARTS = {"input": "log.voltage", "outputs": ("log.theta", "log.alpha")}
+
+
+@pytest.mark.parametrize("kind", ["durations", "dates"])
+def test_a_timetable_of_matlab_is_read_with_its_times(tmp_path, kind):
+    pd = pytest.importorskip("pandas")
+    index = pd.to_timedelta(2 * K, unit="ms")
+    if kind == "dates":
+        index = pd.Timestamp("2025-03-01 10:00") + index
+    path = timetable(tmp_path / "run.mat", index, gain=7.0)
+    recording = load(path, **PARTS)
+    assert recording.Ts == pytest.approx(0.002, rel=1e-6)
+    np.testing.assert_array_equal(recording.u, VOLTAGE)
+    np.testing.assert_array_equal(recording.y, np.column_stack([THETA, ALPHA]))
+    refused(path, r"log\.voltage", input="log.volts", outputs=PARTS["outputs"])
+
+
+def test_a_table_beside_a_structure_is_read(tmp_path):
+    pd = pytest.importorskip("pandas")
+    path = timetable(tmp_path / "run.mat", pd.RangeIndex(N), of={"t": T})
+    exact(load(path, time="of.t", **PARTS))
+
+
+def test_a_timetable_of_version_7_3_is_refused_with_its_cure(tmp_path):
+    pytest.importorskip("h5py")
+    pd = pytest.importorskip("pandas")
+    path = timetable(tmp_path / "run.mat", pd.to_timedelta(2 * K, unit="ms"), "v7.3")
+    refused(path, r"log \(timetable\): save .* a timetable with -v7", **PARTS)
+
+
+def test_a_damaged_timetable_is_left_out_and_named(tmp_path):
+    """The numbers of its properties are gone, the file around them is whole."""
+    pd = pytest.importorskip("pandas")
+    path = timetable(tmp_path / "run.mat", pd.to_timedelta(2 * K, unit="ms"), also=np.arange(9.0))
+    data = path.read_bytes()
+    parts, at = [data[:128]], 128
+    place = struct.unpack_from("<Q", data, 116)[0]
+    while at < len(data):
+        size = struct.unpack_from("<I", data, at + 4)[0]
+        plain = zlib.decompress(data[at + 8 : at + 8 + size])
+        if at == place:
+            assert b"rowTimes" in plain and plain.count(b"millis") == 1
+            plain = plain.replace(b"millis", b"milles")
+        packed = zlib.compress(plain)
+        if at == place:
+            parts[0] = data[:116] + struct.pack("<Q", sum(map(len, parts))) + data[124:128]
+        parts.append(struct.pack("<II", 15, len(packed)) + packed)
+        at += 8 + size
+    path.write_bytes(b"".join(parts))
+    refused(path, r"objects that only MATLAB reads .* log \(timetable\)", **PARTS)
+
+
+# -- LabVIEW ---------------------------------------------------------------------------------------------
+
+
+def tdms(path: Path, waveform: bool = True, **others: np.ndarray) -> Path:
+    nptdms = pytest.importorskip("nptdms")
+    about = {"wf_increment": 0.002, "wf_start_offset": 0.0} if waveform else {}
+    units = {"voltage": "V", "theta": "rad", "alpha": "rad"}
+    channels = [
+        nptdms.ChannelObject("run", name, x, properties=about | {"unit_string": units.get(name, "")})
+        for name, x in (({} if waveform else {"Time": T}) | SIGNALS | others).items()
+    ]
+    with nptdms.TdmsWriter(path) as writer:
+        writer.write_segment([nptdms.RootObject(), nptdms.GroupObject("run"), *channels])
+    return path
+
+
+@pytest.mark.parametrize("waveform", [True, False], ids=["waveform", "channel of times"])
+def test_a_labview_file(tmp_path, waveform):
+    recording = load(tdms(tmp_path / "run.tdms", waveform))
+    exact(recording)
+    assert recording.input_unit == "V"
+
+
+def test_times_of_day_of_a_labview_file_are_seconds(tmp_path):
+    nptdms = pytest.importorskip("nptdms")
+    stamps = np.datetime64("2025-03-01T10:00:00", "us") + (2000 * K).astype("timedelta64[us]")
+    channels = [nptdms.ChannelObject("run", n, x) for n, x in {"Timestamp": stamps, **SIGNALS}.items()]
+    with nptdms.TdmsWriter(tmp_path / "run.tdms") as writer:
+        writer.write_segment(channels)
+    recording = load(tmp_path / "run.tdms")
+    assert recording.Ts == pytest.approx(0.002, rel=1e-6)
+    np.testing.assert_array_equal(recording.u, VOLTAGE)
+
+
+def test_angles_of_a_labview_file_may_be_counts(tmp_path):
+    counts = {"enc": np.round(THETA * 4096 / (2 * np.pi)).astype(np.int32)}
+    path = tdms(tmp_path / "run.tdms", **counts)
+    recording = load(path, outputs="enc", counts=4096)
+    np.testing.assert_allclose(recording.y[:, 0], THETA, atol=np.pi / 4096)
+
+
+def test_a_channel_of_another_length_is_refused(tmp_path):
+    refused(
+        tdms(tmp_path / "run.tdms", short=np.ones(7)), "'short' has 7 samples and its group 'run' 80 times"
+    )
+
+
+# -- MDF4 ------------------------------------------------------------------------------------------------
+
+
+def mdf(path: Path, groups: list[dict[str, np.ndarray]], clocks: list[np.ndarray], **how) -> Path:
+    asammdf = pytest.importorskip("asammdf")
+    with asammdf.MDF(version="4.10") as file:
+        for signals, t in zip(groups, clocks, strict=True):
+            units = {"voltage": "V"}
+            file.append(
+                [asammdf.Signal(x, t, name=name, unit=units.get(name, "rad")) for name, x in signals.items()]
+            )
+        file.save(path, overwrite=True, **how)
+    return path
+
+
+@pytest.mark.parametrize("packed", [0, 2], ids=["plain", "packed"])
+def test_an_mdf_file(tmp_path, packed):
+    recording = load(mdf(tmp_path / "run.mf4", [SIGNALS], [T], compression=packed))
+    exact(recording)
+
+
+def test_groups_with_times_of_their_own_are_brought_together_on_request(tmp_path):
+    late = T + 0.0007
+    groups = [{"voltage": VOLTAGE}, {"theta": 5.0 * late, "alpha": np.sin(40 * late)}]
+    path = mdf(tmp_path / "run.mf4", groups, [T, late])
+    refused(path, "times of their own .* resample='auto'")
+    recording = load(path, resample="auto", accept=("units", "swapped"))
+    t = recording.t
+    np.testing.assert_array_equal(t, 0.0007 + 0.002 * np.arange(len(t)))
+    # A ramp lies on its straight lines; the voltage is the one that was held then.
+    np.testing.assert_allclose(recording.y[:, 0], 5.0 * t, atol=1e-12)
+    np.testing.assert_array_equal(recording.u, VOLTAGE[: len(t)])
+    assert [finding.kind for finding in recording.findings if finding.kind == "resampled"] == ["resampled"]
+
+
+def test_samples_that_are_marked_invalid_are_missing(tmp_path):
+    asammdf = pytest.importorskip("asammdf")
+    bad = K == 33
+    signals = [asammdf.Signal(x, T, name=name) for name, x in SIGNALS.items() if name != "theta"]
+    signals.append(asammdf.Signal(THETA, T, name="theta", invalidation_bits=bad))
+    with asammdf.MDF(version="4.10") as file:
+        file.append(signals)
+        file.save(tmp_path / "run.mf4", overwrite=True)
+    refused(tmp_path / "run.mf4", r"'theta'.*sample 33")
+
+
+# -- ROS 2 -----------------------------------------------------------------------------------------------
+
+
+def mcap(path: Path, jitter: float = 0.0, stamped: bool = True, packed: str = "ZSTD") -> Path:
+    ros2 = pytest.importorskip("mcap_ros2.writer")
+    kinds = pytest.importorskip("mcap.writer").CompressionType
+    times = 1_700_000_000 * 10**9 + 2_000_000 * K.astype(np.int64)
+    times += (1e9 * jitter * np.random.default_rng(5).uniform(-1, 1, N)).astype(np.int64)
+    writer = ros2.Writer(out := io.BytesIO(), compression=kinds[packed])
+    state = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+    number = writer.register_msgdef("std_msgs/msg/Float64", "float64 data")
+    for k, at in enumerate(times.tolist()):
+        stamp = {"sec": at // 10**9, "nanosec": at % 10**9} if stamped else {"sec": 0, "nanosec": 0}
+        joints = {
+            "name": ["hub", "arm"],
+            "position": [THETA[k], ALPHA[k]],
+            "velocity": [],
+            "effort": [0.1, 0.2],
+        }
+        message = {"header": {"stamp": stamp, "frame_id": "base"}, **joints}
+        # A message is logged later than it was stamped.
+        later = at + (3_000_000 if stamped else 0)
+        writer.write_message("/joint_states", state, message, log_time=later, publish_time=later)
+        writer.write_message("/motor/voltage", number, {"data": VOLTAGE[k]}, log_time=at, publish_time=at)
+    writer.finish()
+    path.write_bytes(out.getvalue())
+    return path
+
+
+NAMES = {"outputs": ("hub.position", "arm.position")}
+
+
+@pytest.mark.parametrize("packed", ["NONE", "LZ4", "ZSTD"])
+@pytest.mark.parametrize("stamped", [True, False], ids=["stamped", "logged"])
+def test_joint_states_of_ros_2(tmp_path, stamped, packed):
+    exact(load(mcap(tmp_path / "run.mcap", stamped=stamped, packed=packed), **NAMES))
+
+
+def test_joint_states_at_uneven_times_are_resampled_on_request(tmp_path):
+    path = mcap(tmp_path / "run.mcap", jitter=0.0004)
+    refused(path, r"not uniform|uneven|resample", **NAMES)
+    recording = load(path, resample=0.002, **NAMES)
+    moved = np.interp(recording.t, T, THETA)
+    np.testing.assert_allclose(recording.y[:, 0], moved, atol=0.3 / 9 * 0.5)  # less than half a step away
+    assert len(recording.u) >= N - 2
+
+
+def test_a_joint_state_that_loses_a_joint_is_refused(tmp_path):
+    ros2 = pytest.importorskip("mcap_ros2.writer")
+    writer = ros2.Writer(out := io.BytesIO())
+    state = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+    for k in range(9):
+        header = {"stamp": {"sec": k, "nanosec": 0}, "frame_id": ""}
+        names = ["hub", "arm"][: 1 + (k != 4)]
+        joints = {"name": names, "position": [0.0] * len(names), "velocity": [], "effort": []}
+        writer.write_message("/s", state, {"header": header, **joints}, log_time=k, publish_time=k)
+    writer.finish()
+    (tmp_path / "run.mcap").write_bytes(out.getvalue())
+    refused(tmp_path / "run.mcap", "message 4 of the topic '/s' has not the numbers of its first one")
+
+
+def test_a_packed_part_that_claims_more_is_refused(tmp_path):
+    path = mcap(tmp_path / "run.mcap")
+    refused(path, r"unpacks to at least", max_bytes=1000 + path.stat().st_size, **NAMES)
+
+
+# -- One file for each channel ---------------------------------------------------------------------------
+
+
+def channel_files(folder: Path, header: str | None = None, shift: float = 0.0) -> list[Path]:
+    folder.mkdir()
+    for name, x in SIGNALS.items():
+        rows = np.column_stack([T + (shift if name == "alpha" else 0.0), x])
+        np.savetxt(text := io.StringIO(), rows, "%.17g", ",", header=f"t,{header or name}", comments="")
+        (folder / f"{name}.csv").write_text(text.getvalue())
+    return sorted(folder.iterdir())
+
+
+@pytest.mark.parametrize("header", [None, "value"], ids=["names in headers", "names of files"])
+def test_one_file_for_each_channel(tmp_path, header):
+    files = channel_files(tmp_path / "run", header)
+    exact(load(tmp_path / "run"))
+    exact(load(files))
+
+
+def test_a_folder_is_a_recording_on_the_command_line(tmp_path, capsys):
+    channel_files(tmp_path / "run")
+    with pytest.raises(SystemExit) as left:
+        main(["check", str(tmp_path / "run"), "--accept", "short"])
+    out = capsys.readouterr()
+    assert "80 samples" in out.out + out.err, out
+    assert left.value.code in (0, 2)
+
+
+def test_channels_with_other_times_are_not_joined_in_silence(tmp_path):
+    files = channel_files(tmp_path / "run", shift=0.0005)
+    refused(files, "times of their own")
+    assert len(load(files, resample="auto").u) == N - 1
+
+
+def test_times_in_other_units_and_folders_without_recordings_are_refused(tmp_path):
+    files = channel_files(tmp_path / "run")
+    files[0].write_text(files[0].read_text().replace("t,", "t [ms],", 1))
+    refused(files, "the times are in '' and 'ms'")
+    (tmp_path / "empty").mkdir()
+    refused(tmp_path / "empty", "is a folder, but a recording is one file")
+    refused([], "0 files")
+
+
+# -- Damage ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "make", [tdms, mcap, lambda path: mdf(path, [SIGNALS], [T])], ids=["tdms", "mcap", "mf4"]
+)
+def test_a_cut_or_foreign_file_is_refused_in_one_sentence(tmp_path, make, request):
+    ending = request.node.callspec.id
+    data = make(tmp_path / f"run.{ending}").read_bytes()
+    broken = tmp_path / f"cut.{ending}"
+    for content in (data[: len(data) // 2], b"t,voltage\n0,1\n", bytes(4000), data[:30]):
+        broken.write_bytes(content)
+        refused(broken, "cannot be read as|no channel with numbers|has no column|samples", **NAMES)
