@@ -22,12 +22,16 @@ from .errors import InputError as InputError
 from .experiment import Experiment as Experiment, Limits as Limits, next_experiment as next_experiment
 from .fit import (
     Fit as Fit,
+    Identifiability as Identifiability,
     ManyStarts as ManyStarts,
+    Profile as Profile,
     SeriesFit as SeriesFit,
     fit as fit,
     forward_regression as forward_regression,
+    identifiable as identifiable,
     least_squares as least_squares,
     many_starts as many_starts,
+    profile as profile,
 )
 from .latent import LatentTorque as LatentTorque, latent_torque as latent_torque
 from .mechanism import (
