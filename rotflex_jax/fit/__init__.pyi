@@ -1,3 +1,4 @@
+from .bands import Bands as Bands, prediction_bands as prediction_bands
 from .forward_regression import forward_regression as forward_regression
 from .greybox import fit as fit
 from .identifiable import Identifiability as Identifiability, identifiable as identifiable
