@@ -3,7 +3,7 @@
     python benchmarks/B11_certainty.py --workers 16
     python benchmarks/B11_certainty.py --tuning --parts intervals --only lugre --seeds 100,101
 
-Intervals: short records with one hidden friction or play at two sizes, fitted with the true structure; how
+Intervals: short records with one hidden friction or play at three sizes, fitted with the true structure; how
 often the 95 % interval of a profile holds the true number, beside Wald's. Bands: a run that nobody fitted, of
 the same machine; how many of its samples lie in the 90 % band of the true structure, and of the textbook's
 model that lacks the effect. Nothing is recomputed that is in the results already.
@@ -37,7 +37,7 @@ BANDS = (
     ("gravity", "hub"),
     ("voltage_offset", "input"),
 )
-SIZES = (1.0, 0.3)
+SIZES = (1.0, 0.3, 0.1)
 Job = dict[str, Any]
 
 

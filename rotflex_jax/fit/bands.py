@@ -45,6 +45,8 @@ PARTS = (
     "between models",
 )
 """What widens a band, in the order of tables."""
+# A recording starts at rest where its first speeds are below this share of the speeds that follow.
+AT_REST = 0.02
 # Halvings of an interval that holds a quantile of a mixture.
 HALVINGS = 60
 
@@ -165,9 +167,11 @@ def prediction_bands(
     noise of the samples that it is estimated on), parameters that each recording has for itself (by their
     spread), process torques (by the linear part of the machine), the noise of the sensors, and what the model
     lacks. That is a constant for each channel, so large that bands over `known` recordings hold the share
-    `level` of their samples; without any as large as the residuals of the fit beyond the sensor's noise. Of several models with weights the band is that of the mixture.
+    `level` of their samples; without any as large as the residuals of the fit beyond the sensor's noise. Of
+    several models with weights the band is that of the mixture.
 
-    Everything is propagated to first order: not for a run in which a small change of a parameter decides between two motions.
+    Everything is propagated to first order: not for a run in which a small change of a parameter decides
+    between two motions.
 
     Args:
         fitted: A fit; or pairs of a fit and its weight, one for each set of effects that may be true.
@@ -261,17 +265,20 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
     noise = sensor_noise([recording], model)
     known = np.array([n in recording.constants for n in fitted.free_names], bool)
     J[..., : len(free)][..., known] = 0.0
-    # The first state is the least-squares answer on the first samples, channels as they are.
-    head = slice(0, recording.n_init)
-    first, by = J[head, :, len(free) :], J[head, :, : len(free)]
+    # The first positions and speeds are the least-squares answer on the first samples, channels as they are,
+    # given parameters and states that no sensor shows.
+    head, moving, F = slice(0, recording.n_init), 2 * len(m.coordinates), len(free)
+    J = np.concatenate([J[..., :F], J[..., F + moving :], J[..., F : F + moving]], axis=-1)
+    first, by = J[head, :, -moving:], J[head, :, :-moving]
     H = np.einsum("ncs,nct->st", first, first)
     inverse = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
     follows = -inverse @ np.einsum("ncs,ncp->sp", first, by)
     cov_start = inverse @ np.einsum("ncs,c,nct->st", first, noise**2, first) @ inverse
-    whole = J[..., : len(free)] + np.einsum("ncs,sp->ncp", J[..., len(free) :], follows)
+    whole = J[..., :-moving] + np.einsum("ncs,sp->ncp", J[..., -moving:], follows)
+    unseen = _unseen(model, recording, start[0], moving)
     parts = {
-        "parameters": _propagated(whole, _finite(fitted.covariance)),
-        "first state": _propagated(J[..., len(free) :], cov_start),
+        "parameters": _propagated(whole[..., :F], _finite(fitted.covariance)),
+        "first state": _propagated(J[..., -moving:], cov_start) + _propagated(whole[..., F:], unseen),
         "sensor": np.broadcast_to(noise**2, y.shape),
     }
     own = np.zeros_like(y)
@@ -284,6 +291,22 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
     if fitted.options.process_noise is not None:
         parts["process torque"] = _process_variance(m, fitted.options.process_noise, recording)
     return y_hat, parts
+
+
+def _unseen(
+    model: Model, recording: Recording, start: Float[np.ndarray, " n"], moving: int
+) -> Float[np.ndarray, "h h"]:
+    """Covariance of the first states that no sensor shows, such as that of a friction with memory.
+
+    A recording that starts at rest, or goes on where another ended, is taken to start as the model has it.
+    Otherwise these states may be as far from there as they ever are in a run over the recording.
+    """
+    X = model.simulate_states(recording)
+    n = moving // 2
+    speed = np.sqrt(np.mean(np.square(X[:, n:moving]), axis=0))
+    resting = bool(np.all(np.abs(start[n:moving]) < AT_REST * speed))
+    away = np.where(resting or recording.continues is not None, 0.0, X[:, moving:] - start[moving:])
+    return away.T @ away / len(X)
 
 
 def _finite(covariance: np.ndarray) -> np.ndarray:
@@ -299,8 +322,8 @@ def _propagated(S: Float[np.ndarray, "N C P"], V: Float[np.ndarray, "P P"]) -> F
 def _slopes(
     model: Model, m: Mechanism, recording: Recording, start: np.ndarray, free: np.ndarray
 ) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
-    """Outputs of a free run, and slopes by parameters [their units], then by first positions and speeds."""
-    states, C, N = 2 * len(m.coordinates), len(m.channels), recording.N
+    """Outputs of a free run, and slopes by parameters [their units], then by the first state."""
+    states, C, N = Layout.of(m.structure).size, len(m.channels), recording.N
     with double_precision():
         data = StackedRecordings(
             jnp.asarray(recording.u.astype(float)[None]),

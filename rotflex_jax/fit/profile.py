@@ -19,6 +19,7 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import FitAttempt, FitPoint, FitStage, GreyBoxProblem, problem_of, report
+from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE
 from rotflex_jax.fit.problem import LikelihoodEquations
 from rotflex_jax.fit.profile_result import Profile, Quantity
 from rotflex_jax.fit.result import Fit
@@ -37,6 +38,8 @@ POINTS_TO_LEVEL, MOST_POINTS = 4, 16
 FIRST_STEP, LARGEST, FARTHEST = 0.1, 1.5, 6.0
 # A level is passed where the root is this share beyond it.
 BEYOND_LEVEL = 1.05
+# The level lies between two points whose roots differ by this share of it at most, or so many are added.
+NEAR_LEVEL, MOST_BETWEEN = 0.6, 8
 # A value that moves by less than this share of what was asked is at the end of what it may be.
 STUCK = 0.5
 # A parameter is as good as at its lower bound where it is nearer than this share of its typical size.
@@ -229,36 +232,50 @@ class Walk:
         step = goal / POINTS_TO_LEVEL * self.std if np.isfinite(self.std) else FIRST_STEP
         most = LARGEST if self.along.positive else np.inf
         step, found, here = min(step, most), [], self.middle
+        low, high = (self.along.walked(v) if np.isfinite(v) else v for v in self.along.limits)
         while len(found) < MOST_POINTS:
             at, root = self.along.walked(here.value), self.root(here)
             target = at + way * step
-            low, high = (self.along.walked(v) if np.isfinite(v) else v for v in self.along.limits)
             if not self.along.positive:
                 # The last point before a limit that is never reached itself.
                 target = float(np.clip(target, (at + 3 * low) / 4, (at + 3 * high) / 4))
-            nearer = self.held(target, here.point)
-            moved = way * (self.along.walked(nearer.value) - at)
-            if not np.isfinite(nearer.cost) or moved < STUCK * abs(target - at):
+            further = self.held(target, here.point)
+            moved = way * (self.along.walked(further.value) - at)
+            if not np.isfinite(further.cost) or moved < STUCK * abs(target - at):
                 break
-            gained = self.root(nearer) - root
-            if gained > 3 * goal / POINTS_TO_LEVEL and root < goal and len(found) < MOST_POINTS - 4:
-                step = moved * goal / POINTS_TO_LEVEL / gained  # too far for an interpolation: again, nearer
-                if step > 0.05 * moved:
-                    found.append(nearer)
-                    between = self.held(at + way * max(step, moved / 3), here.point)
-                    found.insert(-1, between)
-                    here = nearer
-                    if self.root(here) > BEYOND_LEVEL * goal:
-                        break
-                    continue
-            found.append(nearer)
-            here = nearer
-            far = abs(self.along.walked(here.value) - begin)
-            if self.root(here) > BEYOND_LEVEL * goal or (self.along.positive and far > FARTHEST):
+            found.append(further)
+            if self.root(further) > BEYOND_LEVEL * goal:
+                return self.nearer(found, here, goal)
+            here, gained = further, self.root(further) - root
+            if self.along.positive and abs(self.along.walked(here.value) - begin) > FARTHEST:
                 break
             wanted = moved * goal / POINTS_TO_LEVEL / gained if gained > 0 else np.inf
             step = float(min(np.clip(wanted, moved / 3, 2.5 * moved), most))
         return found
+
+    def nearer(
+        self, found: list[PointOfProfile], inside: PointOfProfile, goal: float
+    ) -> list[PointOfProfile]:
+        """Points between the last two of a side, until the level lies between two that are near each other.
+
+        Args:
+            found: Points of the side; the last is beyond the level.
+            inside: The one before, or the middle.
+            goal: Root at the level.
+        """
+        outside, added = found[-1], list[PointOfProfile]()
+        for _ in range(MOST_BETWEEN):
+            a, b = self.root(inside), self.root(outside)
+            if b - a <= NEAR_LEVEL * goal:
+                break
+            share = float(np.clip((goal - a) / (b - a), 0.1, 0.9))
+            low, high = (self.along.walked(p.value) for p in (inside, outside))
+            between = self.held(low + share * (high - low), inside.point)
+            if not min(low, high) < self.along.walked(between.value) < max(low, high):
+                break
+            added.append(between)
+            inside, outside = (between, outside) if self.root(between) < goal else (inside, between)
+        return [*found[:-1], *added, found[-1]]
 
 
 @one_thread
@@ -340,10 +357,7 @@ def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Wal
     again = report(problem, end, *problem.errors(end.point, stage, end.K))
     # The variance of the walked coordinate by the curvature alone, of what no end of a range holds.
     moves = ~problem.held_by_ends(end.point, stage.windows)
-    H = here.H[np.ix_(moves, moves)]
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-13, hermitian=True) / np.outer(size, size)
-    plain = float(row[moves] @ inverse @ row[moves])
+    plain = _variance(here.H[np.ix_(moves, moves)], row[moves])
     # By the names of the parameters, as their covariance has them.
     m = again.model.mechanism
     base = dict(zip(m.parameter_names, m.values.tolist(), strict=True))
@@ -361,8 +375,19 @@ def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Wal
         gradient[k] = (high - low) / gap if gap else 0.0
     used = gradient != 0
     variance = float(gradient[used] @ again.covariance[np.ix_(used, used)] @ gradient[used])
+    factor = here.nats_that_count
     if np.isfinite(variance) and variance > 0 and plain > 0:
-        std, factor = float(np.sqrt(variance)), max(variance / plain, 1.0)
-    else:
-        std, factor = np.nan, here.nats_that_count
+        factor = max(variance / plain, 1.0)
+    std = float(np.sqrt(plain * factor)) if plain > 0 else np.nan
     return Walk(problem, along, end, PointOfProfile(value, end.cost, end.point, values), std, factor)
+
+
+def _variance(H: Float[np.ndarray, "M M"], row: Float[np.ndarray, " M"]) -> float:
+    """`row' H^-1 row`; nan where the quantity moves along what the curvature does not determine."""
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(H / np.outer(size, size))
+    along = vectors.T @ (row / size)
+    known = eigenvalues > UNDETERMINED_CURVATURE
+    if not row.any() or np.abs(along[~known]).max(initial=0.0) > 1e-3 * np.linalg.norm(along):
+        return np.nan
+    return float(np.sum(np.square(along[known]) / eigenvalues[known]))
