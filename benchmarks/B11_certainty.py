@@ -103,6 +103,7 @@ def summary(rows: list[Job]) -> dict[str, Any]:
         }
         for group, columns in bands.items()
     }
+    means |= {"all": means.pop("all")} if "all" in means else {}
     return {"intervals": intervals, "bands": means, "failed": len(rows) - len(good)}
 
 
