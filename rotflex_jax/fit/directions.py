@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 # Entries below this share of the largest belong to no sentence.
 LEAST_SHARE = 0.1
-# Two vectors are the same where no entry differs by more.
-SAME = 1e-6
+# Entries of a vector below this are zero, and two vectors are the same where no entry differs by more than
+# this: those of random runs are known to fewer digits than exact ones.
+ZERO, SAME = 1e-6, 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +104,7 @@ def reduced(vectors: Float[np.ndarray, "K P"]) -> Float[np.ndarray, "K P"]:
         for i in range(len(left)):
             if i != k:
                 left[i] -= left[i, column] * left[k]
-    return np.where(np.abs(left) < 1e-6, 0.0, left)
+    return np.where(np.abs(left) < ZERO, 0.0, left)
 
 
 def direction(
@@ -112,7 +113,7 @@ def direction(
     """A direction with its largest share 1."""
     scaled = vector / vector[np.argmax(np.abs(vector))]
     return Direction(
-        {n: float(v) for n, v in zip(names, scaled, strict=True) if abs(v) > 1e-6}, kind, float(std)
+        {n: float(v) for n, v in zip(names, scaled, strict=True) if abs(v) > ZERO}, kind, float(std)
     )
 
 
@@ -129,10 +130,10 @@ def least_held(
     K = len(vectors)
     if not K:
         return ()
-    inside = [i for i in range(len(names)) if np.abs(vectors[:, i]).max() > SAME]
+    inside = [i for i in range(len(names)) if np.abs(vectors[:, i]).max() > ZERO]
     sets = itertools.islice(itertools.combinations(inside, K), most)
     return tuple(
         tuple(names[i] for i in chosen)
         for chosen in sets
-        if np.linalg.matrix_rank(vectors[:, chosen], tol=SAME) == K
+        if np.linalg.matrix_rank(vectors[:, chosen], tol=ZERO) == K
     )

@@ -290,7 +290,7 @@ def _structural_at_random(model: Model, sensors: Sensors, recording: Recording |
         away = np.exp(rng.uniform(-FACTOR, FACTOR, len(free)))
         values[index] = _nonzero(m)[index] * away
         u = times * size * excitation.noise(N, Ts, seed=k)
-        draws.append((values, Runs(model, sensors, values, u, Ts).projected()))
+        draws.append((values, Runs(model, sensors, values, u, Ts, least_share=0.0).scaled()))
     C = len(sensors.here)
 
     def lost(rows: Sequence[int]) -> tuple[np.ndarray, int]:
@@ -307,7 +307,7 @@ def _structural_at_random(model: Model, sensors: Sensors, recording: Recording |
         other = next(k for k in alike if k != best)
         again = reduced(_null_vectors(draws[other][1][:, range(C)], other))
         kinds = [
-            kind_of(np.round(v, 5), np.round(w, 5), draws[best][0][index], draws[other][0][index])
+            kind_of(v, w, draws[best][0][index], draws[other][0][index])
             for v, w in zip(vectors, again, strict=True)
         ]
     unknown = [direction(free, v, kind) for v, kind in zip(vectors, kinds, strict=True)]
@@ -350,6 +350,7 @@ class Runs:
         u: Input.
         Ts: Sampling period [s].
         start: First positions and speeds; at rest if None.
+        least_share: Least size in which moves of a parameter are counted, as a share of its typical one.
     """
 
     model: Model
@@ -358,6 +359,7 @@ class Runs:
     u: np.ndarray
     Ts: float
     start: np.ndarray | None = None
+    least_share: float = SHARE_OF_TYPICAL
 
     def slopes(self) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
         """Outputs, and slopes by shares of the free parameters, then by first positions and speeds."""
@@ -366,7 +368,7 @@ class Runs:
         free = np.array([names.index(n) for n in m.free_names])
         N, C = len(self.u), len(m.channels)
         typical = np.array([s.typical for s in m.parameter_specifications])
-        shares = np.maximum(np.abs(self.values), SHARE_OF_TYPICAL * typical)
+        shares = np.maximum(np.abs(self.values), self.least_share * typical)
         with double_precision():
             data = StackedRecordings(
                 jnp.asarray(self.u[None]),
@@ -388,7 +390,7 @@ class Runs:
             y, J = jax.device_get((y, J))
         return y[0], J[0]
 
-    def projected(self) -> Float[np.ndarray, "N C K"]:
+    def scaled(self) -> Float[np.ndarray, "N C K"]:
         """Slopes by shares of the parameters, each channel by the size of its own signal."""
         y, J = self.slopes()
         size = np.maximum(np.std(y, axis=0), 1e-12)
