@@ -10,6 +10,7 @@ of the fit, with the numbers of its neighbour as a start.
 
 import dataclasses
 import itertools
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -44,6 +45,8 @@ NEAR_LEVEL, MOST_BETWEEN = 0.6, 8
 STUCK = 0.5
 # A parameter is as good as at its lower bound where it is nearer than this share of its typical size.
 NEAR = 1e-3
+# So many of the last equations are kept: those of two sides and a step that was refused.
+REMEMBERED = 6
 # Step of a difference quotient in the coordinates of a fit.
 STEP = 1e-5
 
@@ -135,11 +138,14 @@ class HeldProblem(GreyBoxProblem):
         along: The quantity, in the coordinate of its walk.
         target: Where it is held.
         width: Standard deviation of the row.
+        made: Points with their gains and equations without the row, the last ones: where one point of a
+            profile ends, the next one begins.
     """
 
     along: Along
     target: float
     width: float
+    made: "deque[tuple[FitPoint, np.ndarray, LikelihoodEquations]]"
 
     def at(self, point: FitPoint) -> tuple[float, Float[np.ndarray, " P"]]:
         """Value of the quantity, and the values of all parameters, means over recordings."""
@@ -172,7 +178,10 @@ class HeldProblem(GreyBoxProblem):
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> LikelihoodEquations:
         """Those of the fit with the row of the quantity."""
-        found = super().equations(point, stage, K)
+        found = next((e for at, gain, e in self.made if at is point and np.array_equal(gain, K)), None)
+        if found is None:
+            found = super().equations(point, stage, K)
+            self.made.append((point, K, found))
         miss = (self.along.walked(self.at(point)[0]) - self.target) / self.width
         row = self.slopes(point, stage.windows) / self.width
         return dataclasses.replace(
@@ -204,6 +213,7 @@ class Walk:
         middle: The same as a point.
         std: Wald's standard deviation of the walked coordinate; nan where there is none.
         factor: Nats that say as much as one.
+        made: As a `HeldProblem` has them.
     """
 
     problem: GreyBoxProblem
@@ -212,6 +222,7 @@ class Walk:
     middle: PointOfProfile
     std: float
     factor: float
+    made: "deque[tuple[FitPoint, np.ndarray, LikelihoodEquations]]"
 
     def root(self, point: PointOfProfile) -> float:
         """Root of the likelihood ratio, of either side."""
@@ -221,7 +232,7 @@ class Walk:
         """The least cost with the quantity near a target."""
         width = WIDTH * (self.std if np.isfinite(self.std) else FIRST_STEP)
         given = {f.name: getattr(self.problem, f.name) for f in dataclasses.fields(GreyBoxProblem)}
-        problem = HeldProblem(**given, along=self.along, target=target, width=width)
+        problem = HeldProblem(**given, along=self.along, target=target, width=width, made=self.made)
         found = problem.attempt(start, [self.end.stage])
         value, values = problem.at(found.point)
         return PointOfProfile(value, found.cost - problem.penalty(found.point), found.point, values)
@@ -351,7 +362,8 @@ def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Wal
     end = problem.attempt(point, [stage])
     here = problem.equations(end.point, stage, end.K)
     given = {f.name: getattr(problem, f.name) for f in dataclasses.fields(GreyBoxProblem)}
-    held = HeldProblem(**given, along=along, target=0.0, width=1.0)
+    made = deque([(end.point, end.K, here)], REMEMBERED)
+    held = HeldProblem(**given, along=along, target=0.0, width=1.0, made=made)
     value, values = held.at(end.point)
     row = held.slopes(end.point, stage.windows)
     again = report(problem, end, *problem.errors(end.point, stage, end.K))
@@ -379,7 +391,8 @@ def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Wal
     if np.isfinite(variance) and variance > 0 and plain > 0:
         factor = max(variance / plain, 1.0)
     std = float(np.sqrt(plain * factor)) if plain > 0 else np.nan
-    return Walk(problem, along, end, PointOfProfile(value, end.cost, end.point, values), std, factor)
+    middle = PointOfProfile(value, end.cost, end.point, values)
+    return Walk(problem, along, end, middle, std, factor, made)
 
 
 def _variance(H: Float[np.ndarray, "M M"], row: Float[np.ndarray, " M"]) -> float:

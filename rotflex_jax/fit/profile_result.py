@@ -128,7 +128,10 @@ class Profile:
     def sentence(self) -> str:
         """What is known of the quantity, in words."""
         (low, high), (factor, unit) = self.interval(), as_read(1.0, self.unit)
-        shown = lambda v: digits(factor * v)  # noqa: E731
+        # As many digits as the interval is worth.
+        width = min((b - a for a, b in self.regions() if math.isfinite(b - a)), default=math.inf)
+        worth = math.log10(max(abs(self.value) / width, 1.0)) if width > 0 else 3.0
+        shown = lambda v: digits(factor * v, 3 + math.floor(worth))  # noqa: E731
         says = {
             "closed": f"lies between {shown(low)} and {shown(high)}",
             "open above": f"is at least {shown(low)}; the recordings set no upper end",
@@ -177,5 +180,7 @@ class Profile:
         )
 
     def __str__(self) -> str:
-        low, high = self.wald
-        return f"{self.sentence}; Wald: {digits(low)} to {digits(high)} {unit_text(self.unit)}".rstrip()
+        (low, high), (factor, unit) = self.wald, as_read(1.0, self.unit)
+        worth = math.log10(max(abs(self.value) / self.std, 1.0)) if self.std > 0 else 0.0
+        ends = (digits(factor * v, 3 + math.floor(worth)) for v in (low, high))
+        return f"{self.sentence}; Wald: {' to '.join(ends)} {unit_text(unit)}".rstrip()
