@@ -100,7 +100,7 @@ class Bands:
     def shares(self) -> dict[str, dict[str, float]]:
         """Channel -> what widens its band -> share of the mean variance."""
         mean = {name: np.mean(np.square(part), axis=0) for name, part in self.parts.items()}
-        total = sum(mean.values())
+        total = np.sum(list(mean.values()), axis=0)
         return {
             channel: {
                 name: float(value[c] / total[c]) if total[c] > 0 else 0.0 for name, value in mean.items()
@@ -208,7 +208,7 @@ def prediction_bands(
         for name in PARTS[:-1]
     }
     combined["between models"] = np.einsum("m,mnc->nc", w, np.square(np.array(runs) - middle))
-    totals = np.array([sum(v.values()) for v in variances])
+    totals = np.array([np.sum(list(v.values()), axis=0) for v in variances])
     lower, upper = _mixture(np.array(runs), np.sqrt(totals), w, (1 - level) / 2, quantile)
     m = models[0][0].model.mechanism
     return Bands(
@@ -380,7 +380,7 @@ def _lacking(
         y_hat, parts = _run(fitted, recording)
         seen = slice(recording.n_init, None)
         errors.append((fitted.model.measured(recording).astype(float) - y_hat)[seen])
-        others.append(sum(parts.values())[seen])
+        others.append(np.sum(list(parts.values()), axis=0)[seen])
     e, v = np.concatenate(errors), np.concatenate(others)
     # Of each sample the variance with which it would lie on the edge of its band.
     needed = np.square(e / quantile) - v
