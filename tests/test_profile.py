@@ -180,6 +180,27 @@ def test_nuisances_are_fitted_anew():
     np.testing.assert_array_equal(held, 2.0)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"process_noise": {"hub": 1e-7}}, {"window_seconds": 1.0}, {"local": [CONSTANT]}],
+    ids=lambda options: next(iter(options)),
+)
+def test_profiles_are_of_what_was_fitted(options):
+    """Predictions, windows, numbers of each recording: linear in the torque constant, so Wald's interval."""
+    recordings = [recording(), recording()] if "local" in options else [recording()]
+    fit = rf.fit(axis(CONSTANT), recordings, **options)
+    p = fit.profile(CONSTANT, recordings)
+    np.testing.assert_allclose(p.interval(), fit[CONSTANT].ci95, rtol=0, atol=0.1 * p.std)
+    assert p.shape == "closed" and not p.wald_is_poor and p.gained == pytest.approx(0.0, abs=1e-2)
+
+
+def test_profiles_of_all_that_are_in_doubt():
+    both = rf.fit(axis(CONSTANT, INERTIA), recording())
+    found = both.profiles(recording())
+    assert set(found) == set(both.profile_advised) == {CONSTANT, INERTIA}
+    assert all(p.shape == "open" for p in found.values())
+
+
 def test_what_makes_no_sense_is_refused():
     with pytest.raises(rf.InputError, match="was to be profiled, but the free parameters"):
         rf.profile(fitted(), recording(), "hub.coulomb.level")

@@ -167,8 +167,9 @@ def prediction_bands(
     noise of the samples that it is estimated on), parameters that each recording has for itself (by their
     spread), process torques (by the linear part of the machine), the noise of the sensors, and what the model
     lacks. That is a constant for each channel, so large that bands over `known` recordings hold the share
-    `level` of their samples; without any as large as the residuals of the fit beyond the sensor's noise. Of
-    several models with weights the band is that of the mixture.
+    `level` of their samples; without any as large as the residuals of the fit beyond the sensor's noise, and
+    nothing where these are of predictions, which do not show what a free run misses. Of several models with
+    weights the band is that of the mixture.
 
     Everything is propagated to first order: not for a run in which a small change of a parameter decides
     between two motions.

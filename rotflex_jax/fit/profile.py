@@ -302,7 +302,8 @@ def profile(
     symmetric, may be open where the recordings set no end, and may have a gap. `factor` is the ratio of the
     variance that allows for errors correlated in time to the one by curvature alone, so that the interval is
     Wald's where the cost is a parabola. Points are placed outwards from the least cost, each as far from the
-    last as the profile is steep, in the fit's own compiled program.
+    last as the profile is steep, in the fit's own compiled program. First states that the fit has taken as
+    measured follow the parameters, which Wald's interval leaves out: the two then differ.
 
     Args:
         fitted: A fit by `rotflex_jax.fit`; its options are used again.

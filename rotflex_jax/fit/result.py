@@ -115,6 +115,14 @@ class Fit:
 
         return profile(self, recordings, of)
 
+    def profiles(self, recordings: "Recording | Sequence[Recording]") -> "dict[str, Profile]":
+        """Profiles of the parameters for which one is advised, by full name.
+
+        Args:
+            recordings: Those that were fitted.
+        """
+        return {name: self.profile(name, recordings) for name in self.profile_advised}
+
     def model_of(self, recording: int) -> Model:
         """The model with the local parameters of one of the fitted recordings, by its number."""
         own = {name: each[recording].value for name, each in self.local.items()}
