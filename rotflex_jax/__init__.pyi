@@ -23,13 +23,19 @@ from .discover import (
 from .errors import InputError as InputError
 from .experiment import Experiment as Experiment, Limits as Limits, next_experiment as next_experiment
 from .fit import (
+    Bands as Bands,
     Fit as Fit,
+    Identifiability as Identifiability,
     ManyStarts as ManyStarts,
+    Profile as Profile,
     SeriesFit as SeriesFit,
     fit as fit,
     forward_regression as forward_regression,
+    identifiable as identifiable,
     least_squares as least_squares,
     many_starts as many_starts,
+    prediction_bands as prediction_bands,
+    profile as profile,
 )
 from .joints import load_mjcf as load_mjcf
 from .latent import LatentTorque as LatentTorque, latent_torque as latent_torque

@@ -33,6 +33,7 @@ SERIES = basis.Volterra(basis.Delays(3))
 LIMITS = rf.Limits(voltage=5.0)
 CONTROLLER = rf.controller(JOINT, 0.002)
 NOISE = {"theta": 1e-3, "alpha": 1e-3}
+FITTED = rf.Fit(MODEL, 0.0, "converged", (), NOISE, 1e-9 * np.eye(5), JOINT.free_names, 1)
 AT_REST = rf.Recording(
     u=U, y=np.column_stack([Y[:, 0], np.zeros(N)]), Ts=0.002, accept=("constant", "saturated")
 )
@@ -52,6 +53,9 @@ def refused(call: Callable[[], object], phrase: str) -> None:
 FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fit": (rf.fit, {"mechanism": JOINT, "recordings": RUN}),
     "many_starts": (rf.many_starts, {"mechanism": JOINT, "recordings": RUN}),
+    "profile": (rf.profile, {"fitted": FITTED, "recordings": RUN, "of": "hub.inertia.inertia"}),
+    "identifiable": (rf.identifiable, {"mechanism": JOINT, "recording": RUN}),
+    "prediction_bands": (rf.prediction_bands, {"fitted": FITTED, "recording": RUN}),
     "discover": (rf.discover, {"mechanism": JOINT, "train": A, "validation": B}),
     "learn_torque": (rf.learn_torque, {"model": JOINT, "train": A, "test": B}),
     "latent_torque": (rf.latent_torque, {"model": JOINT, "recordings": RUN}),
@@ -200,6 +204,37 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("many_starts", "short_seconds"): NO_SECONDS,
     ("many_starts", "seed"): [(-1, "is -1"), (1.5, "is 1.5"), ("a", "is 'a'")],
     ("many_starts", "progress"): NO_PROGRESS,
+    ("profile", "fitted"): [
+        (None, "fit is needed, but None was given"),
+        (JOINT, "a Mechanism was given; give what"),
+        ("paper", "'paper' was given"),
+    ],
+    ("profile", "recordings"): [*NO_RECORDINGS, *TOO_SHORT, (AT_REST, "one value throughout")],
+    ("profile", "of"): [
+        ("x", "'x' was to be profiled, but the free parameters of the fit are hub.inertia.inertia"),
+        ("arm.inertia.inertia", "name one of these"),
+        (3, "a function of the values by name, but is 3"),
+        (None, "but is None"),
+        (lambda values: values["x"], "failed with KeyError"),
+        (lambda values: "a", "gives nan at the fit"),
+    ],
+    ("profile", "level"): [(NAN, "is nan"), (0, "above 0"), (1, "below 1, but is 1"), ("high", "is 'high'")],
+    ("identifiable", "mechanism"): [
+        *NO_MODEL,
+        (JOINT.trust(*JOINT.parameter_names), "All parameters are trusted"),
+    ],
+    ("identifiable", "recording"): [*NO_RECORDINGS[1:4], *TOO_SHORT, (AT_REST, "one value throughout")],
+    ("prediction_bands", "fitted"): [
+        (None, "fit and its weight, is needed, but None was given"),
+        (MODEL, "a Model was given"),
+        ([], "a list was given"),
+        ([(MODEL, 1.0)], "a list was given"),
+        ([(FITTED, 0)], "above 0, but is 0"),
+        ([(FITTED, NAN)], "is nan"),
+    ],
+    ("prediction_bands", "recording"): [*NO_RECORDINGS[:3], *TOO_SHORT],
+    ("prediction_bands", "level"): [(NAN, "is nan"), (0, "above 0"), (1, "below 1"), (None, "is None")],
+    ("prediction_bands", "known"): [*NO_RECORDINGS[:3], *TOO_SHORT],
     ("discover", "mechanism"): NO_MODEL,
     ("discover", "train"): [*NO_RECORDINGS, *TOO_SHORT, (AT_REST, "alpha")],
     ("discover", "validation"): [*NO_RECORDINGS[1:3], *NO_RECORDINGS[4:], *TOO_SHORT],

@@ -1,10 +1,16 @@
 """`rotflex check`: quality of recordings; `rotflex data`: the public ones, listed and fetched."""
 
+from typing import TYPE_CHECKING
+
 import typer
 
 from rotflex_jax.cli import arguments as given, terminal
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
+
+if TYPE_CHECKING:
+    from rotflex_jax.models.model import Model
+    from rotflex_jax.recording import Recording
 
 # A shorter recording has too few reversals to fit and to validate on [s].
 SHORTEST_FOR_SEARCH = 5.0
@@ -50,12 +56,18 @@ def data_fetch(
 
 @given.reads_files
 def check(
+    context: typer.Context,
     files: given.Files,
     joint: given.JointName = "paper",
     *,
     columns: given.Columns,
 ) -> None:
-    """Say what is in a recording and what is wrong with it; takes seconds."""
+    """Say what is in a recording and what is wrong with it; takes seconds.
+
+    With --joint also which parameters of that model the recording can determine.
+    """
+    source = context.get_parameter_source("joint")
+    named = source is not None and source.name != "DEFAULT"
     given.check_distinct(files, [])
     joint = given.joint_for(files, joint, columns)
     model = by_name.model(joint)
@@ -74,3 +86,22 @@ def check(
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
         terminal.message(f"The signs of {' and '.join(model.mechanism.channels)} are those of {joint}.")
+        if named:
+            _say_what_can_be_known(model, recording, joint)
+
+
+def _say_what_can_be_known(model: "Model", recording: "Recording", joint: str) -> None:
+    """Which parameters of a model a recording determines, at the numbers that the model starts with."""
+    from rotflex_jax.fit.identifiable import identifiable
+
+    if not model.mechanism.free_names:
+        return
+    try:
+        with terminal.progress("What these sensors can determine"):
+            found = identifiable(model, recording)
+    except InputError as error:  # the recording may be good where the numbers of the model are not
+        terminal.message(f"note: {error}")
+        return
+    terminal.message(f"What can be known of {joint}, at its own numbers:")
+    for sentence in found.sentences:
+        terminal.message(f"  {sentence}")

@@ -31,7 +31,7 @@ from rotflex_jax.fit.problem import (
     likelihood_equations,
     runs_with_slopes,
 )
-from rotflex_jax.fit.result import Fit
+from rotflex_jax.fit.result import Fit, FitOptions
 from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.fit.windows import Windows
 from rotflex_jax.mechanism import Mechanism, kalman_gains
@@ -481,6 +481,7 @@ def report(
     end: FitAttempt,
     e: Float[np.ndarray, "R N C"],
     J: Float[np.ndarray, "R N C D"],
+    options: FitOptions | None = None,
 ) -> Fit:
     """Estimates with intervals.
 
@@ -491,6 +492,7 @@ def report(
         end: The optimum.
         e: Errors there.
         J: Their slopes by the directions of each recording.
+        options: How the fit was asked for; the defaults if None.
     """
     model, data, point, windows = problem.model, problem.dataset.data, end.point, end.stage.windows
     m, coordinates, seen = model.mechanism, problem.coordinates(point, windows), data.seen > 0
@@ -557,6 +559,7 @@ def report(
         ),
         local=local,
         remarks=(*at_bounds(found), *beyond_recordings(fitted, reach)),
+        options=options or FitOptions(),
     )
 
 
@@ -665,11 +668,44 @@ def fit(
         checks.positive(window_seconds, "window_seconds", "s", "2.0, or None for whole recordings")
     check_signs(model, given)
     problem = _problem(model, given, first, max_steps, minimiser, devices, say)
+    asked = None if process_noise is None else dict(process_noise)
+    options = FitOptions(asked, local, first, window_seconds, max_steps)
     with double_precision():
         end = problem.solve([names.index(n) for n in local], process_noise, window_seconds)
         if throw and end.status != "converged":
             raise RuntimeError(f"The fit did not converge: {end.status}.")
-        return report(problem, end, *problem.errors(end.point, end.stage, end.K))
+        return report(problem, end, *problem.errors(end.point, end.stage, end.K), options)
+
+
+def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxProblem, FitPoint, FitStage]:
+    """The problem that a fit has solved, its parameters with first states where fits start, and the stage.
+
+    Args:
+        fitted: A fit.
+        recordings: Those that were fitted.
+
+    Raises:
+        InputError: Other recordings, where each has parameters of its own.
+    """
+    asked, m = fitted.options, fitted.model.mechanism
+    own = fitted.local.values()
+    if any(len(each) != len(recordings) for each in own):
+        raise InputError(
+            f"The fit has parameters of their own for {len(next(iter(own)))} recordings, but "
+            f"{len(recordings)} were given; give those that were fitted."
+        )
+    problem = _problem(fitted.model, recordings, asked.first, asked.max_steps, None, None, lambda _: None)
+    windows = problem.horizons(asked.window_seconds)[-1]
+    point = problem.start([m.parameter_names.index(n) for n in asked.local], windows)
+    transform, local_z = problem.transform, point.local_z.copy()
+    for r in range(len(recordings)):
+        z = np.clip(transform.unconstrain(fitted.model_of(r).mechanism.values), *problem.ranges)
+        local_z[r] = z[list(point.local)]
+    return (
+        problem,
+        dataclasses.replace(point, local_z=local_z),
+        FitStage(windows, asked.process_noise),
+    )
 
 
 def _problem(

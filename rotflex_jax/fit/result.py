@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,32 @@ from rotflex_jax.text.svg import bars
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from rotflex_jax.fit.profile_result import Profile, Quantity
+
+
+# A parameter with a bound whose 95 % interval is wider than this share of it, to either side, hardly has a
+# symmetric one.
+WIDE_INTERVAL = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class FitOptions:
+    """How a fit was asked for, so that what follows from it asks the same.
+
+    Attributes:
+        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for a free run.
+        local: Parameters that each recording has for itself.
+        first: Whether first states were fitted, or held at what the first samples show.
+        window_seconds: Runs started again so often [s]; None for whole recordings.
+        max_steps: Most iterations of each minimisation.
+    """
+
+    process_noise: dict[str, float] | None = None
+    local: tuple[str, ...] = ()
+    first: str = "fitted"
+    window_seconds: float | None = None
+    max_steps: int = 60
+
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
@@ -42,6 +69,7 @@ class Fit:
         local: Parameter that each recording has for itself -> its estimates, in the order of the
             recordings; `parameters` has the mean.
         remarks: Parameters at a bound, or far beyond what the recordings reach, each with a sentence.
+        options: How it was asked for.
     """
 
     model: Model
@@ -56,6 +84,44 @@ class Fit:
     weakest: dict[str, float] = dataclasses.field(default_factory=dict)
     local: dict[str, tuple[Estimate, ...]] = dataclasses.field(default_factory=dict)
     remarks: tuple[Remark, ...] = ()
+    options: FitOptions = FitOptions()
+
+    @property
+    def profile_advised(self) -> tuple[str, ...]:
+        """Free parameters whose symmetric interval is in doubt by its own numbers, without any run.
+
+        They have no interval, or one that reaches a bound, or a bound and an interval of more than 30 % to
+        either side. `rotflex_jax.profile` gives them a better one.
+        """
+        m = self.model.mechanism
+        specs = dict(zip(m.parameter_names, m.parameter_specifications, strict=True))
+        found = []
+        for e in self.parameters:
+            spec, half = specs[e.name], 1.96 * e.std
+            bounds = [b for b in (spec.lower, spec.upper) if math.isfinite(b)]
+            room = min((abs(e.value - b) for b in bounds), default=math.inf)
+            if e.free and not half <= WIDE_INTERVAL * room:
+                found.append(e.name)
+        return tuple(found)
+
+    def profile(self, of: "Quantity", recordings: "Recording | Sequence[Recording]") -> "Profile":
+        """Profile likelihood of a parameter or of a function of parameters; as `rotflex_jax.profile`.
+
+        Args:
+            of: Full name, or a function from the values by full name to a number.
+            recordings: Those that were fitted.
+        """
+        from rotflex_jax.fit.profile import profile  # imported on request: it needs this module
+
+        return profile(self, recordings, of)
+
+    def profiles(self, recordings: "Recording | Sequence[Recording]") -> "dict[str, Profile]":
+        """Profiles of the parameters for which one is advised, by full name.
+
+        Args:
+            recordings: Those that were fitted.
+        """
+        return {name: self.profile(name, recordings) for name in self.profile_advised}
 
     def model_of(self, recording: int) -> Model:
         """The model with the local parameters of one of the fitted recordings, by its number."""

@@ -1,0 +1,128 @@
+"""How often intervals hold the true number and bands the measured samples, on one record of the arena.
+
+Imports JAX, so workers import it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+import traceback
+from typing import Any
+
+import numpy as np
+
+import rotflex_jax as rf
+from arena.hidden import DEFAULTS, SHAPES
+from arena.laws import Place
+from arena.records import make_record
+from arena.scoring import renamed
+from arena.trial import textbook
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.mechanism import Exponential
+from rotflex_jax.models.model import Model
+
+FS = 500.0
+SUBSTEPS = 3
+"""Steps in each sample: friction stops and starts within one, which would bias its level by an interval."""
+LEVEL = 0.9
+
+
+def true_model(places: list[Place], size: float = 1.0) -> Model:
+    """The true structure with half the true sizes, where a fit starts."""
+    m = textbook()
+    for place in places:
+        kept = SHAPES.get(place[0], set())
+        half = {n: (v if n in kept else v * size / 2) for n, v in DEFAULTS[place].items()}
+        m = m + CATALOG[place[0]](at=place[1], **renamed(place, half))
+    return Model(m, Exponential(substeps=SUBSTEPS))
+
+
+def record(job: dict[str, Any], kind: str, seconds: float) -> tuple[rf.Recording, dict[str, Any]]:
+    """A recording of the machine of a job under an input, and its truth."""
+    places = [tuple(p) for p in job["effects"]]
+    r = make_record(places, kind=kind, seed=job["seed"], size=job["size"], seconds=seconds, fs=FS)
+    return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena"), r["truth"]
+
+
+def intervals(job: dict[str, Any]) -> dict[str, Any]:
+    """Profile and Wald intervals of the parameters of the hidden effect, beside the truth."""
+    row: dict[str, Any] = dict(job)
+    try:
+        rec, truth = record(job, job["kind"], job["seconds"])
+        (hidden,) = truth["effects"]
+        place = (hidden["effect"], hidden["port"])
+        true = renamed(place, hidden["parameters"], truth["plant"]["K"])
+        began = time.perf_counter()
+        fitted = rf.fit(true_model([place], job["size"]), rec)
+        row["status"], row["fit_s"] = fitted.status, time.perf_counter() - began
+        row["intervals"] = []
+        for name, value in true.items():
+            began = time.perf_counter()
+            full = f"{place[1]}.{place[0]}.{name}"
+            if full not in fitted.free_names:
+                continue
+            p = rf.profile(fitted, rec, full)
+            estimate = fitted[full]
+            row["intervals"].append(
+                {
+                    "name": full,
+                    "truth": value,
+                    "value": p.value,
+                    "profile": _plain(p.interval()),
+                    "held": any(a <= value <= b for a, b in p.regions()),
+                    "wald": _plain(estimate.ci95),
+                    "wald_held": bool(estimate.ci95[0] <= value <= estimate.ci95[1]),
+                    "shape": p.shape,
+                    "wald_is_poor": p.wald_is_poor,
+                    "advised": full in fitted.profile_advised,
+                    "gained": p.gained,
+                    "factor": p.factor,
+                    "points": len(p.values),
+                    "s": time.perf_counter() - began,
+                }
+            )
+    except Exception as problem:  # the benchmark reports it and goes on
+        row["error"] = f"{type(problem).__name__}: {problem}"
+        row["traceback"] = traceback.format_exc()
+    return row
+
+
+def bands(job: dict[str, Any]) -> dict[str, Any]:
+    """Coverage of bands over a run that nobody fitted, of the true structure and of the textbook's.
+
+    The same machine runs three times: the first run is fitted, the second is known to the band of the
+    textbook's model, the third is held out.
+    """
+    row: dict[str, Any] = dict(job)
+    try:
+        places = [tuple(p) for p in job["effects"]]
+        seconds, runs = job["seconds"], []
+        whole, _ = record(job, job["kind"], 3 * seconds)
+        n = whole.N // 3
+        runs = [dataclasses.replace(whole.slice(k * n, (k + 1) * n), continues=None) for k in range(3)]
+        train, known, held_out = runs
+        began = time.perf_counter()
+        fitted = rf.fit(true_model(places, job["size"]), train)
+        row["status"] = fitted.status
+        found = rf.prediction_bands(fitted, held_out, LEVEL)
+        row["coverage"], row["shares"] = found.coverage(), found.shares
+        row["with_known"] = rf.prediction_bands(fitted, held_out, LEVEL, known=known).coverage()
+        wrong = rf.fit(Model(textbook(), Exponential(substeps=SUBSTEPS)), train)
+        row["textbook"] = rf.prediction_bands(wrong, held_out, LEVEL).coverage()
+        row["textbook_known"] = rf.prediction_bands(wrong, held_out, LEVEL, known=known).coverage()
+        row["s"] = time.perf_counter() - began
+    except Exception as problem:
+        row["error"] = f"{type(problem).__name__}: {problem}"
+        row["traceback"] = traceback.format_exc()
+    return row
+
+
+def trial(job: dict[str, Any]) -> dict[str, Any]:
+    """One row of either kind."""
+    return {"intervals": intervals, "bands": bands}[job["part"]](job)
+
+
+def _plain(pair: tuple[float, float]) -> list[float | None]:
+    return [v if math.isfinite(v) else None for v in np.asarray(pair, float).tolist()]

@@ -1,0 +1,410 @@
+"""Bands around a free run: where a measurement would lie, and what widens them.
+
+    y - y_hat ~ N(0, sum of parts),   part_p = S V S',  S = J_p + J_x dx0/dp
+
+The parts are first-order propagations of what is uncertain: parameters with the covariance of the fit, the
+first state with the noise of the samples that it is estimated on, what each recording has for itself,
+process torques, the sensor, and what the model lacks, as large as free runs over known recordings show it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from rotflex_jax import checks
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
+from rotflex_jax.fit.problem import RunLayout, runs_with_slopes
+from rotflex_jax.fit.result import Fit
+from rotflex_jax.mechanism import Mechanism, linearise
+from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.mechanism.linear import inverse_mass, output_units, process_covariance
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.runtime.xla import double_precision
+from rotflex_jax.text.markup import card, paragraph, table
+from rotflex_jax.text.numbers import plain_number, readable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PARTS = (
+    "parameters",
+    "first state",
+    "own of each recording",
+    "process torque",
+    "sensor",
+    "what the model lacks",
+    "between models",
+)
+"""What widens a band, in the order of tables."""
+# A recording starts at rest where its first speeds are below this share of the speeds that follow.
+AT_REST = 0.02
+# Halvings of an interval that holds a quantile of a mixture.
+HALVINGS = 60
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bands:
+    """Where a recording's outputs would lie, sample by sample.
+
+    Attributes:
+        recording: Whose input was run.
+        channels: Of the model.
+        units: Of these.
+        level: Probability of each sample to lie inside.
+        middle: Free run; of several models the weighted mean.
+        lower: Lower end.
+        upper: Upper end.
+        parts: What widens the band -> standard deviation by this alone.
+    """
+
+    recording: Recording
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    level: float
+    middle: Float[np.ndarray, "N C"]
+    lower: Float[np.ndarray, "N C"]
+    upper: Float[np.ndarray, "N C"]
+    parts: dict[str, Float[np.ndarray, "N C"]]
+
+    def coverage(self, recording: Recording | None = None) -> dict[str, float]:
+        """Share of the measured samples inside the band, per channel, those at the start not counted.
+
+        Args:
+            recording: What was measured; the recording of the band if None.
+
+        Raises:
+            InputError: A recording of another length, or without a channel.
+        """
+        (recording,) = listed(self.recording if recording is None else recording, "recording")
+        missing = [c for c in self.channels if c not in recording.channels]
+        if missing or len(self.middle) != recording.N:
+            what = f"lacks the channel {missing[0]!r}" if missing else f"has {recording.N} samples"
+            raise InputError(
+                f"The bands are of {len(self.middle)} samples of {', '.join(self.channels)}, but the "
+                f"recording {what}; give a measurement under the same input."
+            )
+        y = np.stack([recording.channel(c) for c in self.channels], axis=1).astype(float)
+        inside = ((self.lower <= y) & (y <= self.upper))[recording.n_init :]
+        return dict(zip(self.channels, inside.mean(axis=0).tolist(), strict=True))
+
+    @property
+    def shares(self) -> dict[str, dict[str, float]]:
+        """Channel -> what widens its band -> share of the mean variance."""
+        mean = {name: np.mean(np.square(part), axis=0) for name, part in self.parts.items()}
+        total = np.sum(list(mean.values()), axis=0)
+        return {
+            channel: {
+                name: float(value[c] / total[c]) if total[c] > 0 else 0.0 for name, value in mean.items()
+            }
+            for c, channel in enumerate(self.channels)
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        half = (self.upper - self.lower) / 2
+        return {
+            "level": self.level,
+            "channels": list(self.channels),
+            "mean_half_width": dict(zip(self.channels, half.mean(axis=0).tolist(), strict=True)),
+            "coverage": self.coverage(),
+            "shares": self.shares,
+        }
+
+    def plot(self) -> "Figure":
+        """The band around the free run with what was measured, and its parts over time."""
+        from rotflex_jax.fit.bands_figure import bands_figure  # takes long to import
+
+        return bands_figure(self)
+
+    def _repr_html_(self) -> str:
+        """Mean width, coverage and what widens the band, per channel."""
+        rows, covered, shares = [], self.coverage(), self.shares
+        for c, (channel, unit) in enumerate(zip(self.channels, self.units, strict=True)):
+            half, read = readable(float(np.mean(self.upper[:, c] - self.lower[:, c]) / 2), unit)
+            most = max(shares[channel], key=lambda name: shares[channel][name])
+            share = f"{most} ({100 * shares[channel][most]:.0f} %)"
+            rows.append((channel, read, share, plain_number(half), f"{100 * covered[channel]:.1f} %"))
+        return card(
+            f"Bands of {100 * self.level:g} % around a free run",
+            table(
+                ("channel", "unit", "widened most by", "mean half width", "measured inside"), rows, words=3
+            ),
+            paragraph("Each sample by itself: neighbouring samples leave the band together."),
+        )
+
+    def __str__(self) -> str:
+        shares = self.shares
+        lines = [f"Bands of {100 * self.level:g} %"]
+        for channel, inside in self.coverage().items():
+            large = sorted(shares[channel].items(), key=lambda pair: -pair[1])[:3]
+            by = ", ".join(f"{name} {100 * share:.0f} %" for name, share in large if share >= 0.005)
+            lines.append(f"  {channel}: {100 * inside:.1f} % of the samples inside; widened by {by}")
+        return "\n".join(lines)
+
+
+def prediction_bands(
+    fitted: Fit | Sequence[tuple[Fit, float]],
+    recording: Recording,
+    level: float = 0.9,
+    *,
+    known: Recording | Sequence[Recording] = (),
+) -> Bands:
+    """Bands in which the samples of a recording lie with some probability, around a free run over it.
+
+        y_k - y_hat_k ~ N(0, v_k),   v_k = sum of the parts,   band: y_hat_k -+ quantile(level) sqrt(v_k)
+
+    The run starts from the first `n_init` samples, like every free run. The variance of a sample adds up
+    parameters (by the covariance of the fit, with the first state that follows them), the first state (by the
+    noise of the samples that it is estimated on), parameters that each recording has for itself (by their
+    spread), process torques (by the linear part of the machine), the noise of the sensors, and what the model
+    lacks. That is a constant for each channel, so large that bands over `known` recordings hold the share
+    `level` of their samples; without any as large as the residuals of the fit beyond the sensor's noise, and
+    nothing where these are of predictions, which do not show what a free run misses. Of several models with
+    weights the band is that of the mixture.
+
+    Everything is propagated to first order: not for a run in which a small change of a parameter decides
+    between two motions.
+
+    Args:
+        fitted: A fit; or pairs of a fit and its weight, one for each set of effects that may be true.
+        recording: Its input and first samples are used, its other samples only by `coverage`.
+        level: Probability, between 0 and 1.
+        known: Recordings of the same machine by which the error of the model is measured, best some that were
+            not fitted.
+
+    Raises:
+        InputError: No fit, weights that are not positive, models with other channels.
+
+    Source: L. Ljung, System Identification, 2nd ed., 1999, section 9.4 (propagation of a covariance); V.
+    Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, 2005 (width by known errors).
+    """
+    level = checks.number(level, "level", above=0, below=1, example="0.9")
+    models = _weighted(fitted)
+    (recording,) = listed(recording, "recording", shortest=SHORTEST_TO_FIT)
+    others = list(listed(known, "known", shortest=SHORTEST_TO_FIT)) if _any(known) else []
+    quantile = float(scipy.stats.norm.ppf((1 + level) / 2))
+    runs, variances, weights = [], [], []
+    for one, weight in models:
+        y_hat, parts = _run(one, recording)
+        lacks = _lacking(one, others, quantile, level, parts["sensor"][0])
+        parts["what the model lacks"] = np.broadcast_to(lacks, y_hat.shape)
+        if not np.isfinite(y_hat).all():
+            raise InputError("The model diverges over this recording, so that it has no bands; fit it first.")
+        runs.append(y_hat)
+        variances.append(parts)
+        weights.append(weight)
+    w = np.array(weights) / np.sum(weights)
+    middle = np.einsum("m,mnc->nc", w, np.array(runs))
+    combined = {
+        name: np.einsum("m,mnc->nc", w, np.array([v.get(name, np.zeros_like(middle)) for v in variances]))
+        for name in PARTS[:-1]
+    }
+    combined["between models"] = np.einsum("m,mnc->nc", w, np.square(np.array(runs) - middle))
+    totals = np.array([np.sum(list(v.values()), axis=0) for v in variances])
+    lower, upper = _mixture(np.array(runs), np.sqrt(totals), w, (1 - level) / 2, quantile)
+    m = models[0][0].model.mechanism
+    return Bands(
+        recording=recording,
+        channels=m.channels,
+        units=tuple(output_units(m).values()),
+        level=level,
+        middle=middle,
+        lower=lower,
+        upper=upper,
+        parts={name: np.sqrt(v) for name, v in combined.items() if np.any(v > 0)},
+    )
+
+
+def _any(known: Any) -> bool:
+    return not (isinstance(known, Sequence) and len(known) == 0)
+
+
+def _weighted(fitted: Any) -> list[tuple[Fit, float]]:
+    """Fits with their weights.
+
+    Raises:
+        InputError: Something else, or models of other channels.
+    """
+    pairs = [(fitted, 1.0)] if isinstance(fitted, Fit) else fitted
+    right = isinstance(pairs, Sequence) and all(
+        isinstance(pair, Sequence) and len(pair) == 2 and isinstance(pair[0], Fit) for pair in pairs
+    )
+    if not right or not pairs:
+        raise InputError(
+            f"A fit, or pairs of a fit and its weight, is needed, but {checks.shown(fitted)} was given; give "
+            "what rotflex_jax.fit gives."
+        )
+    found = [(fit, checks.positive(weight, "weight", "", "0.5")) for fit, weight in pairs]
+    channels = {fit.model.mechanism.channels for fit, _ in found}
+    if len(channels) > 1:
+        raise InputError(
+            "The models have different outputs, "
+            + " and ".join(", ".join(c) for c in sorted(channels))
+            + ", but bands are of the same outputs; give models of one machine."
+        )
+    return found
+
+
+def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], dict[str, np.ndarray]]:
+    """A free run, and the variances of its samples by what is uncertain of machine, start and sensor."""
+    model = fitted.model
+    m = model.at(recording).mechanism
+    names = m.parameter_names
+    free = np.array([names.index(n) for n in fitted.free_names], int)
+    y = model.measured(recording).astype(float)
+    start = model.states_at(recording, np.array([0]))
+    y_hat, J = _slopes(model, m, recording, start, free)
+    noise = sensor_noise([recording], model)
+    known = np.array([n in recording.constants for n in fitted.free_names], bool)
+    J[..., : len(free)][..., known] = 0.0
+    # The first positions and speeds are the least-squares answer on the first samples, channels as they are,
+    # given parameters and states that no sensor shows.
+    head, moving, F = slice(0, recording.n_init), 2 * len(m.coordinates), len(free)
+    J = np.concatenate([J[..., :F], J[..., F + moving :], J[..., F : F + moving]], axis=-1)
+    first, by = J[head, :, -moving:], J[head, :, :-moving]
+    H = np.einsum("ncs,nct->st", first, first)
+    inverse = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
+    follows = -inverse @ np.einsum("ncs,ncp->sp", first, by)
+    cov_start = inverse @ np.einsum("ncs,c,nct->st", first, noise**2, first) @ inverse
+    whole = J[..., :-moving] + np.einsum("ncs,sp->ncp", J[..., -moving:], follows)
+    unseen = _unseen(model, recording, start[0], moving)
+    parts = {
+        "parameters": _propagated(whole[..., :F], _finite(fitted.covariance)),
+        "first state": _propagated(J[..., -moving:], cov_start) + _propagated(whole[..., F:], unseen),
+        "sensor": np.broadcast_to(noise**2, y.shape),
+    }
+    own = np.zeros_like(y)
+    for name, each in fitted.local.items():
+        if len(each) > 1:
+            spread = float(np.var([e.value for e in each], ddof=1))
+            own = own + spread * np.square(whole[..., fitted.free_names.index(name)])
+    if own.any():
+        parts["own of each recording"] = own
+    if fitted.options.process_noise is not None:
+        parts["process torque"] = _process_variance(m, fitted.options.process_noise, recording)
+    return y_hat, parts
+
+
+def _unseen(
+    model: Model, recording: Recording, start: Float[np.ndarray, " n"], moving: int
+) -> Float[np.ndarray, "h h"]:
+    """Covariance of the first states that no sensor shows, such as that of a friction with memory.
+
+    A recording that starts at rest, or goes on where another ended, is taken to start as the model has it.
+    Otherwise these states may be as far from there as they ever are in a run over the recording.
+    """
+    X = model.simulate_states(recording)
+    n = moving // 2
+    speed = np.sqrt(np.mean(np.square(X[:, n:moving]), axis=0))
+    resting = bool(np.all(np.abs(start[n:moving]) < AT_REST * speed))
+    away = np.where(resting or recording.continues is not None, 0.0, X[:, moving:] - start[moving:])
+    return away.T @ away / len(X)
+
+
+def _finite(covariance: np.ndarray) -> np.ndarray:
+    """A covariance without what has none: parameters that are held at the end of their range."""
+    return np.where(np.isfinite(covariance), covariance, 0.0)
+
+
+def _propagated(S: Float[np.ndarray, "N C P"], V: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "N C"]:
+    """Diagonal of `S V S'`."""
+    return np.maximum(np.einsum("ncp,pq,ncq->nc", S, V, S), 0.0)
+
+
+def _slopes(
+    model: Model, m: Mechanism, recording: Recording, start: np.ndarray, free: np.ndarray
+) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
+    """Outputs of a free run, and slopes by parameters [their units], then by the first state."""
+    states, C, N = Layout.of(m.structure).size, len(m.channels), recording.N
+    with double_precision():
+        data = StackedRecordings(
+            jnp.asarray(recording.u.astype(float)[None]),
+            jnp.zeros((1, N, C)),
+            jnp.ones((1, N)),
+            jnp.asarray(np.array([float(recording.Ts)])),
+        )
+        y, J = runs_with_slopes(
+            RunLayout(m.structure, model.solver, states),
+            jnp.asarray(m.values[None]),
+            jnp.ones((1, len(m.values))),
+            jnp.asarray(free),
+            jnp.asarray(start),
+            data,
+            jnp.zeros((1, Layout.of(m.structure).size, C)),
+            None,
+        )
+        y, J = jax.device_get((y, J))
+    return np.array(y[0]), np.array(J[0])
+
+
+def _process_variance(
+    m: Mechanism, intensities: dict[str, float], recording: Recording
+) -> Float[np.ndarray, "N C"]:
+    """Variance of the outputs by white torques from the start on, in the linear part of the machine."""
+    ss = linearise(m)
+    Ts = float(recording.Ts)
+    Ad, _ = ss.discretise(Ts)
+    n, inverse = len(m.coordinates), inverse_mass(m)
+    ports = m.port_vectors
+    Q = sum(
+        (q * process_covariance(ss.A, inverse @ np.array(ports[p]), n, Ts) for p, q in intensities.items()),
+        np.zeros_like(ss.A),
+    )
+    P, found = np.zeros_like(ss.A), np.zeros((recording.N, len(ss.C)))
+    for k in range(recording.n_init, recording.N):
+        P = Ad @ P @ Ad.T + Q
+        found[k] = np.einsum("cs,st,ct->c", ss.C, P, ss.C)
+    return found
+
+
+def _lacking(
+    fitted: Fit, known: Sequence[Recording], quantile: float, level: float, sensor: Float[np.ndarray, " C"]
+) -> Float[np.ndarray, " C"]:
+    """Variance of each channel by what the model lacks."""
+    m = fitted.model.mechanism
+    residual = np.array([fitted.noise[c] for c in m.channels])
+    if not known:
+        if fitted.options.process_noise is not None:
+            return np.zeros(len(residual))  # predictions leave innovations, which are no errors of a free run
+        return np.maximum(residual**2 - sensor, 0.0)
+    errors, others = [], []
+    for recording in known:
+        y_hat, parts = _run(fitted, recording)
+        seen = slice(recording.n_init, None)
+        errors.append((fitted.model.measured(recording).astype(float) - y_hat)[seen])
+        others.append(np.sum(list(parts.values()), axis=0)[seen])
+    e, v = np.concatenate(errors), np.concatenate(others)
+    # Of each sample the variance with which it would lie on the edge of its band.
+    needed = np.square(e / quantile) - v
+    return np.maximum(np.quantile(needed, level, axis=0), 0.0)
+
+
+def _mixture(
+    runs: Float[np.ndarray, "M N C"],
+    std: Float[np.ndarray, "M N C"],
+    weights: Float[np.ndarray, " M"],
+    tail: float,
+    quantile: float,
+) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C"]]:
+    """Quantiles of a mixture of normal distributions, by halving."""
+    if len(runs) == 1:
+        return runs[0] - quantile * std[0], runs[0] + quantile * std[0]
+    ends = []
+    for probability in (tail, 1 - tail):
+        far = float(scipy.stats.norm.isf(tail / 2)) + 2.0
+        low, high = (runs - far * std).min(axis=0), (runs + far * std).max(axis=0)
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            below = np.einsum("m,mnc->nc", weights, scipy.stats.norm.cdf((middle - runs) / std)) < probability
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        ends.append((low + high) / 2)
+    return ends[0], ends[1]

@@ -1,0 +1,224 @@
+"""Sensitivities of a linear machine in exact arithmetic: derivatives of what it answers to an impulse.
+
+    y(t) = C exp(A t) B,   h_k = C A^k B,   k = 0 .. 2 n - 1
+
+The first 2 n of these numbers determine the transfer function of n states, so parameters are locally known
+from input and outputs where the derivatives of `h_k` by the parameters have full rank. The numbers are
+fractions with derivatives beside them, so a rank is a rank and not a tolerance.
+
+Source: M. S. Grewal and K. Glover, IEEE Trans. Autom. Control 21, 1976; numbers drawn at random give the
+rank that holds almost everywhere: A. Sedoglavic, J. Symb. Comput. 33, 2002.
+"""
+
+import dataclasses
+import random
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+from rotflex_jax.effects.base import Linear
+from rotflex_jax.mechanism import Mechanism
+
+Matrix = list[list[Any]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Dual:
+    """A fraction with its derivatives along some directions.
+
+    >>> x = Dual(Fraction(3), (Fraction(1),))
+    >>> (2 / x + x * x).slopes[0] == Fraction(-2, 9) + 6
+    True
+    """
+
+    value: Fraction
+    slopes: tuple[Fraction, ...]
+
+    def _other(self, x: Any) -> "Dual":
+        return x if isinstance(x, Dual) else Dual(exact(x), (Fraction(0),) * len(self.slopes))
+
+    def __add__(self, x: Any) -> "Dual":
+        o = self._other(x)
+        return Dual(self.value + o.value, tuple(a + b for a, b in zip(self.slopes, o.slopes, strict=True)))
+
+    def __neg__(self) -> "Dual":
+        return Dual(-self.value, tuple(-a for a in self.slopes))
+
+    def __sub__(self, x: Any) -> "Dual":
+        return self + (-self._other(x))
+
+    def __rsub__(self, x: Any) -> "Dual":
+        return self._other(x) - self
+
+    def __mul__(self, x: Any) -> "Dual":
+        o = self._other(x)
+        pairs = zip(self.slopes, o.slopes, strict=True)
+        return Dual(self.value * o.value, tuple(a * o.value + self.value * b for a, b in pairs))
+
+    def __truediv__(self, x: Any) -> "Dual":
+        o = self._other(x)
+        quotient = self.value / o.value
+        pairs = zip(self.slopes, o.slopes, strict=True)
+        return Dual(quotient, tuple((a - quotient * b) / o.value for a, b in pairs))
+
+    def __rtruediv__(self, x: Any) -> "Dual":
+        return self._other(x) / self
+
+    def __pow__(self, power: int) -> "Dual":
+        result = self._other(1)
+        for _ in range(abs(power)):
+            result = result * self
+        return result if power >= 0 else 1 / result
+
+    __radd__, __rmul__ = __add__, __mul__
+
+
+def exact(x: Any) -> Fraction:
+    """A number as the fraction that its decimals say.
+
+    >>> exact(0.0059)
+    Fraction(59, 10000)
+    """
+    return x if isinstance(x, Fraction) else Fraction(repr(float(x)))
+
+
+def is_linear(m: Mechanism) -> bool:
+    """Whether the whole machine is linear in state and input, so that exact arithmetic can be used."""
+    return all(type(e).is_linear and isinstance(e, Linear) and e.exact_step for e in m.effects)
+
+
+def random_values(m: Mechanism, free: Sequence[str], seed: int) -> dict[str, Fraction]:
+    """Values of all parameters: free ones at random, positive; trusted ones as they are."""
+    draw = random.Random(seed)
+    return {
+        name: Fraction(draw.randint(11, 99), draw.randint(11, 99)) if name in free else exact(value)
+        for name, value in zip(m.parameter_names, m.values.tolist(), strict=True)
+    }
+
+
+def impulse_slopes(
+    m: Mechanism, values: Mapping[str, Fraction], free: Sequence[str], rows: Sequence[Sequence[float]]
+) -> Matrix:
+    """Derivatives of `h_k` of some readings by the logarithms of parameters.
+
+    Args:
+        m: A linear machine.
+        values: Of all parameters.
+        free: By which parameters.
+        rows: Readings as coefficients of positions and speeds.
+
+    Returns:
+        One row for each reading and k, one column for each parameter.
+    """
+    zero = (Fraction(0),) * len(free)
+    unit = {name: tuple(Fraction(int(i == k)) for k in range(len(free))) for i, name in enumerate(free)}
+    effects = [
+        e.replace(
+            **{
+                p: Dual(values[full], unit.get(full, zero))
+                for p in e.values
+                for full in (f"{e.at}.{e.name}.{p}",)
+            }
+        )
+        for e in m.effects
+    ]
+    none = Dual(Fraction(0), zero)
+    A, B = _state_space(m, effects, none)
+    x, found = B, []
+    for _ in range(2 * len(A)):
+        for row in rows:
+            h = none
+            for coefficient, entry in zip(row, x, strict=False):
+                if coefficient:
+                    h = h + entry * coefficient
+            found.append([s * values[name] for s, name in zip(h.slopes, free, strict=True)])
+        x = [_dot(row, x, none) for row in A]
+    return found
+
+
+def _state_space(m: Mechanism, effects: Sequence[Any], none: Dual) -> tuple[Matrix, list[Dual]]:
+    """`A` and `B` of positions, speeds and the states of linear effects, as `mechanism.assembly` has them."""
+    n = len(m.coordinates)
+    empty = lambda rows, columns: [[none] * columns for _ in range(rows)]  # noqa: E731
+    M, D, K, drive = empty(n, n), empty(n, n), empty(n, n), [none] * n
+    stamps = [(e.stamp(), [exact(x) for x in m.vector(e)]) for e in effects]
+    for s, p in stamps:
+        for i in range(n):
+            drive[i] = drive[i] + s.drive * p[i]
+            for j in range(n):
+                both = p[i] * p[j]
+                if both:
+                    M[i][j] = M[i][j] + s.inertia * both
+                    D[i][j] = D[i][j] + s.damping * both
+                    K[i][j] = K[i][j] + s.stiffness * both
+    inverse = _inverse(M, none)
+    size = 2 * n + sum(len(s.own) for s, _ in stamps)
+    A, B = empty(size, size), [none] * size
+    for i in range(n):
+        A[i][n + i] = none + 1
+        B[n + i] = _dot(inverse[i], drive, none)
+        for j in range(n):
+            A[n + i][j] = -_dot(inverse[i], [row[j] for row in K], none)
+            A[n + i][n + j] = -_dot(inverse[i], [row[j] for row in D], none)
+    at = 2 * n
+    for s, p in stamps:
+        for a in range(len(s.own)):
+            for b in range(len(s.own)):
+                A[at + a][at + b] = none + s.own[a][b]
+            B[at + a] = none + s.from_voltage[a]
+            for j in range(n):
+                A[at + a][n + j] = none + s.from_speed[a] * p[j]
+            for i in range(n):
+                A[n + i][at + a] = _dot(inverse[i], p, none) * s.torque[a]
+        at += len(s.own)
+    return A, B
+
+
+def _dot(a: Sequence[Any], b: Sequence[Any], none: Dual) -> Dual:
+    total = none
+    for x, y in zip(a, b, strict=True):
+        total = total + x * y
+    return total
+
+
+def _inverse(M: Matrix, none: Dual) -> Matrix:
+    """Inverse of a matrix of duals by elimination."""
+    n = len(M)
+    rows = [[*row, *(none + int(i == j) for j in range(n))] for i, row in enumerate(M)]
+    for k in range(n):
+        pivot = next(i for i in range(k, n) if rows[i][k].value != 0)
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [x / rows[k][k] for x in rows[k]]
+        for i in range(n):
+            if i != k:
+                factor = rows[i][k]
+                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
+    return [row[n:] for row in rows]
+
+
+def null_space(rows: Matrix, size: int) -> list[list[Fraction]]:
+    """Vectors that a matrix of fractions maps to zero, each with a one in a column of its own.
+
+    >>> null_space([[Fraction(1), Fraction(1), Fraction(0)]], 3)
+    [[Fraction(-1, 1), Fraction(1, 1), Fraction(0, 1)], [Fraction(0, 1), Fraction(0, 1), Fraction(1, 1)]]
+    """
+    left, pivots = [list(row) for row in rows], list[int]()
+    for column in range(size):
+        k = len(pivots)
+        pivot = next((i for i in range(k, len(left)) if left[i][column] != 0), None)
+        if pivot is None:
+            continue
+        left[k], left[pivot] = left[pivot], left[k]
+        left[k] = [x / left[k][column] for x in left[k]]
+        for i in range(len(left)):
+            if i != k and left[i][column] != 0:
+                factor = left[i][column]
+                left[i] = [a - factor * b for a, b in zip(left[i], left[k], strict=True)]
+        pivots.append(column)
+    found = []
+    for column in (c for c in range(size) if c not in pivots):
+        vector = [Fraction(int(i == column)) for i in range(size)]
+        for k, pivot in enumerate(pivots):
+            vector[pivot] = -left[k][column]
+        found.append(vector)
+    return found

@@ -1,0 +1,489 @@
+"""What a machine and a recording of it can know: structural and practical identifiability.
+
+Structural: which combinations of parameters no recording determines, whatever its length and noise. For a
+linear machine by exact arithmetic (`exact_sensitivities.py`), for any other by the rank of the sensitivities
+of free runs at random parameters and inputs. Practical: which combinations one recording determines badly, by
+the eigenvectors of its information about the logarithms of the parameters.
+
+All sensors that a machine might have are outputs of one compiled run, so that what another one would add is
+a matter of rows.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.data import excitation
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit.dataset import StackedRecordings, prepare
+from rotflex_jax.fit.directions import Direction, direction, kind_of, least_held, reduced
+from rotflex_jax.fit.exact_sensitivities import impulse_slopes, is_linear, null_space, random_values
+from rotflex_jax.fit.problem import RunLayout, runs_with_slopes
+from rotflex_jax.fit.result import Fit
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.mechanism.mechanism import ROTOR
+from rotflex_jax.mechanism.quantity import Quantity
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.runtime.xla import double_precision
+from rotflex_jax.text.markup import bullets, card, paragraph
+
+# Singular values of normalised sensitivities below this are zeros but for rounding.
+ZERO = 1e-7
+# Samples of a random run, and its period where no recording gives one [s].
+RANDOM_SAMPLES, RANDOM_PERIOD = 1000, 0.004
+# Random inputs are so large, times 1 V or 0.3 rad; parameters are drawn within this factor.
+INPUT_SIZES, FACTOR = (1.0, 3.0, 10.0), 0.5
+# Directions known worse than this share of the values are named [standard deviation].
+BADLY_KNOWN = 0.1
+# A parameter near zero counts as this share of its typical size.
+SHARE_OF_TYPICAL = 0.1
+# A held parameter, sensor or input is worth naming where it makes the worst direction so many times better.
+HELPS = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Identifiability:
+    """What is known of a machine, from any recording and from one.
+
+    Attributes:
+        free: Parameters that a fit would move.
+        rank: How many combinations of them a perfect recording would determine.
+        unknown: The other combinations.
+        trust: Sets of parameters each of which, held, leaves nothing unknown; the smallest sets.
+        sensors: Further sensors -> how many combinations would still be unknown with them; those that help.
+        exact: Whether in exact arithmetic.
+        badly_known: Combinations that this recording determines worse than 10 %.
+        trust_here: Parameter -> worst standard deviation of any combination once it is held; the best first.
+        sensors_here: Further sensor -> the same with it.
+        inputs_here: Another input -> the same with it.
+        std: Parameter -> standard deviation as a share of its value, by this recording.
+    """
+
+    free: tuple[str, ...]
+    rank: int
+    unknown: tuple[Direction, ...]
+    trust: tuple[tuple[str, ...], ...]
+    sensors: dict[str, int]
+    exact: bool
+    badly_known: tuple[Direction, ...] | None = None
+    trust_here: dict[str, float] = dataclasses.field(default_factory=dict)
+    sensors_here: dict[str, float] = dataclasses.field(default_factory=dict)
+    inputs_here: dict[str, float] = dataclasses.field(default_factory=dict)
+    std: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def structural(self) -> bool:
+        """Whether a perfect recording would determine every free parameter."""
+        return not self.unknown
+
+    @property
+    def practical(self) -> bool | None:
+        """Whether this recording determines all combinations to 10 %; None without a recording."""
+        return None if self.badly_known is None else not self.badly_known
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All of it in words."""
+        how = "in exact arithmetic" if self.exact else "by the rank of sensitivities at random numbers"
+        said = []
+        if self.structural:
+            said.append(f"A perfect recording would determine all {len(self.free)} free parameters ({how}).")
+        else:
+            said.append(
+                f"Of {len(self.free)} free parameters a perfect recording would determine {self.rank} "
+                f"combinations ({how})."
+            )
+            said += [f"{d.sentence}." for d in self.unknown]
+            said += [f"To know the rest, trust {_either(self.trust)}."] if self.trust else []
+            freeing = [s for s, left in self.sensors.items() if left == 0]
+            if freeing:
+                said.append(f"Or measure {' or '.join(freeing)}.")
+            elif not self.sensors:
+                said.append("No further position or speed sensor would help.")
+        if self.badly_known is None:
+            return tuple(said)
+        if not self.badly_known:
+            worst = max(self.std, key=lambda n: self.std[n], default="")
+            tail = f"; worst is {worst}, ± {196 * self.std[worst]:.2g} %" if worst else ""
+            return (*said, f"This recording determines every combination to 10 % or better{tail}.")
+        said += [f"{d.sentence}." for d in self.badly_known if np.isfinite(d.std)]
+        if self.structural:
+            for words, found in (
+                ("trust {}", self.trust_here),
+                ("measure {}", self.sensors_here),
+                ("record {}", self.inputs_here),
+            ):
+                if found:
+                    best = min(found, key=lambda n: found[n])
+                    said.append(
+                        f"What would help: {words.format(best)}; the worst combination would be known to "
+                        f"± {196 * found[best]:.2g} %."
+                    )
+        return tuple(said)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "free": list(self.free),
+            "rank": self.rank,
+            "exact": self.exact,
+            "unknown": [d.to_dict() for d in self.unknown],
+            "trust": [list(names) for names in self.trust],
+            "sensors": self.sensors,
+            "badly_known": None if self.badly_known is None else [d.to_dict() for d in self.badly_known],
+            "trust_here": self.trust_here,
+            "sensors_here": self.sensors_here,
+            "inputs_here": self.inputs_here,
+            "std": {n: v if np.isfinite(v) else None for n, v in self.std.items()},
+            "sentences": list(self.sentences),
+        }
+
+    def _repr_html_(self) -> str:
+        """What is known in principle, then by the recording."""
+        first, *others = self.sentences
+        return card("What can be known", paragraph(first), bullets(others))
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences)
+
+
+def _either(sets: Sequence[Sequence[str]]) -> str:
+    """Some sets of names as alternatives, not all of them."""
+    shown = [" with ".join(names) for names in sets[:6]]
+    return (" or " if len(sets[0]) == 1 else ", or ").join(shown) + (" or others" if len(sets) > 6 else "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensors:
+    """Readings that there are, and those that there might be.
+
+    Attributes:
+        here: Rows over positions and speeds of the machine's own channels.
+        further: Name in words -> row of a sensor that it lacks.
+    """
+
+    here: list[tuple[float, ...]]
+    further: dict[str, tuple[float, ...]]
+
+    @classmethod
+    def of(cls, m: Mechanism) -> "Sensors":
+        """Positions and speeds of all ports that no channel shows."""
+        ports = m.port_vectors
+        pairs = [(port, Quantity(what)) for _, (port, what) in m.outputs]
+        here = [q.row(tuple(ports[port])) for port, q in pairs]
+        wanted = {
+            f"the {q.value} of {port}": q.row(tuple(v))
+            for port, v in ports.items()
+            if port != ROTOR
+            for q in Quantity
+        }
+        return cls(here, {name: row for name, row in wanted.items() if row not in here})
+
+    def all_outputs(self, m: Mechanism) -> Mechanism:
+        """The machine with all of them as outputs, its own first."""
+        added = {}
+        for name in self.further:
+            quantity, _, port = name.removeprefix("the ").partition(" of ")
+            added[f"further {name}"] = (port, quantity)
+        return dataclasses.replace(m, outputs=dict(m.outputs) | added)
+
+
+def identifiable(mechanism: Mechanism | Model | Fit, recording: Recording | None = None) -> Identifiability:
+    """What this machine, and this recording of it, can know of the free parameters.
+
+        structural: rank of d(outputs) / d ln(parameters)
+        practical: H = J'J / noise^2,  std = eig(H)^(-1/2)
+
+    Structural is what no recording of these sensors determines, for instance the common factor of all torques
+    of a machine of which only voltage and angles are known: for a machine of linear effects in exact
+    arithmetic, for any other at three random sets of parameters with random inputs of different sizes.
+    Practical is what this recording determines worse than 10 %, at the parameters that the mechanism has
+    (fit it first), with first states unknown, and with the noise of the sensors; of a fit with its residuals
+    and with the covariance that allows for their correlation. Both say which parameter to trust and which
+    sensor would help, the second also which input.
+
+    Args:
+        mechanism: A mechanism, a model or a fit; trusted parameters are known.
+        recording: For the practical part; None for the structural one alone.
+
+    Raises:
+        InputError: No free parameter, or a recording without the channels of the model.
+
+    Source: M. S. Grewal and K. Glover, IEEE Trans. Autom. Control 21, 1976 (linear); J. A. Jacquez and P.
+    Greif, Math. Biosci. 77, 1985 (rank of sensitivities); R. N. Gutenkunst et al., PLoS Comput. Biol. 3, 2007
+    (sloppy directions).
+    """
+    fitted = mechanism if isinstance(mechanism, Fit) else None
+    model = fitted.model if fitted else Model.of(mechanism)  # type: ignore[arg-type]
+    if recording is not None:
+        (recording,) = listed(recording, "recording", shortest=SHORTEST_TO_FIT)
+        model = model.at(recording)
+    m = model.mechanism
+    if not m.free_names:
+        raise InputError("All parameters are trusted, so that there is none to know; release one.")
+    sensors = Sensors.of(m)
+    if is_linear(m):
+        found = _structural_exact(m, sensors)
+    else:
+        found = _structural_at_random(model, sensors, recording)
+    return found if recording is None else _with_recording(found, model, sensors, recording, fitted)
+
+
+def _structural_exact(m: Mechanism, sensors: Sensors) -> Identifiability:
+    free = m.free_names
+    rows = [*sensors.here, *sensors.further.values()]
+    draws = [random_values(m, free, seed) for seed in (1, 2)]
+    slopes = impulse_slopes(m, draws[0], free, rows)
+
+    def lost(given: list[Any], which: Sequence[int]) -> list[Any]:
+        return null_space([row for k, row in enumerate(given) if k % len(rows) in which], len(free))
+
+    own = list(range(len(sensors.here)))
+    null = lost(slopes, own)
+    other = lost(impulse_slopes(m, draws[1], free, rows), own) if null else []
+    vectors = np.array(null, float).reshape(-1, len(free))
+    values = [np.array([float(d[n]) for n in free]) for d in draws]
+    unknown = [
+        direction(free, v, kind_of(v, w, *values))
+        for v, w in zip(vectors, np.array(other, float).reshape(-1, len(free)), strict=True)
+    ]
+    helping = {name: len(lost(slopes, [*own, len(own) + k])) for k, name in enumerate(sensors.further)}
+    return _structural(free, vectors, unknown, helping, True)
+
+
+def _structural(
+    free: tuple[str, ...],
+    vectors: np.ndarray,
+    unknown: Sequence[Direction],
+    helping: dict[str, int],
+    exact: bool,
+) -> Identifiability:
+    return Identifiability(
+        free=free,
+        rank=len(free) - len(vectors),
+        unknown=tuple(unknown),
+        trust=least_held(free, vectors),
+        sensors={name: left for name, left in helping.items() if left < len(vectors)},
+        exact=exact,
+    )
+
+
+def _structural_at_random(model: Model, sensors: Sensors, recording: Recording | None) -> Identifiability:
+    m, rng = model.mechanism, np.random.default_rng(0)
+    free = list(m.free_names)
+    index = [m.parameter_names.index(n) for n in free]
+    Ts = recording.Ts if recording is not None else RANDOM_PERIOD
+    N = recording.N if recording is not None else RANDOM_SAMPLES
+    unit = 0.3 if m.units.input == "rad" else 1.0
+    size = float(np.sqrt(np.mean(np.square(recording.u)))) if recording is not None else unit
+    draws = []
+    for k, times in enumerate(INPUT_SIZES):
+        values = m.values.copy()
+        away = np.exp(rng.uniform(-FACTOR, FACTOR, len(free)))
+        values[index] = _nonzero(m)[index] * away
+        u = times * size * excitation.noise(N, Ts, seed=k)
+        draws.append((values, Runs(model, sensors, values, u, Ts, least_share=0.0).scaled()))
+    C = len(sensors.here)
+
+    def lost(rows: Sequence[int]) -> tuple[np.ndarray, int]:
+        """What the best draw leaves unknown, and which draw that is."""
+        null = [_null_vectors(J[:, rows], k) for k, (_, J) in enumerate(draws)]
+        best = min(range(len(null)), key=lambda k: len(null[k]))
+        return null[best], best
+
+    vectors, best = lost(range(C))
+    vectors = reduced(vectors)
+    kinds = ["mixed"] * len(vectors)
+    alike = [k for k, (_, J) in enumerate(draws) if len(_null_vectors(J[:, range(C)], k)) == len(vectors)]
+    if len(alike) > 1:
+        other = next(k for k in alike if k != best)
+        again = reduced(_null_vectors(draws[other][1][:, range(C)], other))
+        kinds = [
+            kind_of(v, w, draws[best][0][index], draws[other][0][index])
+            for v, w in zip(vectors, again, strict=True)
+        ]
+    unknown = [direction(free, v, kind) for v, kind in zip(vectors, kinds, strict=True)]
+    helping = {
+        name: len(lost([*range(C), C + k])[0]) if len(vectors) else 0
+        for k, name in enumerate(sensors.further)
+    }
+    return _structural(tuple(free), vectors, unknown, helping, False)
+
+
+def _null_vectors(J: Float[np.ndarray, "N C K"], draw: int) -> Float[np.ndarray, "n K"]:
+    """Directions (rows) that sensitivities map to nothing but rounding."""
+    flat = J.reshape(-1, J.shape[-1])
+    if not np.isfinite(flat).all():
+        return np.eye(J.shape[-1])
+    size = np.linalg.norm(flat, axis=0)
+    seen = size > ZERO * max(float(size.max()), 1e-300)
+    scaled = np.where(seen, flat / np.where(seen, size, 1.0), 0.0)
+    _, s, V = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
+    null = V[s < ZERO * max(float(s[0]), 1e-300)]
+    # Back in shares of the values.
+    return null / np.where(seen, size / size.max(), 1.0)
+
+
+def _nonzero(m: Mechanism) -> np.ndarray:
+    """Values, and a part of the typical size where one is nearly zero."""
+    typical = np.array([s.typical for s in m.parameter_specifications])
+    small = np.abs(m.values) < SHARE_OF_TYPICAL * typical
+    return np.where(small, SHARE_OF_TYPICAL * typical * np.where(m.values < 0, -1, 1), m.values)
+
+
+@dataclasses.dataclass(frozen=True)
+class Runs:
+    """A free run with all sensors and its slopes.
+
+    Attributes:
+        model: Solver and machine.
+        sensors: Those that are there come first.
+        values: Of all parameters.
+        u: Input.
+        Ts: Sampling period [s].
+        start: First positions and speeds; at rest if None.
+        least_share: Least size in which moves of a parameter are counted, as a share of its typical one.
+    """
+
+    model: Model
+    sensors: Sensors
+    values: np.ndarray
+    u: np.ndarray
+    Ts: float
+    start: np.ndarray | None = None
+    least_share: float = SHARE_OF_TYPICAL
+
+    def slopes(self) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
+        """Outputs, and slopes by shares of the free parameters, then by first positions and speeds."""
+        m = self.sensors.all_outputs(self.model.mechanism)
+        names, states = m.parameter_names, 2 * len(m.coordinates)
+        free = np.array([names.index(n) for n in m.free_names])
+        N, C = len(self.u), len(m.channels)
+        typical = np.array([s.typical for s in m.parameter_specifications])
+        shares = np.maximum(np.abs(self.values), self.least_share * typical)
+        with double_precision():
+            data = StackedRecordings(
+                jnp.asarray(self.u[None]),
+                jnp.zeros((1, N, C)),
+                jnp.ones((1, N)),
+                jnp.asarray(np.array([float(self.Ts)])),
+            )
+            start = np.zeros(states) if self.start is None else self.start
+            y, J = runs_with_slopes(
+                RunLayout(m.structure, self.model.solver, states),
+                jnp.asarray(self.values[None]),
+                jnp.asarray(shares[None]),
+                jnp.asarray(free),
+                jnp.asarray(start[None]),
+                data,
+                jnp.zeros((1, Layout.of(m.structure).size, C)),
+                None,
+            )
+            y, J = jax.device_get((y, J))
+        return y[0], J[0]
+
+    def scaled(self) -> Float[np.ndarray, "N C K"]:
+        """Slopes by shares of the parameters, each channel by the size of its own signal."""
+        y, J = self.slopes()
+        size = np.maximum(np.std(y, axis=0), 1e-12)
+        return J[..., : len(self.model.mechanism.free_names)] / size[:, None]
+
+
+def _information(
+    J: Float[np.ndarray, "N C D"], noise: Float[np.ndarray, " C"], K: int
+) -> Float[np.ndarray, "K K"]:
+    """Information about shares of the parameters, with first states unknown."""
+    flat = (J / noise[:, None]).reshape(-1, J.shape[-1])
+    H = flat.T @ flat
+    if J.shape[-1] == K:
+        return H
+    return H[:K, :K] - H[:K, K:] @ np.linalg.pinv(H[K:, K:], hermitian=True) @ H[K:, :K]
+
+
+def _directions(H: Float[np.ndarray, "K K"]) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations, the largest first, and their directions as rows."""
+    eigenvalues, vectors = np.linalg.eigh((H + H.T) / 2)
+    return 1 / np.sqrt(np.maximum(eigenvalues, 1e-300)), vectors.T
+
+
+def _with_recording(
+    found: Identifiability, model: Model, sensors: Sensors, recording: Recording, fitted: Fit | None
+) -> Identifiability:
+    m, free = model.mechanism, found.free
+    K, C = len(free), len(sensors.here)
+    start = model.states_at(recording, np.array([0]))[0][: 2 * len(m.coordinates)]
+    u, Ts = recording.u.astype(float), float(recording.Ts)
+    y, J = Runs(model, sensors, m.values, u, Ts, start).slopes()
+    if not np.isfinite(J).all():
+        raise InputError(
+            "The model diverges over this recording, so that nothing can be said of it; fit it first."
+        )
+    prepared = prepare(model, [recording])
+    noise = prepared.noise
+    if fitted is not None:
+        noise = np.maximum(noise, [fitted.noise[c] for c in m.channels])
+    # A further sensor is as good, relative to its signal, as the best of those that are there.
+    spread = np.maximum(np.std(y, axis=0), 1e-12)
+    relative = float(np.min(noise / spread[:C]))
+    every = np.concatenate([noise, relative * spread[C:]])
+    H = _information(J[:, :C], noise, K)
+    if fitted is not None and np.isfinite(fitted.covariance).all() and fitted.free_names == free:
+        # The same directions with the errors' correlation in time: nats count for less.
+        typical = np.array([s.typical for s in m.parameter_specifications])
+        shares = np.maximum(np.abs(m.values), SHARE_OF_TYPICAL * typical)
+        shares = shares[[m.parameter_names.index(n) for n in free]]
+        H = np.linalg.pinv(fitted.covariance / np.outer(shares, shares), rcond=1e-14, hermitian=True)
+    std, vectors = _directions(H)
+    bad = [
+        direction(free, v, "mixed", min(s, 1e9)) for s, v in zip(std, vectors, strict=True) if s > BADLY_KNOWN
+    ]
+    worst = float(std[0])
+    each = np.sqrt(np.maximum(np.diag(np.linalg.pinv(H, rcond=1e-14, hermitian=True)), 0.0))
+    trust, further, inputs = {}, {}, {}
+    if bad and found.structural:
+        base = _information(J[:, :C], noise, K)
+        counts = worst / _directions(base)[0][0]  # what correlated errors make of the same information
+        for k, name in enumerate(free):
+            rest = np.delete(np.arange(K), k)
+            if len(rest):
+                trust[name] = float(_directions(H[np.ix_(rest, rest)])[0][0])
+        for k, name in enumerate(sensors.further):
+            rows = [*range(C), C + k]
+            further[name] = float(counts * _directions(_information(J[:, rows], every[rows], K))[0][0])
+        for name, other in _other_inputs(u, Ts).items():
+            J_other = Runs(model, sensors, m.values, other, Ts, start).slopes()[1]
+            if np.isfinite(J_other).all():
+                inputs[name] = float(counts * _directions(_information(J_other[:, :C], noise, K))[0][0])
+    helpful = lambda options: {  # noqa: E731
+        n: s for n, s in sorted(options.items(), key=lambda pair: pair[1]) if s < worst / HELPS
+    }
+    return dataclasses.replace(
+        found,
+        badly_known=tuple(bad),
+        trust_here=helpful(trust),
+        sensors_here=helpful(further),
+        inputs_here=helpful(inputs),
+        std=dict(zip(free, each.tolist(), strict=True)),
+    )
+
+
+def _other_inputs(u: Float[np.ndarray, " N"], Ts: float) -> dict[str, Float[np.ndarray, " N"]]:
+    """Inputs of the same length that may show more, by what one would say of them."""
+    N, most = len(u), max(float(np.abs(u).max()), 1e-12)
+    rms = max(float(np.sqrt(np.mean(u**2))), 1e-12)
+    noise = excitation.noise(N, Ts, seed=0)
+    t = np.arange(N) * Ts
+    slow = np.sin(2 * np.pi * 3 * t / max(t[-1], Ts)) * most
+    return {
+        "an input three times as large": 3 * u,
+        "noise of the same rms": noise * rms / max(float(np.sqrt(np.mean(noise**2))), 1e-12),
+        "three slow swings of the same peak": slow,
+    }

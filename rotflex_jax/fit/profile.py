@@ -1,0 +1,407 @@
+"""Profile likelihood: the cost of a fit along one quantity, with everything else fitted anew at each value.
+
+    cost(c) = min of the fit's own cost over all parameters and first states with g(parameters) = c
+
+The quantity is held by a row of its own in the least-squares problem, `(g - c) / w` with a width far below
+its standard deviation. What the minimum of that sum has as its `g` is where the profile is known exactly,
+whatever the width: given its own `g`, nothing lowers the cost. Every point goes through the compiled program
+of the fit, with the numbers of its neighbour as a start.
+"""
+
+import dataclasses
+import itertools
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from rotflex_jax import checks
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit.greybox import FitAttempt, FitPoint, FitStage, GreyBoxProblem, problem_of, report
+from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE
+from rotflex_jax.fit.problem import LikelihoodEquations
+from rotflex_jax.fit.profile_result import Profile, Quantity
+from rotflex_jax.fit.result import Fit
+from rotflex_jax.fit.windows import Windows
+from rotflex_jax.parameters import Transform
+from rotflex_jax.recording import Recording
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.runtime.xla import double_precision, one_thread
+
+# Width of the row that holds the quantity, as a share of its standard deviation.
+WIDTH = 0.02
+# Points that lie between the least cost and the level, to each side, and the most that are tried there.
+POINTS_TO_LEVEL, MOST_POINTS = 4, 16
+# Where the curvature gives no step, the first one; the largest one; and how far a profile goes from the least
+# cost, all as changes of the logarithm of a quantity that is positive.
+FIRST_STEP, LARGEST, FARTHEST = 0.1, 1.5, 6.0
+# A level is passed where the root is this share beyond it.
+BEYOND_LEVEL = 1.05
+# The level lies between two points whose roots differ by this share of it at most, or so many are added.
+NEAR_LEVEL, MOST_BETWEEN = 0.6, 8
+# A value that moves by less than this share of what was asked is at the end of what it may be.
+STUCK = 0.5
+# A parameter is as good as at its lower bound where it is nearer than this share of its typical size.
+NEAR = 1e-3
+# So many of the last equations are kept: those of two sides and a step that was refused.
+REMEMBERED = 6
+# Step of a difference quotient in the coordinates of a fit.
+STEP = 1e-5
+
+
+@dataclasses.dataclass(frozen=True)
+class Along:
+    """A quantity of a fit, and the coordinate along which a profile walks: its logarithm if it is positive.
+
+    Attributes:
+        name: For people.
+        unit: Empty for a function.
+        function: From the values of the parameters by full name.
+        limits: Least and largest value that it may have.
+        positive: Whether it walks in logarithms, of the distance to its lower limit.
+        least: Distance below which it walks in equal steps again, so that the limit itself is not far away.
+    """
+
+    name: str
+    unit: str
+    function: Callable[[Mapping[str, float]], float]
+    limits: tuple[float, float]
+    positive: bool
+    least: float = 0.0
+
+    @classmethod
+    def of(cls, of: Quantity, fitted: Fit) -> "Along":
+        """A parameter by its name, or a function.
+
+        Raises:
+            InputError: A name that is no free parameter, or a function that gives no finite number.
+        """
+        m = fitted.model.mechanism
+        if isinstance(of, str):
+            if of not in fitted.free_names:
+                raise InputError(
+                    f"Parameter {of!r} was to be profiled, but the free parameters of the fit are "
+                    f"{', '.join(fitted.free_names)}; name one of these."
+                )
+            spec = m.parameter_specifications[m.parameter_names.index(of)]
+            # Where both ends are finite, a walk in logarithms would slow down at one of them only.
+            positive = np.isfinite(spec.lower) and not np.isfinite(spec.upper)
+            return cls(
+                of,
+                spec.unit,
+                lambda values: values[of],
+                (spec.lower, spec.upper),
+                positive,
+                NEAR * spec.typical,
+            )
+        if not callable(of):
+            raise InputError(
+                f"Argument `of` must be the full name of a parameter or a function of the values by name, "
+                f"but is {checks.shown(of)}; give for instance {fitted.free_names[0]!r}."
+            )
+        values = dict(zip(m.parameter_names, m.values.tolist(), strict=True))
+        try:
+            value = checks.real(of(values))
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+            raise InputError(
+                f"The function of the parameters failed with {type(error).__name__}: {error}; it receives "
+                "the values by full name and must give a number."
+            ) from error
+        if not np.isfinite(value):
+            raise InputError(
+                f"The function of the parameters gives {value} at the fit, but must give a finite number; "
+                "correct it."
+            )
+        name = getattr(of, "__name__", "quantity")
+        name = "quantity" if name == "<lambda>" else name
+        positive = value > 0
+        return cls(name, "", of, (0.0 if positive else -np.inf, np.inf), positive)
+
+    def walked(self, value: float) -> float:
+        """The coordinate of a value."""
+        if not self.positive:
+            return value
+        return float(np.log(max(value - self.limits[0] + self.least, 1e-300)))
+
+    def slope(self, value: float) -> float:
+        """Derivative of the value by the coordinate."""
+        return value - self.limits[0] + self.least if self.positive else 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldProblem(GreyBoxProblem):
+    """A fit in which a quantity is held near a number by a row of its own.
+
+    Attributes:
+        along: The quantity, in the coordinate of its walk.
+        target: Where it is held.
+        width: Standard deviation of the row.
+        made: Points with their gains and equations without the row, the last ones: where one point of a
+            profile ends, the next one begins.
+    """
+
+    along: Along
+    target: float
+    width: float
+    made: "deque[tuple[FitPoint, np.ndarray, LikelihoodEquations]]"
+
+    def at(self, point: FitPoint) -> tuple[float, Float[np.ndarray, " P"]]:
+        """Value of the quantity, and the values of all parameters, means over recordings."""
+        m = self.model.mechanism
+        each = self.physical(point)[0]
+        free = np.array([name not in m.trusted for name in m.parameter_names])
+        common = np.where(free, each.mean(axis=0), m.values)
+        return float(self.along.function(dict(zip(m.parameter_names, common.tolist(), strict=True)))), common
+
+    def slopes(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
+        """Derivative of the walked coordinate of the quantity by the coordinates of the fit."""
+        coordinates = self.coordinates(point, windows)
+        move = np.zeros(coordinates.size)
+        found = np.zeros(coordinates.size)
+        own = [coordinates.local_columns(r) for r in range(len(point.local_z))]
+        for column in np.concatenate([np.arange(coordinates.shared), *own]).astype(int):
+            ends = []
+            for sign in (1, -1):
+                move[column] = sign * STEP
+                ends.append(self.along.walked(self.at(coordinates.moved(point, move))[0]))
+            move[column] = 0.0
+            found[column] = (ends[0] - ends[1]) / (2 * STEP)
+        return found
+
+    def penalty(self, point: FitPoint) -> float:
+        """What the row adds to the cost."""
+        return ((self.along.walked(self.at(point)[0]) - self.target) / self.width) ** 2 / 2
+
+    def equations(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> LikelihoodEquations:
+        """Those of the fit with the row of the quantity."""
+        found = next((e for at, gain, e in self.made if at is point and np.array_equal(gain, K)), None)
+        if found is None:
+            found = super().equations(point, stage, K)
+            self.made.append((point, K, found))
+        miss = (self.along.walked(self.at(point)[0]) - self.target) / self.width
+        row = self.slopes(point, stage.windows) / self.width
+        return dataclasses.replace(
+            found,
+            cost=found.cost + miss**2 / 2,
+            gradient=found.gradient + miss * row,
+            H=found.H + np.outer(row, row),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class PointOfProfile:
+    """One point: the value, its cost without the row that holds it, where the fit is, all parameters."""
+
+    value: float
+    cost: float
+    point: FitPoint
+    values: Float[np.ndarray, " P"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """What a profile needs at the least cost.
+
+    Attributes:
+        problem: Of the fit.
+        along: The quantity.
+        end: The least cost.
+        middle: The same as a point.
+        std: Wald's standard deviation of the walked coordinate; nan where there is none.
+        factor: Nats that say as much as one.
+        made: As a `HeldProblem` has them.
+    """
+
+    problem: GreyBoxProblem
+    along: Along
+    end: FitAttempt
+    middle: PointOfProfile
+    std: float
+    factor: float
+    made: "deque[tuple[FitPoint, np.ndarray, LikelihoodEquations]]"
+
+    def root(self, point: PointOfProfile) -> float:
+        """Root of the likelihood ratio, of either side."""
+        return float(np.sqrt(max(2 * (point.cost - self.middle.cost) / self.factor, 0.0)))
+
+    def held(self, target: float, start: FitPoint) -> PointOfProfile:
+        """The least cost with the quantity near a target."""
+        width = WIDTH * (self.std if np.isfinite(self.std) else FIRST_STEP)
+        given = {f.name: getattr(self.problem, f.name) for f in dataclasses.fields(GreyBoxProblem)}
+        problem = HeldProblem(**given, along=self.along, target=target, width=width, made=self.made)
+        found = problem.attempt(start, [self.end.stage])
+        value, values = problem.at(found.point)
+        return PointOfProfile(value, found.cost - problem.penalty(found.point), found.point, values)
+
+    def side(self, way: int, goal: float) -> list[PointOfProfile]:
+        """Points to one side, outwards until the root is beyond the goal or nothing is left to find."""
+        begin = self.along.walked(self.middle.value)
+        step = goal / POINTS_TO_LEVEL * self.std if np.isfinite(self.std) else FIRST_STEP
+        most = LARGEST if self.along.positive else np.inf
+        step, found, here = min(step, most), [], self.middle
+        low, high = (self.along.walked(v) if np.isfinite(v) else v for v in self.along.limits)
+        while len(found) < MOST_POINTS:
+            at, root = self.along.walked(here.value), self.root(here)
+            target = at + way * step
+            if not self.along.positive:
+                # The last point before a limit that is never reached itself.
+                target = float(np.clip(target, (at + 3 * low) / 4, (at + 3 * high) / 4))
+            further = self.held(target, here.point)
+            moved = way * (self.along.walked(further.value) - at)
+            if not np.isfinite(further.cost) or moved < STUCK * abs(target - at):
+                break
+            found.append(further)
+            if self.root(further) > BEYOND_LEVEL * goal:
+                return self.nearer(found, here, goal)
+            here, gained = further, self.root(further) - root
+            if self.along.positive and abs(self.along.walked(here.value) - begin) > FARTHEST:
+                break
+            wanted = moved * goal / POINTS_TO_LEVEL / gained if gained > 0 else np.inf
+            step = float(min(np.clip(wanted, moved / 3, 2.5 * moved), most))
+        return found
+
+    def nearer(
+        self, found: list[PointOfProfile], inside: PointOfProfile, goal: float
+    ) -> list[PointOfProfile]:
+        """Points between the last two of a side, until the level lies between two that are near each other.
+
+        Args:
+            found: Points of the side; the last is beyond the level.
+            inside: The one before, or the middle.
+            goal: Root at the level.
+        """
+        outside, added = found[-1], list[PointOfProfile]()
+        for _ in range(MOST_BETWEEN):
+            a, b = self.root(inside), self.root(outside)
+            if b - a <= NEAR_LEVEL * goal:
+                break
+            share = float(np.clip((goal - a) / (b - a), 0.1, 0.9))
+            low, high = (self.along.walked(p.value) for p in (inside, outside))
+            between = self.held(low + share * (high - low), inside.point)
+            if not min(low, high) < self.along.walked(between.value) < max(low, high):
+                break
+            added.append(between)
+            inside, outside = (between, outside) if self.root(between) < goal else (inside, between)
+        return [*found[:-1], *added, found[-1]]
+
+
+@one_thread
+def profile(
+    fitted: Fit, recordings: Recording | Sequence[Recording], of: Quantity, level: float = 0.95
+) -> Profile:
+    """Profile likelihood of a parameter, or of any function of the parameters.
+
+        2 (cost(c) - least cost) / factor <= quantile of chi2 with 1 degree of freedom at `level`
+
+    `cost(c)` is the cost of the fit with the quantity held at `c` and everything else fitted anew: the other
+    parameters, those of each recording, and first states. The interval of all `c` that pass need not be
+    symmetric, may be open where the recordings set no end, and may have a gap. `factor` is the ratio of the
+    variance that allows for errors correlated in time to the one by curvature alone, so that the interval is
+    Wald's where the cost is a parabola. Points are placed outwards from the least cost, each as far from the
+    last as the profile is steep, in the fit's own compiled program. First states that the fit has taken as
+    measured follow the parameters, which Wald's interval leaves out: the two then differ.
+
+    Args:
+        fitted: A fit by `rotflex_jax.fit`; its options are used again.
+        recordings: Those that were fitted.
+        of: Full name of a free parameter, or a function that receives the values of all parameters by full
+            name and gives a number: `lambda p: p["hub.coulomb.level"] / p["joint.spring.stiffness"]`.
+        level: Up to which confidence level the profile reaches.
+
+    Returns:
+        Profile with `interval(level)`, `shape`, `wald` and a figure.
+
+    Raises:
+        InputError: No such parameter, a function that gives no number, or other recordings than were fitted.
+
+    Source: S. A. Murphy and A. W. van der Vaart, J. Am. Stat. Assoc. 95, 2000; A. Raue et al., Bioinformatics
+    25, 2009; the factor: R. E. Chandler and S. Bate, Biometrika 94, 2007.
+    """
+    if not isinstance(fitted, Fit):
+        raise InputError(
+            f"A fit is needed, but {checks.shown(fitted)} was given; give what rotflex_jax.fit gives."
+        )
+    level = checks.number(level, "level", above=0, below=1, example="0.95")
+    given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
+    along = Along.of(of, fitted)
+    with double_precision():
+        walk = _at_least(fitted, given, along)
+        goal = float(np.sqrt(scipy.stats.chi2.ppf(level, 1)))
+        below, above = walk.side(-1, goal), walk.side(1, goal)
+    points = sorted([*below, walk.middle, *above], key=lambda p: p.value)
+    least = min(points, key=lambda p: p.cost)
+    spread = _distinct([p.value for p in points])
+    points = [p for p, keep in zip(points, spread, strict=True) if keep or p is least]
+    return Profile(
+        name=along.name,
+        unit=along.unit,
+        value=least.value,
+        values=np.array([p.value for p in points]),
+        drop=np.array([2 * (p.cost - least.cost) / walk.factor for p in points]),
+        factor=walk.factor,
+        std=walk.std * along.slope(walk.middle.value),
+        limits=along.limits,
+        nuisances=np.array([p.values for p in points]),
+        parameter_names=fitted.model.mechanism.parameter_names,
+        gained=walk.middle.cost - least.cost,
+    )
+
+
+def _distinct(values: list[float]) -> list[bool]:
+    """Which of ascending values differ from the one before."""
+    size = max(abs(values[0]), abs(values[-1]))
+    return [True, *(b - a > 1e-12 * size for a, b in itertools.pairwise(values))]
+
+
+def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Walk:
+    """The least cost next to a fit, and what its curvature says of the quantity."""
+    problem, point, stage = problem_of(fitted, recordings)
+    end = problem.attempt(point, [stage])
+    here = problem.equations(end.point, stage, end.K)
+    given = {f.name: getattr(problem, f.name) for f in dataclasses.fields(GreyBoxProblem)}
+    made = deque([(end.point, end.K, here)], REMEMBERED)
+    held = HeldProblem(**given, along=along, target=0.0, width=1.0, made=made)
+    value, values = held.at(end.point)
+    row = held.slopes(end.point, stage.windows)
+    again = report(problem, end, *problem.errors(end.point, stage, end.K))
+    # The variance of the walked coordinate by the curvature alone, of what no end of a range holds.
+    moves = ~problem.held_by_ends(end.point, stage.windows)
+    plain = _variance(here.H[np.ix_(moves, moves)], row[moves])
+    # By the names of the parameters, as their covariance has them.
+    m = again.model.mechanism
+    base = dict(zip(m.parameter_names, m.values.tolist(), strict=True))
+    transform = Transform.of(m.parameter_specifications)
+    z = transform.unconstrain(m.values)
+    gradient = np.zeros(len(again.free_names))
+    for k, name in enumerate(again.free_names):
+        i, ends = m.parameter_names.index(name), []
+        for sign in (1, -1):
+            moved = z.copy()
+            moved[i] += sign * STEP
+            ends.append(base | {name: float(transform.physical(moved)[0][i])})
+        high, low = (along.walked(along.function(values)) for values in ends)
+        gap = ends[0][name] - ends[1][name]
+        gradient[k] = (high - low) / gap if gap else 0.0
+    used = gradient != 0
+    variance = float(gradient[used] @ again.covariance[np.ix_(used, used)] @ gradient[used])
+    factor = here.nats_that_count
+    if np.isfinite(variance) and variance > 0 and plain > 0:
+        factor = max(variance / plain, 1.0)
+    std = float(np.sqrt(plain * factor)) if plain > 0 else np.nan
+    middle = PointOfProfile(value, end.cost, end.point, values)
+    return Walk(problem, along, end, middle, std, factor, made)
+
+
+def _variance(H: Float[np.ndarray, "M M"], row: Float[np.ndarray, " M"]) -> float:
+    """`row' H^-1 row`; nan where the quantity moves along what the curvature does not determine."""
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(H / np.outer(size, size))
+    along = vectors.T @ (row / size)
+    known = eigenvalues > UNDETERMINED_CURVATURE
+    if not row.any() or np.abs(along[~known]).max(initial=0.0) > 1e-3 * np.linalg.norm(along):
+        return np.nan
+    return float(np.sum(np.square(along[known]) / eigenvalues[known]))

@@ -1,0 +1,164 @@
+"""Bands of a free run: closed forms of each part, coverage on machines that nobody fitted, mixtures."""
+
+import dataclasses
+import functools
+import json
+
+import numpy as np
+import pytest
+import scipy
+
+import rotflex_jax as rf
+from arena.records import make_record
+from rotflex_jax.effects import Inertia, Motor
+from rotflex_jax.fit import Fit
+from rotflex_jax.fit.result import FitOptions
+
+N, TS, NOISE = 300, 0.01, 0.02
+CONSTANT = "hub.motor.torque_constant"
+
+
+def axis() -> rf.Mechanism:
+    """A double integrator, whose angle is linear in its torque constant."""
+    motor = Motor("hub", torque_constant=0.01, back_emf=0.0, resistance=2.0, gear_ratio=10.0)
+    m = rf.Mechanism(("theta",), {"hub": (1.0,)}, (Inertia("hub", inertia=0.01), motor), {"theta": "hub"})
+    return m.trust(*(name for name in m.parameter_names if name != CONSTANT))
+
+
+@functools.cache
+def recording(seed: int = 1, noise: float = NOISE) -> rf.Recording:
+    u = rf.data.excitation.multisine(N, TS, seed=seed)
+    y = rf.simulate(axis(), u, TS) + noise * np.random.default_rng(seed).normal(size=(N, 1))
+    return rf.Recording(u=u, y=y, Ts=TS, channels=("theta",))
+
+
+@functools.cache
+def fitted() -> Fit:
+    return rf.fit(axis(), recording())
+
+
+def with_std(fit: Fit, share: float) -> Fit:
+    """The fit with another standard deviation of its parameter, as a share of the value."""
+    variance = (share * fit[CONSTANT].value) ** 2
+    return dataclasses.replace(fit, covariance=np.array([[variance]]))
+
+
+def test_parts_are_those_of_a_linear_regression():
+    """theta_k = c g_k + position + speed t_k, position and speed by least squares from the first samples."""
+    rec = recording(2)
+    bands = rf.prediction_bands(with_std(fitted(), 0.1), rec, 0.9)
+    head, t = slice(0, rec.n_init), TS * np.arange(N)
+    g = rf.simulate(axis().with_values({CONSTANT: 1.0}), rec.u, TS)[:, 0]
+    X = np.column_stack([np.ones(N), t])
+    fit = np.linalg.pinv(X[head])
+    sensor = bands.parts["sensor"][0, 0]
+    assert sensor == pytest.approx(NOISE, rel=0.15)
+    covariance = fit @ fit.T * sensor**2
+    first = np.sqrt(np.einsum("ns,st,nt->n", X, covariance, X))
+    np.testing.assert_allclose(bands.parts["first state"][:, 0], first, rtol=1e-6)
+    # What the torque constant adds, the first state takes away again where it is fitted to the same samples.
+    whole = g - X @ (fit @ g[head])
+    std = 0.1 * fitted()[CONSTANT].value
+    np.testing.assert_allclose(bands.parts["parameters"][:, 0], std * np.abs(whole), rtol=1e-6, atol=1e-12)
+    half = (bands.upper - bands.lower)[:, 0] / 2
+    total = np.sqrt(sum(part[:, 0] ** 2 for part in bands.parts.values()))
+    np.testing.assert_allclose(half, scipy.stats.norm.ppf(0.95) * total, rtol=1e-9)
+
+
+def test_a_speed_that_is_hardly_known_widens_the_band_with_time():
+    bands = rf.prediction_bands(fitted(), recording(3))
+    half = (bands.upper - bands.lower)[:, 0]
+    assert half[-1] > 5 * half[10]
+    assert max(bands.shares["theta"], key=bands.shares["theta"].__getitem__) == "first state"
+
+
+def test_what_each_recording_has_for_itself_widens_the_band():
+    """Runs of the same machine with torque constants that scatter by a tenth."""
+    runs = []
+    for k, factor in enumerate((0.9, 1.0, 1.1)):
+        m = axis().with_values({CONSTANT: 0.01 * factor})
+        u = rf.data.excitation.multisine(N, TS, seed=k)
+        y = rf.simulate(m, u, TS) + 1e-3 * np.random.default_rng(k).normal(size=(N, 1))
+        runs.append(rf.Recording(u=u, y=y, Ts=TS, channels=("theta",)))
+    fit = rf.fit(axis(), runs, local=[CONSTANT])
+    bands = rf.prediction_bands(fit, recording(4, 1e-3))
+    spread = np.std([e.value for e in fit.local[CONSTANT]], ddof=1)
+    own = bands.parts["own of each recording"][:, 0]
+    same = rf.prediction_bands(with_std(fit, 1.0), recording(4, 1e-3)).parts["parameters"][:, 0]
+    np.testing.assert_allclose(own, same * spread / fit[CONSTANT].value, rtol=1e-6)
+
+
+def test_process_torques_integrate_twice():
+    """White torque of intensity q on an inertia J: the angle has the variance q t^3 / (3 J^2)."""
+    q, rec = 1e-6, recording(5)
+    noisy = dataclasses.replace(fitted(), options=FitOptions(process_noise={"hub": q}))
+    part = rf.prediction_bands(noisy, rec).parts["process torque"][:, 0]
+    t = TS * (np.arange(N) - rec.n_init + 1)[rec.n_init :]
+    np.testing.assert_allclose(part[rec.n_init :], np.sqrt(q * t**3 / 3) / 0.01, rtol=1e-6)
+    assert not part[: rec.n_init].any()
+
+
+def test_known_recordings_say_what_the_model_lacks():
+    """A band that is so wide that known runs lie in it as often as they should."""
+    wrong = dataclasses.replace(
+        fitted(), model=rf.Model(fitted().model.mechanism.with_values({CONSTANT: 0.05}))
+    )
+    rec = recording(6)
+    blind = rf.prediction_bands(wrong, rec).coverage()["theta"]
+    knowing = rf.prediction_bands(wrong, rec, known=rec)
+    assert knowing.coverage()["theta"] == pytest.approx(0.9, abs=0.02)
+    assert blind < 0.6 and knowing.shares["theta"]["what the model lacks"] > 0.3
+    half = rf.prediction_bands(wrong, rec, 0.5, known=[rec]).coverage()["theta"]
+    assert half == pytest.approx(0.5, abs=0.02)
+
+
+def test_bands_of_several_models_are_those_of_the_mixture():
+    """Between the models lies the weighted mean; each end cuts off half of what is outside."""
+    rec, one = recording(7), with_std(fitted(), 1e-6)
+    other = dataclasses.replace(one, model=rf.Model(one.model.mechanism.with_values({CONSTANT: 0.02})))
+    alone = [rf.prediction_bands(f, rec) for f in (one, other)]
+    bands = rf.prediction_bands([(one, 3.0), (other, 1.0)], rec)
+    np.testing.assert_allclose(bands.middle, 0.75 * alone[0].middle + 0.25 * alone[1].middle, rtol=1e-12)
+    quantile = scipy.stats.norm.ppf(0.95)
+    std = [(b.upper - b.lower) / 2 / quantile for b in alone]
+    for end, probability in ((bands.lower, 0.05), (bands.upper, 0.95)):
+        inside = sum(
+            w * scipy.stats.norm.cdf((end - b.middle) / s)
+            for w, b, s in zip((0.75, 0.25), alone, std, strict=True)
+        )
+        np.testing.assert_allclose(inside, probability, atol=1e-6)
+    same = rf.prediction_bands([(one, 1.0), (one, 5.0)], rec)
+    np.testing.assert_allclose(same.upper, alone[0].upper, rtol=1e-9)
+
+
+def test_bands_hold_what_another_run_of_the_arena_measures():
+    """Friction as it is, fitted to the first half; nine of ten samples of the other half lie in the bands."""
+    inside = {"theta": [], "alpha": []}
+    for seed in (100, 101):
+        made = make_record([("coulomb", "hub")], seed=seed, seconds=6.0, fs=400.0, rms=1.5)
+        train, test = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"]).split(0.5)
+        model = rf.Model(rf.joints.paper() + rf.effects.Coulomb("hub"), rf.Exponential(substeps=3))
+        bands = rf.prediction_bands(rf.fit(model, train), test)
+        for channel, share in bands.coverage().items():
+            inside[channel].append(share)
+    for shares in inside.values():
+        assert 0.85 < np.mean(shares) < 0.95
+
+
+def test_bands_are_shown_and_written():
+    bands = rf.prediction_bands(fitted(), recording(8))
+    assert json.loads(json.dumps(bands.to_dict()))["level"] == 0.9
+    assert "first state" in bands._repr_html_() and "theta" in str(bands)
+    labels = [ax.get_ylabel() for ax in bands.plot().axes]
+    assert labels == ["theta [deg]", "standard deviation [deg]"]
+    assert bands.coverage(recording(8)) == bands.coverage()
+
+
+def test_what_makes_no_sense_is_refused():
+    bands = rf.prediction_bands(fitted(), recording(8))
+    with pytest.raises(rf.InputError, match="has 100 samples; give a measurement under the same input"):
+        bands.coverage(recording(8).slice(0, 100))
+    with pytest.raises(rf.InputError, match="A fit, or pairs of a fit and its weight, is needed"):
+        rf.prediction_bands([fitted()], recording(8))
+    with pytest.raises(rf.InputError, match="`weight` must be a finite number above 0"):
+        rf.prediction_bands([(fitted(), -1.0)], recording(8))
