@@ -1,11 +1,11 @@
 """From a recording to a controller, on the independent simulator: with and without what was found.
 
-    python benchmarks/B11_control.py            # every machine
-    python benchmarks/B11_control.py coulomb    # some
+    python benchmarks/B12_control.py            # every machine
+    python benchmarks/B12_control.py coulomb    # some
 
 A recording of ten seconds is fitted by the joint with the effect in it; the controller is designed on the fit
 alone. It then drives the simulator along a reference, once with the found torque along the planned motion
-and once without, and every model that the fit leaves possible. Writes results/B11.json, and for the first
+and once without, and every model that the fit leaves possible. Writes results/B12.json, and for the first
 machine docs/figures/control.png.
 """
 
@@ -29,7 +29,7 @@ from rotflex_jax import effects as fx
 from rotflex_jax.control import close_loop
 from rotflex_jax.text.files import write_file
 
-RESULT = Path(__file__).resolve().parent / "results" / "B11.json"
+RESULT = Path(__file__).resolve().parent / "results" / "B12.json"
 FIGURE = Path(__file__).resolve().parents[1] / "docs" / "figures" / "control.png"
 DRAWS = 20
 
