@@ -141,3 +141,10 @@ def test_the_richer_effect_runs_as_well_within_a_hundredth(side: float) -> None:
 def test_runs_are_clearly_better_by_a_hundredth(side: float) -> None:
     a, b = 5.0 * np.exp(-0.01 * side) * NOISE, 5.0 * NOISE
     assert runs_clearly_better(a, b) is (side > 1)
+
+
+@SIDES
+def test_uncertain_free_runs_are_enough_where_predictions_run_a_tenth_better(side: float) -> None:
+    sure_predictions = PLENTY | {"windows": 10.0 * np.exp(-0.1 * side)}
+    found = at_both(sure_predictions, {"windows": 10.0}, COULOMB)
+    assert admissible(found, FAR, DATA, NOISE) is (side > 1)

@@ -113,11 +113,18 @@ def test_files_that_hold_no_search(kind: str, tmp_path: Path) -> None:
         rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, resume=path)
 
 
-@pytest.mark.parametrize("where", ["z", "x0", "K", "locations", "free", "process_noise", "order"])
+@pytest.mark.parametrize("where", ["z", "local_z", "x0", "K", "locations", "free", "process_noise", "order"])
 def test_changed_numbers_are_refused(searched: tuple[rf.Discovery, Path], where: str, tmp_path: Path) -> None:
     written = json.loads(searched[1].read_text())
     stages = [copy.deepcopy(entry["search"]) for entry in written["stages"]]
-    bad = {"z": [1.0], "x0": [[["nan"]]], "K": None, "locations": [["unknown", "shaft"]], "free": [10**6]}
+    bad = {
+        "z": [1.0],
+        "local_z": [[10**400]],
+        "x0": [[["nan"]]],
+        "K": None,
+        "locations": [["unknown", "shaft"]],
+        "free": [10**6],
+    }
     if where == "order":
         stages.reverse()
     else:

@@ -172,7 +172,7 @@ def read_stages(path: str | Path, digest: str) -> Sequence[KeptStage]:
             f"{path} cannot be read ({error.strerror or error}); give the file NAME.stopped.json that a "
             "stopped search has left."
         ) from None
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError, RecursionError):
         raise not_kept(path) from None
     if not same:
         raise InputError(

@@ -365,7 +365,7 @@ def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, pat
         try:
             h = restored(horizons.prediction.problem, stage.prediction)
             runs = restored(horizons.free_run.problem, stage.free_run)
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError):
             raise not_kept(path) from None
         before = state.current if state else None
         found = horizons.validated(h, runs, before)

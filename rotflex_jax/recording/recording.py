@@ -30,7 +30,9 @@ from rotflex_jax.text.svg import Panel, signals
 
 def _known_remarks(given: Any) -> tuple[Finding, ...]:
     """Findings of whoever made the recording."""
-    listed = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    listed: tuple[Any, ...] = (given,)
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        listed = tuple(given)
     for entry in listed:
         if not isinstance(entry, Finding):
             raise InputError(

@@ -1,6 +1,7 @@
 """Figures of tests against data: correlations of the residuals, and the frequency response."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,7 +11,7 @@ from rotflex_jax.discover.result import SearchResult
 from rotflex_jax.models.frequency_response import FrequencyResponse
 from rotflex_jax.models.residual_tests import ResidualTests
 from rotflex_jax.report.figures.registry import figure
-from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, MEASURED, MUTED
+from rotflex_jax.text.colours import BASELINE, BASELINE_LINE, FAINT, FINAL, MEASURED, MUTED
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks
 
 # Coherence below which an estimate of the response is drawn faint.
@@ -36,8 +37,11 @@ def residual_figure(tests: Mapping[str, ResidualTests]) -> Figure:
         own, cross = axes[c]
         own.axhspan(-first.white_band, first.white_band, color=FAINT, lw=0, label="99 % band")
         for name, t in tests.items():
-            own.plot(lag, t.autocorrelation[c], "o-", ms=3, lw=1.1, color=colours[name], label=name)
-            cross.plot(both, t.cross_correlation[c], lw=1.3, color=colours[name], label=name)
+            line = BASELINE_LINE if name == "baseline" else "-"
+            style: dict[str, Any] = {"color": colours[name], "ls": line, "label": name}
+            filled = "none" if name == "baseline" else "full"
+            own.plot(lag, t.autocorrelation[c], marker="o", ms=3, fillstyle=filled, lw=1.1, **style)
+            cross.plot(both, t.cross_correlation[c], lw=1.3, **style)
             band = t.input_band[c]
             for edge in (-band, band):
                 cross.axhline(edge, color=colours[name], lw=0.9, ls=(0, (3, 2)))
@@ -77,10 +81,11 @@ def response_figure(
         for name, r, colour, width in listed:
             # Within half a turn of what was measured.
             degrees = turned + (r.phase_deg[c] - turned + 180.0) % 360.0 - 180.0
-            magnitude.plot(f, r.magnitude_db[c], color=colour, lw=0.7, alpha=0.35)
-            magnitude.plot(f, np.where(clear, r.magnitude_db[c], np.nan), color=colour, lw=width, label=name)
-            phase.plot(f, np.where(clear, degrees, np.nan), color=colour, lw=width)
-            coherence.plot(f, r.coherence[c], color=colour, lw=width)
+            style: dict[str, Any] = {"color": colour, "ls": BASELINE_LINE if name == "baseline" else "-"}
+            magnitude.plot(f, r.magnitude_db[c], lw=0.7, alpha=0.35, **style)
+            magnitude.plot(f, np.where(clear, r.magnitude_db[c], np.nan), lw=width, label=name, **style)
+            phase.plot(f, np.where(clear, degrees, np.nan), lw=width, **style)
+            coherence.plot(f, r.coherence[c], lw=width, **style)
         magnitude.set_title(channel)
         magnitude.set_ylabel(f"magnitude [dB of {unit}/{input_unit}]")
         phase.set_ylabel("phase [deg]")

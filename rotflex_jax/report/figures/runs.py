@@ -1,6 +1,7 @@
 """Figures of held-out runs: measured against simulated, and the spectra of what is left."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,7 +14,7 @@ from rotflex_jax.discover.tables import channel_units
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.registry import figure
-from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, HIGHLIGHT, MEASURED, NOISE
+from rotflex_jax.text.colours import BASELINE, BASELINE_LINE, FAINT, FINAL, HIGHLIGHT, MEASURED, NOISE
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, thinned
 
@@ -132,8 +133,9 @@ def _lines(above: Axes, below: Axes, s: Shown, c: int, part: slice, scale: float
         runs.append((s.final, FINAL, "final model", 1.1))
     for values, colour, label, width in runs:
         run = scale * values[part, c]
-        above.plot(*thinned(t, run), color=colour, lw=width, label=label)
-        below.plot(*thinned(t, measured - run), color=colour, lw=0.9)
+        line: Any = BASELINE_LINE if label == "baseline" else "-"
+        above.plot(*thinned(t, run), color=colour, ls=line, lw=width, label=label)
+        below.plot(*thinned(t, measured - run), color=colour, ls=line, lw=0.9)
     above.margins(x=0)
 
 
@@ -161,7 +163,8 @@ def spectra(discovery: SearchResult) -> Figure:
             length = min(4096, max(16, N // 5))
             f, density = welch(error, 1 / Ts, nperseg=length, detrend="constant")
             size = np.sqrt(np.maximum(density, np.finfo(float).tiny))
-            ax.loglog(f[1:], size[1:], color=colour, lw=1.3, label=label)
+            line: Any = BASELINE_LINE if label == "baseline" else "-"
+            ax.loglog(f[1:], size[1:], color=colour, ls=line, lw=1.3, label=label)
         floor = discovery.noise_floor.get(channel, 0.0)
         if floor > 0:
             level = scale * floor * np.sqrt(2 * Ts)
