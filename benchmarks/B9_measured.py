@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -69,7 +70,7 @@ def side_by_side(
 ) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Directions as they are ready, each in a process on a core of its own; without times."""
     free = queue.SimpleQueue[int]()
-    for core in range(workers):
+    for core in sorted(os.sched_getaffinity(0))[:workers]:
         free.put(core)
 
     def one(machine: str, direction: str, cache: str) -> dict[str, Any]:
