@@ -362,7 +362,7 @@ def mutated(data: bytes, pick: random.Random, text: bool) -> bytes:
             other = pick.randrange(len(found) + 1)
             found[at : at + width] = found[other : other + width]
         else:
-            end = at = min(at, len(found))
+            end = at = max(0, min(at, len(found)))  # nothing may be left
             while at and found[at - 1] not in b",;:[{ \n":
                 at -= 1
             while end < len(found) and found[end] not in b",;:]} \n":
