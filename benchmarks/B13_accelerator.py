@@ -4,8 +4,8 @@
 
 One compiled program simulates K machines side by side (`jax.vmap` over the parameters), in double precision:
 the joint of the paper with dry friction at the hub, 2 s at 500 Hz. The time is that of one call, results left
-on the device, the least of several; on a processor one program uses one core. An accelerator that JAX does not
-have is left out. Writes `results/B13.json`.
+on the device, the least of several; on a processor one program uses one core. An accelerator that JAX lacks
+is left out. Writes `results/B13.json`.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def row(
         "sentence": told["sentence"],
         "notes": told["notes"],
         "estimates": estimates(result.final),
-        # What the search itself reports, all keys that it has, and the same anew by the public interface.
+        # What the search itself reports, all keys that it has, and the same again by the public interface.
         "reported": {
             "baseline": reported(told["baseline"]),
             "final": reported((told["rounds"] or [told["baseline"]])[-1]),

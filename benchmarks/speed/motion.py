@@ -133,7 +133,7 @@ def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any, Any]
 
 
 def solve_ivp_run(u: np.ndarray, p: np.ndarray, **options: Any) -> np.ndarray:
-    """Angles (N, 2) by scipy's solver, started anew at every step of the voltage."""
+    """Angles (N, 2) by scipy's solver, started again at every step of the voltage."""
 
     def flow(_: float, x: np.ndarray, v: float) -> list[float]:
         spring = p[2] * x[1] + p[7] * x[1] ** 3 + p[6] * x[3]

@@ -55,7 +55,7 @@ def to_bam(
         u: Input of the certificate: goals [rad]; None for three sines with rests.
 
     Returns:
-        The text of the JSON file with its certificate: the equations of BAM, written anew and stepped finely,
+        The text of the JSON file with its certificate: the equations of BAM, written again and stepped finely,
         against the toolkit. JSON has no comments, so the certificate is not in the file.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Profile likelihood: the cost of a fit along one quantity, with everything else fitted anew at each value.
+"""Profile likelihood: the cost of a fit along one quantity, with everything else fitted again at each value.
 
     cost(c) = min of the fit's own cost over all parameters and first states with g(parameters) = c
 
@@ -297,7 +297,7 @@ def profile(
 
         2 (cost(c) - least cost) / factor <= quantile of chi2 with 1 degree of freedom at `level`
 
-    `cost(c)` is the cost of the fit with the quantity held at `c` and everything else fitted anew: the other
+    `cost(c)` is the cost of the fit with the quantity held at `c` and everything else fitted again: the other
     parameters, those of each recording, and first states. The interval of all `c` that pass need not be
     symmetric, may be open where the recordings set no end, and may have a gap. `factor` is the ratio of the
     variance that allows for errors correlated in time to the one by curvature alone, so that the interval is

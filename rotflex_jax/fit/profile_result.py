@@ -26,7 +26,7 @@ POOR = 0.15
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Profile:
-    """The likelihood along one quantity, with all else fitted anew at each value.
+    """The likelihood along one quantity, with all else fitted again at each value.
 
         drop = 2 (cost(value) - least cost) / factor,   interval: drop <= quantile of chi2 with 1 degree
 
