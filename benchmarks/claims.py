@@ -29,6 +29,27 @@ def results(file: str) -> Any:
     return json.loads((RESULTS / file).read_text(encoding="utf-8"))
 
 
+# -- wrong worlds -------------------------------------------------------------------------------------------
+
+
+def _worlds(marked: str) -> tuple[int, int]:
+    """How many wrong worlds have a mark, and of how many; without a hidden effect some marks are None."""
+    rows = [r for r in results("B0_wrong_worlds.json")["records"].values() if r.get(marked) is not None]
+    return sum(bool(r[marked]) for r in rows), len(rows)
+
+
+@named
+def worlds_named() -> str:
+    """Worlds whose hidden effect was named."""
+    return "{} of {}".format(*_worlds("named"))
+
+
+@named
+def worlds_wrong() -> str:
+    """Worlds in which a wrong effect was called established."""
+    return "{} of {}".format(*_worlds("wrong_established"))
+
+
 # -- the measured joint -------------------------------------------------------------------------------------
 
 WAYS = {"ab": "A to B", "ba": "B to A", "mixed": "first 7 s of both to the last 3 s"}
