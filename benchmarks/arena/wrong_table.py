@@ -146,8 +146,9 @@ def written(records: list[Row]) -> str:
     lines = [
         "# B0: wrong worlds",
         "",
-        "Feedback, counted angles, wrong trusted constants, an offset of each run, and things besides: torques",
-        "that no candidate has, faults of sensors. Named: found, or listed as equivalent to what was found. Wrong: neither hidden",
+        "Feedback, counted angles, wrong trusted constants, an offset of each run, and things besides:",
+        "torques that no candidate has, faults of sensors. Named: found, or listed as equivalent to what",
+        "was found. Wrong: neither hidden",
         "nor a right name of something besides. Errors in degrees, theta / alpha, free runs of 2 s and",
         "whole runs, before -> after the search, with the voltage offset found on the first 2 s of the",
         "record that is run; the test record had no say.",

@@ -55,8 +55,8 @@ def to_bam(
         u: Input of the certificate: goals [rad]; None for three sines with rests.
 
     Returns:
-        The text of the JSON file with its certificate: the equations of BAM, written a second time and stepped
-        finely, against the toolkit. JSON has no comments, so the certificate is not in the file.
+        The text of the JSON file with its certificate: the equations of BAM, written a second time and
+        stepped finely, against the toolkit. JSON has no comments, so the certificate is not in the file.
 
     Raises:
         InputError: No servo, a pendulum that is heavier than the inertia; no sampling period, no signal.
