@@ -98,6 +98,7 @@ ACTUATORS = {
     "position": ('<position joint="shoulder" kp="8" kv="0.4"/>', 0.5),
     "position, filtered": ('<position joint="shoulder" kp="8" timeconst="0.02" gear="1.5"/>', 0.5),
     "position, limited": ('<position joint="shoulder" kp="30" forcerange="-3 3"/>', 0.5),
+    "motor in the parent": ('<motor jointinparent="shoulder" gear="3"/>', 1.0),
     "general": (
         '<general joint="shoulder" gainprm="2" biastype="affine" biasprm="0.3 0 -0.5" gear="1.2"'
         ' ctrlrange="-1 1"/>',
@@ -195,7 +196,7 @@ def test_a_child_that_turns_the_other_way(tmp_path):
         ({"a": 'springdamper="1 1"'}, "springdamper", None),
         (
             {"actuator": '<motor joint="a" ctrlrange="-1 2"/>'},
-            "ctrlrange of -1 to 2, not symmetric",
+            "an asymmetric ctrlrange of -1 to 2",
             "ctrlrange",
         ),
         (
@@ -209,6 +210,26 @@ def test_a_child_that_turns_the_other_way(tmp_path):
         ({"actuator": '<motor joint="b"/>'}, "behind the first", None),
         ({"actuator": ""}, "has 0 actuators", None),
         ({"actuator": '<motor joint="a" gear="-1"/>'}, "turns backwards", None),
+        ({"actuator": '<motor joint="a" gear="0"/>'}, "gives no force", None),
+        ({"actuator": '<position joint="a" kp="0"/>'}, "gives no force", None),
+        (
+            {"actuator": '<general joint="a" biastype="affine" biasprm="0.5 0 0" forcerange="-1 1"/>'},
+            "a filter or a constant of its own",
+            "forcerange",
+        ),
+        (
+            {"actuator": '<general joint="a" dyntype="filter" dynprm="0.1" forcerange="-1 1"/>'},
+            "a filter or a constant of its own",
+            "forcerange",
+        ),
+        (
+            {
+                "actuator": '<motor joint="a"/><position tendon="t"/>',
+                "more": '<tendon><fixed name="t"><joint joint="a" coef="1"/></fixed></tendon>',
+            },
+            "an actuator at the tendon 't'",
+            "actuator",
+        ),
         ({"more": '<equality><joint joint1="a" joint2="b"/></equality>'}, "an equality", "equality"),
         (
             {"more": '<tendon><fixed stiffness="1"><joint joint="a" coef="2"/></fixed></tendon>'},
@@ -237,6 +258,21 @@ def test_what_cannot_be_said_is_refused_by_name(tmp_path, change, words, ignore)
         loaded(tmp_path, text, "a", "b", ignore=[ignore])
 
 
+def test_actuators_share_one_set_of_defaults(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    text = TWO.format(**(PLAIN | {"actuator": '<general joint="a"/>'}))
+    text = text.replace("<worldbody>", '<default><motor gear="3" ctrlrange="-2 2"/></default><worldbody>', 1)
+    assert mujoco.MjModel.from_xml_string(text).actuator_gear[0, 0] == 3.0
+    machine = loaded(tmp_path, text, "a", "b")
+    assert machine.effect("current_drive", "hub").gain == 3.0
+    assert any(isinstance(e, Saturation) and e.limit == 2.0 for e in machine.effects)
+
+
+def test_a_name_that_no_file_can_have():
+    with pytest.raises(InputError, match="cannot be read"):
+        rf.load_mjcf("a\0b.xml")
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -245,6 +281,8 @@ def test_what_cannot_be_said_is_refused_by_name(tmp_path, change, words, ignore)
         ("<mujoco>" + "<body>" * 300, "more than 200 elements inside"),
         ("<robot/>", "begins with <robot>"),
         ("not xml", "is no XML"),
+        ('<?xml version="1.0" encoding="nobody"?><mujoco/>', "unknown encoding"),
+        ('<?xml version="1.0" encoding="shift_jis"?><mujoco/>', "multi-byte encodings"),
         ("", "is no XML"),
         ("<mujoco/>", "turn or slide: none; no joint was named"),
         ("<mujoco><worldbody><frame/></worldbody></mujoco>", "the element <frame>"),

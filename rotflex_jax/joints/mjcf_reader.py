@@ -234,10 +234,15 @@ class _Reader:
         """Adds what drives the joint; returns the damping that is left beside it."""
         mine: list[ET.Element] = []
         names = {j.name for j in (self.hub, self.arm) if j is not None}
+        fixed = self.file.root.findall("tendon/fixed")
+        tied = {t.get("name") for t in fixed if names & {j.get("joint") for j in t.findall("joint")}} - {None}
         for group in self.file.root.findall("actuator"):
             for element in group:
-                at = self.file.told(element, None, "general").get("joint")
+                told = self.file.told(element, None, "general")
+                at = told.get("joint", told.get("jointinparent"))
                 mine += [element] if at == self.hub.name else []
+                if told.get("tendon") in tied:
+                    self.unable(f"an actuator at the tendon {one_line(str(told['tendon']))!r}", "actuator")
                 if at in names and at != self.hub.name:
                     self.unable(
                         f"an actuator at the joint {one_line(str(at))!r}, behind the first", "actuator"
@@ -252,10 +257,9 @@ class _Reader:
 
     def _actuator(self, element: ET.Element, damping: float) -> float:
         file, kind = self.file, element.tag
-        also = ("general",) if kind != "general" else ()
-        told = file.told(element, None, *also)
-        gear = float(file.numbers(told, "gear", None, np.ones(1))[0])
         known = ("motor", "general", "position", "velocity", "dcmotor")
+        told = file.told(element, None, *known)  # MuJoCo keeps one set of defaults for all actuators
+        gear = float(file.numbers(told, "gear", None, np.ones(1))[0])
         if kind not in known:
             self.unable(f"an actuator <{one_line(kind)}>", "kind of actuator")
         if kind == "dcmotor":
@@ -271,7 +275,7 @@ class _Reader:
         torque, stiffness, brake = gear * gain, -at_position * gear**2, -at_speed * gear**2
         if stiffness:
             return self._position_loop(told, gear, torque, stiffness, brake, damping)
-        self._limits(told, gain, bool(brake))
+        self._limits(told, gain, bool(brake or constant or time > 0))
         if brake and torque > 0:
             self.effects.append(
                 Motor(
@@ -287,6 +291,8 @@ class _Reader:
         return damping + brake
 
     def _forwards(self, torque: float) -> float:
+        if torque == 0:
+            self.unable("an actuator whose control gives no force", "gain of zero")
         if torque < 0:
             self.unable("an actuator whose positive control turns backwards", "negative gain")
         return torque
@@ -327,15 +333,17 @@ class _Reader:
         if ends is None or told.get(name.replace("range", "limited"), "auto") == "false":
             return math.inf
         if ends[0] != -ends[1] or ends[1] <= 0:
-            self.unable(f"a {name} of {ends[0]:g} to {ends[1]:g}, not symmetric,", name)
+            self.unable(f"an asymmetric {name} of {ends[0]:g} to {ends[1]:g}", name)
             return math.inf
         return float(ends[1]) if name not in self.ignore else math.inf
 
-    def _limits(self, told: dict[str, str], gain: float, brakes: bool) -> None:
-        """Limits of control and force as one limit of the input."""
+    def _limits(self, told: dict[str, str], gain: float, other: bool) -> None:
+        """Limits of control and force as one limit of the input, from which no `other` force may differ."""
         limit, force = self._range(told, "ctrlrange"), self._range(told, "forcerange")
-        if math.isfinite(force) and brakes:
-            self.unable("a forcerange at an actuator with damping of its own", "forcerange")
+        if math.isfinite(force) and other:
+            self.unable(
+                "a forcerange at an actuator with damping, a filter or a constant of its own", "forcerange"
+            )
         elif math.isfinite(force) and gain:
             limit = min(limit, force / abs(gain))
         if math.isfinite(limit):

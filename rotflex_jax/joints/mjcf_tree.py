@@ -320,10 +320,9 @@ def _parsed(path: str | os.PathLike[str]) -> ET.Element:
     try:
         size = place.stat().st_size
         data = place.read_bytes() if size <= LARGEST_FILE else b""
-    except OSError as error:
-        raise InputError(
-            f"{shown} cannot be read ({error.strerror or error}); give the path of an MJCF file."
-        ) from error
+    except (OSError, ValueError) as error:  # a name with a zero byte is no name of a file
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{shown} cannot be read ({reason}); give the path of an MJCF file.") from error
     if size > LARGEST_FILE:
         raise InputError(
             f"{shown} has {size} bytes, but an MJCF file has at most {LARGEST_FILE}; give one of these."
@@ -355,7 +354,9 @@ def _parsed(path: str | os.PathLike[str]) -> ET.Element:
     try:
         parser.Parse(data, True)
         return builder.close()
-    except expat.ExpatError as error:
+    except InputError:
+        raise
+    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: an encoding that it lacks
         raise InputError(f"{shown} is no XML ({error}); give the path of an MJCF file.") from error
 
 
