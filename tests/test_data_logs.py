@@ -290,6 +290,12 @@ def test_one_file_for_each_channel(tmp_path, header):
     exact(load(files))
 
 
+def test_another_table_in_the_folder_does_not_hide_the_names_of_the_files(tmp_path):
+    channel_files(tmp_path / "run", "value")
+    (tmp_path / "run" / "gains.csv").write_text("stage,gain\n1,2\n2,4\n")
+    exact(load(tmp_path / "run"))
+
+
 def test_a_folder_is_a_recording_on_the_command_line(tmp_path, capsys):
     channel_files(tmp_path / "run")
     with pytest.raises(SystemExit) as left:

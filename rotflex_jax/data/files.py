@@ -96,7 +96,7 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
 def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | None) -> Table:
     """One table of files with a channel or more each.
 
-    Channels have the names of the columns; where two are equal and each file has one, those of the files.
+    Channels have the names of the columns; where two are equal, those of the files that have one each.
     """
     if not sources:
         raise InputError(
@@ -108,6 +108,7 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
     clocks: dict[str, Any] = {}
     units: set[str] = set()
     channels: list[Channel] = []
+    alone: list[str | None] = []  # names of files with one channel
     for path, table in zip(paths, tables, strict=True):
         clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
         own = [name for name in table.columns if name != clock]
@@ -123,11 +124,14 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
             group = next((g for g, other in clocks.items() if np.array_equal(t, other)), group)
             clocks.setdefault(group, t)
         channels += [Channel(group, name, table.units.get(name, ""), table.columns[name]) for name in own]
+        alone += [path.stem] if len(own) == 1 else [None] * len(own)
     if len(units) > 1:
         named = " and ".join(repr(unit) for unit in sorted(units))
         raise InputError(f"{label}: the times are in {named}, but must have one unit; export them alike.")
-    if len({channel.name for channel in channels}) < len(channels) == len(paths):
-        channels = [c._replace(name=path.stem) for c, path in zip(channels, paths, strict=True)]
+    if len({channel.name for channel in channels}) < len(channels):
+        channels = [
+            c if name is None else c._replace(name=name) for c, name in zip(channels, alone, strict=True)
+        ]
     unit = "".join(units)
     return table_of_channels(label, channels, clocks, f"t [{unit}]" if unit else "t")
 
