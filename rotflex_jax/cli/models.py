@@ -88,9 +88,11 @@ def export(
     sampled = form in ("c", "controller", *given.SIMULATORS)
     if sampled and period is None and model.endswith(".json"):
         period = forms.read(model).Ts
-    if form in ("c", "controller", "fmu") and period is None:
+    stepped = {"c": "C code", "controller": "a controller", "fmu": "an FMU"}
+    if form in stepped and period is None:
         raise InputError(
-            f"{model} does not say how its data were sampled, but C code needs a sampling period; give --Ts."
+            f"{model} does not say how its data were sampled, but {stepped[form]} needs a sampling period; "
+            "give --Ts."
         )
     text: str | bytes
     if form in given.SIMULATORS:
