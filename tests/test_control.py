@@ -19,6 +19,7 @@ from rotflex_jax.control.closed_loop import run_loop
 from rotflex_jax.control.design import AT_REST
 from rotflex_jax.control.motion import Tracking, torques_along
 from rotflex_jax.errors import InputError
+from rotflex_jax.joints import xl330_pendulum
 from rotflex_jax.mechanism.linear import zero_order_hold
 
 TS = 0.002
@@ -303,11 +304,12 @@ def test_the_c_code_gives_the_same_voltage(tmp_path):
     assert run.saturated > 0  # so that the limit was part of it
 
 
-def test_the_command_line_writes_it(capsys):
+@pytest.mark.parametrize(("options", "prefix"), [(["--prefix", "arm"], "arm"), ([], "control")])
+def test_the_command_line_writes_it(capsys, options, prefix):
     with pytest.raises(SystemExit) as left:
-        main(["export", "paper", "--to", "controller", "--Ts", "0.002", "--prefix", "arm"])
+        main(["export", "paper", "--to", "controller", "--Ts", "0.002", *options])
     assert left.value.code in (0, None)
-    assert capsys.readouterr().out == controller_to_c(rf.controller(rf.joints.paper(), 0.002), prefix="arm")
+    assert capsys.readouterr().out == controller_to_c(rf.controller(rf.joints.paper(), 0.002), prefix=prefix)
 
 
 # -- An independent machine ------------------------------------------------------------------------------
@@ -352,6 +354,26 @@ def test_models_are_drawn_from_the_distribution_of_the_fit():
     values = np.array([m.mechanism.values[index] for m in list(drawn.values())[1:]])
     np.testing.assert_allclose(np.cov(values.T), covariance, rtol=0.3, atol=1e-4)
     assert np.all(values[:, 0] >= 0)
+
+
+def test_names_become_no_code():
+    """A name that ends the comment and goes on as C stays in the comment."""
+    name = "a */ #error b /*"
+    motor = [fx.Motor(at="hub", gear_ratio=5.0), fx.Inertia(at="hub", inertia=0.01), fx.Viscous(at="hub")]
+    machine = rf.Mechanism(coordinates=[name], ports={"hub": (1,)}, effects=motor, outputs={name: "hub"})
+    text = controller_to_c(rf.controller(machine, 0.002))
+    head = text[: text.index("#ifndef")]
+    assert head.count("*/") == head.count("/*") == 1 and head.rstrip().endswith("*/")
+
+
+def test_the_input_of_a_servo_is_no_voltage():
+    servo = rf.controller(xl330_pendulum(), 0.005, limit=1.5)
+    assert "input up to 1.5 rad" in str(servo)
+    assert "u: input [rad], at most 1.5" in controller_to_c(servo)
+    both = rf.controller(rf.joints.paper(sensors="theta+alpha+speed"), 0.002)
+    assert "y: theta [rad], alpha [rad], speed [rad/s];" in controller_to_c(both)
+    with pytest.raises(InputError, match=r"limit.*\[rad\]"):
+        rf.controller(xl330_pendulum(), 0.005, limit=0)
 
 
 def test_a_figure_has_units_on_each_axis():

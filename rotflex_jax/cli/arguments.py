@@ -202,7 +202,14 @@ ExportPeriod = Annotated[
         "data unless given) or of a discrete state space (continuous unless given).",
     ),
 ]
-Prefix = Annotated[str, typer.Option(metavar="NAME", help="What the names in the C code begin with.")]
+Prefix = Annotated[
+    str | None,
+    typer.Option(
+        "--prefix",
+        metavar="NAME",
+        help="What the names in the C code begin with: rotflex, those of a controller control, unless given.",
+    ),
+]
 PendulumLength = Annotated[
     float, typer.Option("--length", metavar="M", help="Length of the servo's pendulum, for bam.")
 ]

@@ -69,7 +69,7 @@ def export(
     to: given.ExportForm,
     out: given.ExportFile = None,
     Ts: given.ExportPeriod = None,
-    prefix: given.Prefix = "rotflex",
+    prefix: given.Prefix = None,
     effects: given.OwnEffects = None,
     length: given.PendulumLength = 0.1,
     actuator: given.ServoName = "xl330",
@@ -85,6 +85,8 @@ def export(
     for file in effects or []:
         imported(file)
     subject, period = by_name.model(model), Ts
+    if prefix is None:
+        prefix = "control" if form == "controller" else "rotflex"
     sampled = form in ("c", "controller", *given.SIMULATORS)
     if sampled and period is None and model.endswith(".json"):
         period = forms.read(model).Ts

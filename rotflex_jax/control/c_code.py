@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from rotflex_jax.checks import shown
 from rotflex_jax.control.design import Controller
 from rotflex_jax.errors import InputError
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.export.c_code import in_c_comment
 
 
 def controller_to_c(
@@ -44,11 +44,15 @@ def controller_to_c(
     c, big = controller, prefix.upper()
     m, channels = len(c.B), len(c.C)
     mechanism = c.model.mechanism
+    sensors = [
+        f"{in_c_comment(name)} [{in_c_comment(quantity.unit(mechanism.units))}]"
+        for name, quantity in zip(mechanism.channels, mechanism.quantities, strict=True)
+    ]
     lines = [
-        f"/* Controller of {one_line(c.port)}, made by rotflex_jax; every {c.Ts!r} s.",
-        f"   y: {', '.join(one_line(name) for name in mechanism.channels)} [{mechanism.units.motion}];"
-        f" u: voltage [V], at most {c.limit!r}.",
-        f"   states: {', '.join(one_line(name) for name in c.states)}. */",
+        f"/* Controller of {in_c_comment(c.port)}, made by rotflex_jax; every {c.Ts!r} s.",
+        f"   y: {', '.join(sensors)};"
+        f" u: {c.input_name} [{in_c_comment(mechanism.units.input)}], at most {c.limit!r}.",
+        f"   states: {', '.join(in_c_comment(name) for name in c.states)}. */",
         f"#ifndef {big}_H",
         f"#define {big}_H",
         f"#define {big}_STATES {m}",

@@ -83,6 +83,11 @@ class Controller:
     effort: float
     left_out: tuple[str, ...]
 
+    @property
+    def input_name(self) -> str:
+        """What it gives: the `voltage` of a motor, another `input` such as a goal or a current."""
+        return "voltage" if self.model.mechanism.units.input == "V" else "input"
+
     @functools.cached_property
     def poles(self) -> Complex[np.ndarray, " n"]:
         """Poles of the loop on the linear part, as those of continuous time [1/s]."""
@@ -127,7 +132,8 @@ class Controller:
         slowest = np.min(np.abs(np.real(self.poles)))
         lines = [
             f"Controller of {self.port} every {1000 * self.Ts:g} ms, {len(self.row)} states and the load, "
-            f"voltage up to {self.limit:g} V, compensation: {self.compensate}",
+            f"{self.input_name} up to {self.limit:g} {self.model.mechanism.units.input}, "
+            f"compensation: {self.compensate}",
             f"  slowest pole {slowest:.3g} 1/s, gains {np.array2string(self.K, precision=3)}",
         ]
         return "\n".join(lines + [f"  {sentence}" for sentence in self.left_out])
@@ -162,7 +168,7 @@ def controller(
         Ts: Sampling period of the controller [s].
         port: Whose position follows the reference.
         accuracy: Error that is worth the whole voltage [rad].
-        limit: Largest voltage [V].
+        limit: Largest voltage [V], or input in the unit of the model's.
         poles: Of the loop in continuous time [1/s], one for each state; the regulator's unless given.
         compensate: "nothing", "feedforward", "observer" or "both".
         load: Port where the load torque acts; `port` unless given.
@@ -185,7 +191,7 @@ def controller(
     model = Model.of(getattr(model, "model", model) if not isinstance(model, Model) else model)
     Ts = positive(Ts, "Ts", example="0.002")
     accuracy = positive(accuracy, "accuracy", unit="rad", example="0.1")
-    limit = positive(limit, "limit", unit="V", example="10.0")
+    limit = positive(limit, "limit", unit=model.mechanism.units.input, example="10.0")
     one_of(compensate, "compensate", get_args(Compensation))
     mechanism = model.mechanism
     for name, given in (("port", port), ("load", port if load is None else load)):

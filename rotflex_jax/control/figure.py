@@ -32,7 +32,7 @@ def loop_figure(run: ClosedLoop, *others: ClosedLoop) -> Figure:
             axes[2].axhline(way * controller.limit, color=MUTED, lw=0.7)
     axes[0].set_ylabel(f"{controller.port} [{unit}]")
     axes[1].set_ylabel(f"error [{unit}]")
-    axes[2].set_ylabel("voltage [V]")
+    axes[2].set_ylabel(f"{controller.input_name} [{controller.model.mechanism.units.input}]")
     effort = unit_text(controller.model.mechanism.units.effort)
     axes[3].set_ylabel(f"{controller.states[-1]} [{effort}]")
     axes[3].set_xlabel("time [s]")

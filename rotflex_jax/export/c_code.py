@@ -124,7 +124,7 @@ def _lines(model: Model, Ts: float, prefix: str, code: SampleProgram) -> Iterato
     yield f"#define {name}_OUTPUTS {len(mechanism.channels)}"
     yield f"#define {name}_TS {_number(Ts)} /* sampling period [s] */\n"
     yield "typedef struct {"
-    yield f"    double x[{len(names)}]; /* {_comment(', '.join(names))} */"
+    yield f"    double x[{len(names)}]; /* {in_c_comment(', '.join(names))} */"
     yield "    int started; /* whether there has been a command */"
     if counted:
         yield "    double count; /* samples so far */"
@@ -146,7 +146,7 @@ def _lines(model: Model, Ts: float, prefix: str, code: SampleProgram) -> Iterato
     yield f"static void {prefix}_read(const {prefix}_state *s, {outputs})\n{{"
     yield from _reading(code)
     yield "}\n"
-    unit = _comment(mechanism.units.input)
+    unit = in_c_comment(mechanism.units.input)
     yield f"/* y: what the sensors read now. u: command that is held from now over one sample [{unit}]. */"
     yield f"static void {prefix}_step({prefix}_state *s, double u, {outputs})\n{{"
     yield f"    {prefix}_read(s, y);"
@@ -164,15 +164,15 @@ def _heading(mechanism: Mechanism, model: Model, Ts: float) -> Iterator[str]:
     gates = model.gates or (1.0,) * len(mechanism.effects)
     for effect, gate in zip(mechanism.effects, gates, strict=True):
         off = "" if gate else " (switched off)"
-        yield " * " + _comment(f"{effect.title} at {effect.at}{off}: {effect.equation}")
+        yield " * " + in_c_comment(f"{effect.title} at {effect.at}{off}: {effect.equation}")
         declared = specifications(effect)
         for n, v in effect.values.items():
             unit = mechanism.units.unit(declared[n].unit, effect.volts_of_input)
-            yield " *     " + _comment(f"{n} = {v:.10g} {unit}".rstrip())
+            yield " *     " + in_c_comment(f"{n} = {v:.10g} {unit}".rstrip())
     yield " */"
 
 
-def _comment(text: str) -> str:
+def in_c_comment(text: str) -> str:
     """A text in which no comment of C ends, on one line: names may come from a file."""
     return one_line(text).replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
 
