@@ -236,6 +236,9 @@ def test_a_child_that_turns_the_other_way(tmp_path):
             "the tendon",
             "tendon",
         ),
+        ({"more": '<option><flag damper="disable"/></option>'}, 'flag damper="disable"', None),
+        ({"more": '<option viscosity="1"/>'}, "viscosity of a fluid", None),
+        ({"more": '<option actuatorgroupdisable="0"/>'}, "switched off", None),
         ({"a": 'damping="x"'}, 'damping="x"', None),
         ({"a": 'damping="nan"'}, 'damping="nan"', None),
         ({"a": 'class="none"'}, "the class 'none'", None),
@@ -256,6 +259,15 @@ def test_what_cannot_be_said_is_refused_by_name(tmp_path, change, words, ignore)
     if ignore:
         assert f"ignore=['{ignore}']" in str(caught.value)
         loaded(tmp_path, text, "a", "b", ignore=[ignore])
+
+
+def test_options_add_up(tmp_path):
+    pieces = '<option timestep="1e-3"/><option gravity="0 -5 0"/><option><flag contact="disable"/></option>'
+    mujoco = pytest.importorskip("mujoco")
+    text = TWO.format(**(PLAIN | {"more": pieces}))
+    assert mujoco.MjModel.from_xml_string(text).opt.gravity[1] == -5.0
+    weight = loaded(tmp_path, text, "a", "b").effect("gravity", "arm")
+    assert math.hypot(weight.sine, weight.cosine) == pytest.approx(0.5)
 
 
 def test_actuators_share_one_set_of_defaults(tmp_path):

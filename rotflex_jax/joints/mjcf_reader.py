@@ -94,6 +94,7 @@ class _Reader:
     def mechanism(self) -> Mechanism:
         """The mechanism."""
         hub, arm, told = self.hub, self.arm, self.file.number
+        self._check_options()
         bodies = self.file.below(hub.body)
         outer = [] if arm is None else self.file.below(arm.body)
         inner = [b for b in bodies if b not in outer]
@@ -115,6 +116,17 @@ class _Reader:
         self._tendons()
         self._equalities()
         return self._assembled()
+
+    def _check_options(self) -> None:
+        """Options that change the forces of the whole file."""
+        for name in ("actuation", "damper", "spring", "passive", "frictionloss", "clampctrl"):
+            if self.file.flags.get(name) == "disable":
+                self.unable(f'the flag {name}="disable"', name)
+        for name in ("viscosity", "density"):
+            if self.file.number(self.file.options, name):
+                self.unable(f"the {name} of a fluid", name)
+        if "actuatorgroupdisable" in self.file.options:
+            self.unable("actuators that are switched off (actuatorgroupdisable)", "actuatorgroupdisable")
 
     def _assembled(self) -> Mechanism:
         hub, arm = self.hub, self.arm
@@ -146,10 +158,8 @@ class _Reader:
 
     def _weight(self, bodies: list[int], port: str) -> None:
         """tau(q) = axis . (turn(q) r x m g): a cosine and a sine of the angle."""
-        option = self.file.root.find("option")
-        told = {} if option is None else dict(option.attrib)
-        flag = None if option is None else option.find("flag")
-        if flag is not None and flag.get("gravity") == "disable":
+        told = self.file.options
+        if self.file.flags.get("gravity") == "disable":
             return
         fall, axis = self.file.numbers(told, "gravity", 3, np.array([0.0, 0.0, -9.81])), self.hub.axis
         cosine = sine = size = 0.0

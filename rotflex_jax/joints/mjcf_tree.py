@@ -110,6 +110,12 @@ class FileModel:
         ):
             if name in self.settings:
                 raise self.error(f"has the setting {name} of the compiler", "write masses and inertias out")
+        self.options: dict[str, str] = {}
+        self.flags: dict[str, str] = {}
+        for element in self.root.findall("option"):
+            self.options |= element.attrib
+            for flag in element.findall("flag"):
+                self.flags |= flag.attrib
         self.degrees = self.settings.get("angle", "degree") != "radian"
         self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for element in self.root.findall("default"):
