@@ -252,6 +252,22 @@ def test_joint_states_at_uneven_times_are_resampled_on_request(tmp_path):
     assert len(recording.u) >= N - 2
 
 
+def test_simulated_time_begins_at_zero(tmp_path):
+    """A first stamp of zero is a time; only where all are zero did nobody fill them in."""
+    ros2 = pytest.importorskip("mcap_ros2.writer")
+    writer = ros2.Writer(out := io.BytesIO())
+    state = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+    for k in range(N):
+        header = {"stamp": {"sec": 0, "nanosec": 2_000_000 * k}, "frame_id": ""}
+        joints = {"name": ["hub", "arm"], "position": [THETA[k], ALPHA[k]], "velocity": []}
+        message = {"header": header, **joints, "effort": [VOLTAGE[k], 0.0]}
+        at = 1_700_000_000 * 10**9 + 5_000_000 * k  # simulated slower than real time
+        writer.write_message("/s", state, message, log_time=at, publish_time=at)
+    writer.finish()
+    (tmp_path / "run.mcap").write_bytes(out.getvalue())
+    exact(load(tmp_path / "run.mcap", input="hub.effort", **NAMES))
+
+
 def test_a_joint_state_that_loses_a_joint_is_refused(tmp_path):
     ros2 = pytest.importorskip("mcap_ros2.writer")
     writer = ros2.Writer(out := io.BytesIO())

@@ -232,7 +232,8 @@ def table_from_mcap(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 
     A joint of `sensor_msgs/msg/JointState` gives `joint.position`, `joint.velocity` and `joint.effort`; a
     message with one number has the name of its topic, others `topic.field`, and `topic.field[k]` in a list.
-    The time is that of the header, else that of the log, in seconds since the first message.
+    The time is that of the headers, or that of the log where none is filled in, in seconds since the first
+    message.
 
     Raises:
         InputError: mcap or mcap-ros2-support is missing, or the file is damaged, too large, without ROS 2
@@ -241,7 +242,7 @@ def table_from_mcap(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     readers: Any = optional("mcap.stream_reader", f"Reading {path.name}")
     records: Any = optional("mcap.records", f"Reading {path.name}")
     ros2: Any = optional("mcap_ros2.decoder", f"Reading {path.name}")
-    topics: dict[str, tuple[list[int], list[dict[str, float]]]] = {}
+    topics: dict[str, tuple[list[tuple[int, int]], list[dict[str, float]]]] = {}
     try:
         stream = readers.StreamReader(
             BytesIO(path.read_bytes()), emit_chunks=True, validate_crcs=True, record_size_limit=max_bytes
@@ -272,20 +273,21 @@ def table_from_mcap(path: Path, max_bytes: int = MAX_BYTES) -> Table:
                     stamp, numbers = _message(decode(part.data), source.topic)
                     if numbers:
                         times, rows = topics.setdefault(source.topic, ([], []))
-                        times.append(stamp or part.log_time)
+                        times.append((stamp, part.log_time))
                         rows.append(numbers)
     except InputError:
         raise
     except Exception as error:  # a damaged file fails in many ways within mcap
         raise unreadable(path, "an MCAP file", error) from error
-    first = min((times[0] for times, _ in topics.values()), default=0)
+    # A header that nobody fills in is zero in all messages, simulated time in the first one alone.
+    stamped = {topic: any(stamp for stamp, _ in times) for topic, (times, _) in topics.items()}
+    at = {topic: [t[0 if stamped[topic] else 1] for t in times] for topic, (times, _) in topics.items()}
+    first = min((times[0] for times in at.values()), default=0)
     channels: list[Channel] = []
     clocks: dict[str, Any] = {}
-    for topic, (times, rows) in topics.items():
+    for topic, (_, rows) in topics.items():
         group = topic.strip("/").replace("/", ".")
-        clocks[group] = (
-            np.array([stamp - first for stamp in times]) * 1e-9
-        )  # whole numbers, as they are exact
+        clocks[group] = np.array([stamp - first for stamp in at[topic]]) * 1e-9  # exact: whole numbers
         names = list(rows[0])
         odd = next((k for k, row in enumerate(rows) if list(row) != names), None)
         if odd is not None:
