@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax.effects import Coulomb, CoulombAsymmetric, Gravity, Lag, Saturation, Viscous
+from rotflex_jax.effects import Coulomb, CoulombAsymmetric, CurrentDrive, Gravity, Lag, Saturation, Viscous
 from rotflex_jax.errors import InputError
 from rotflex_jax.export import to_mjcf
 from rotflex_jax.export.certificate import standard_input
@@ -267,7 +267,7 @@ def test_options_add_up(tmp_path):
     text = TWO.format(**(PLAIN | {"more": pieces}))
     assert mujoco.MjModel.from_xml_string(text).opt.gravity[1] == -5.0
     weight = loaded(tmp_path, text, "a", "b").effect("gravity", "arm")
-    assert math.hypot(weight.sine, weight.cosine) == pytest.approx(0.5)
+    assert isinstance(weight, Gravity) and math.hypot(weight.sine, weight.cosine) == pytest.approx(0.5)
 
 
 def test_actuators_share_one_set_of_defaults(tmp_path):
@@ -276,7 +276,7 @@ def test_actuators_share_one_set_of_defaults(tmp_path):
     text = text.replace("<worldbody>", '<default><motor gear="3" ctrlrange="-2 2"/></default><worldbody>', 1)
     assert mujoco.MjModel.from_xml_string(text).actuator_gear[0, 0] == 3.0
     machine = loaded(tmp_path, text, "a", "b")
-    assert machine.effect("current_drive", "hub").gain == 3.0
+    assert machine.effect("current_drive", "hub") == CurrentDrive(at="hub", gain=3.0)
     assert any(isinstance(e, Saturation) and e.limit == 2.0 for e in machine.effects)
 
 

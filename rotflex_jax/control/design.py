@@ -157,8 +157,8 @@ def controller(
     voltage for an error of `accuracy` in the position or any coordinate (Bryson's rule), or the gains for
     given poles, and a steady Kalman filter of the states and of a load torque that walks at random. What the
     model has beside its linear part is compensated along the planned motion ("feedforward"), by the observed
-    load ("observer", which also counters what the model does not know, but may hunt where a joint sticks), or
-    by both.
+    load ("observer", which also counters what the model does not know, but may oscillate where a joint
+    sticks), or by both.
 
     Not for an unstable plan: a position whose zeros are unstable, such as the tip of a long arm, follows
     with the voltage that is allowed, not exactly.

@@ -17,6 +17,9 @@ from rotflex_jax.mechanism import Mechanism
 
 Vector = tuple[float, ...]
 
+LEAST_INERTIA = 1e-7
+"""Inertia of a body that has none of its own, as a share of the smallest one: simulators refuse zero."""
+
 # A speed at which friction that falls with it has fallen [rad/s].
 _FAST = 1e6
 

@@ -13,6 +13,7 @@ from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.export.certificate import Exported, Subject, in_comment
 from rotflex_jax.export.joint_chain import (
+    LEAST_INERTIA,
     Chain,
     Drive,
     Place,
@@ -29,9 +30,6 @@ from rotflex_jax.text.plain import one_line
 
 LONGEST_STEP = 1e-4
 """Step of the simulator that a file asks for [s], at most: larger ones are less accurate in dry friction."""
-
-# Inertia of a body that has none of its own, as a share of the smallest one: MuJoCo refuses a body without.
-_DUST = 1e-7
 
 # Dry friction is a soft constraint in MuJoCo: as hard as its solver bears.
 _HARD = "0.9999 0.9999 0.001"
@@ -159,8 +157,8 @@ def _mujoco(mechanism: Mechanism, chain: Chain, name: str, Ts: float) -> ET.Elem
         acting = _nonzero(stiffness=at.stiffness, damping=at.damping, armature=at.inertia)
         acting |= _nonzero(frictionloss=at.friction) | hard if at.friction else {}
         _element(body, "joint", name=coordinate, **axis, **acting)
-        mass, x, z = mass_and_lever(inertia or _DUST * least, gravity, FREE_FALL)
-        own = (inertia or _DUST * least) / (2 if any(gravity) else 1)
+        mass, x, z = mass_and_lever(inertia or LEAST_INERTIA * least, gravity, FREE_FALL)
+        own = (inertia or LEAST_INERTIA * least) / (2 if any(gravity) else 1)
         place = f"{number(x)} 0 {number(z)}"
         _element(body, "inertial", pos=place, mass=number(mass), diaginertia=" ".join([number(own)] * 3))
     names = _tendons(root, mechanism, chain, tendons, hard)

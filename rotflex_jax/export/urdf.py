@@ -9,16 +9,20 @@ from jaxtyping import Float, Real
 
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.export.certificate import Exported, Subject, in_comment
-from rotflex_jax.export.joint_chain import Chain, body_of, described as number, joint_of, mass_and_lever
+from rotflex_jax.export.joint_chain import (
+    LEAST_INERTIA,
+    Chain,
+    body_of,
+    described as number,
+    joint_of,
+    mass_and_lever,
+)
 from rotflex_jax.export.mjcf import LONGEST_STEP, machine_name, shares
 from rotflex_jax.joints.servos import FREE_FALL
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.models.model import Model
 from rotflex_jax.text.plain import one_line
-
-# Inertia of a link that has none of its own, as a share of the smallest one.
-_DUST = 1e-7
 
 
 def to_urdf(
@@ -81,8 +85,8 @@ def _robot(mechanism: Mechanism, chain: Chain, name: str) -> ET.Element:
     least = min((inertia for inertia, _ in bodies if inertia), default=1.0)
     for k, coordinate in enumerate(map(one_line, mechanism.coordinates)):
         inertia, gravity = bodies[k]
-        mass, x, z = mass_and_lever(inertia or _DUST * least, gravity, FREE_FALL)
-        own = number((inertia or _DUST * least) / (2 if any(gravity) else 1))
+        mass, x, z = mass_and_lever(inertia or LEAST_INERTIA * least, gravity, FREE_FALL)
+        own = number((inertia or LEAST_INERTIA * least) / (2 if any(gravity) else 1))
         link = ET.SubElement(root, "link", {"name": f"{coordinate} link"})
         inertial = ET.SubElement(link, "inertial")
         ET.SubElement(inertial, "origin", {"xyz": f"{number(x)} 0 {number(z)}", "rpy": "0 0 0"})
