@@ -278,6 +278,12 @@ def test_actuators_share_one_set_of_defaults(tmp_path):
     machine = loaded(tmp_path, text, "a", "b")
     assert machine.effect("current_drive", "hub") == CurrentDrive(at="hub", gain=3.0)
     assert any(isinstance(e, Saturation) and e.limit == 2.0 for e in machine.effects)
+    text = text.replace('motor gear="3" ctrlrange="-2 2"', 'velocity kv="2"')
+    with pytest.raises(InputError, match="defaults of another kind"):
+        loaded(tmp_path, text, "a", "b")
+    text = text.replace('<general joint="a"/>', '<position joint="a" kp="5"/>')
+    assert mujoco.MjModel.from_xml_string(text).actuator_biasprm[0, :3].tolist() == [0.0, -5.0, 0.0]
+    assert loaded(tmp_path, text, "a", "b").effect("viscous", "hub") == Viscous(at="hub", coefficient=0.05)
 
 
 def test_a_name_that_no_file_can_have():

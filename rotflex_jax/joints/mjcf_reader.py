@@ -31,6 +31,9 @@ from rotflex_jax.text.plain import one_line
 # Torque constant of a servo whose joint has no damping: its back-EMF is as good as none [N m/A].
 _NO_BRAKE = 1e-4
 
+# Attributes that every kind of actuator has.
+_OF_ALL_KINDS = {"gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited"}
+
 
 def mechanism_of(
     path: str | os.PathLike[str], joint: str | None, child: str | None, ignore: tuple[str, ...]
@@ -268,7 +271,11 @@ class _Reader:
     def _actuator(self, element: ET.Element, damping: float) -> float:
         file, kind = self.file, element.tag
         known = ("motor", "general", "position", "velocity", "dcmotor")
-        told = file.told(element, None, *known)  # MuJoCo keeps one set of defaults for all actuators
+        # MuJoCo keeps one set of defaults for all actuators; gains are those of the kind.
+        every = file.told(element, None, *known)
+        told = file.told(element, None, "general") | {n: every[n] for n in _OF_ALL_KINDS & set(every)}
+        if kind == "general" and {"kp", "kv"} & set(every):
+            self.unable("defaults of another kind for a <general> actuator", "actuator law")
         gear = float(file.numbers(told, "gear", None, np.ones(1))[0])
         if kind not in known:
             self.unable(f"an actuator <{one_line(kind)}>", "kind of actuator")
