@@ -162,3 +162,23 @@ def test_what_makes_no_sense_is_refused():
         rf.prediction_bands([fitted()], recording(8))
     with pytest.raises(rf.InputError, match="`weight` must be a finite number above 0"):
         rf.prediction_bands([(fitted(), -1.0)], recording(8))
+
+
+def test_a_run_that_diverges_has_no_bands():
+    """Neither over the recording nor over one that is known: the width would be no number."""
+    fast = dataclasses.replace(
+        fitted(), model=rf.Model(fitted().model.mechanism.with_values({CONSTANT: 1e306}))
+    )
+    calm, huge = recording(8), recording(8)
+    huge = rf.Recording(u=1e9 * huge.u, y=huge.y, Ts=TS, channels=("theta",))
+    with pytest.raises(rf.InputError, match="diverges"):
+        rf.prediction_bands(fast, huge)
+    with pytest.raises(rf.InputError, match="diverges"):
+        rf.prediction_bands(fast, calm, known=[huge])
+
+
+def test_bands_are_of_one_recording():
+    with pytest.raises(rf.InputError, match="2 recordings were given as `recording`, but one is needed"):
+        rf.prediction_bands(fitted(), [recording(1), recording(2)])
+    with pytest.raises(rf.InputError, match="one is needed"):
+        rf.prediction_bands(fitted(), recording(1)).coverage([recording(1), recording(2)])
