@@ -22,7 +22,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import FitAttempt, FitPoint, FitStage, GreyBoxProblem, problem_of, report
 from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE
 from rotflex_jax.fit.problem import LikelihoodEquations
-from rotflex_jax.fit.profile_result import Profile, Quantity
+from rotflex_jax.fit.profile_result import LEAST_LEVEL, Profile, Quantity
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.fit.windows import Windows
 from rotflex_jax.parameters import Transform
@@ -310,13 +310,15 @@ def profile(
         recordings: Those that were fitted.
         of: Full name of a free parameter, or a function that receives the values of all parameters by full
             name and gives a number: `lambda p: p["hub.coulomb.level"] / p["joint.spring.stiffness"]`.
-        level: Up to which confidence level the profile reaches.
+        level: Up to which confidence level the profile reaches; never less than 0.95, by which its shape is
+            told.
 
     Returns:
         Profile with `interval(level)`, `shape`, `wald` and a figure.
 
     Raises:
-        InputError: No such parameter, a function that gives no number, or other recordings than were fitted.
+        InputError: No such parameter, a function that gives no number, or another number of recordings than
+            were fitted where each has parameters of its own.
 
     Source: S. A. Murphy and A. W. van der Vaart, J. Am. Stat. Assoc. 95, 2000; A. Raue et al., Bioinformatics
     25, 2009; the factor: R. E. Chandler and S. Bate, Biometrika 94, 2007.
@@ -325,7 +327,7 @@ def profile(
         raise InputError(
             f"A fit is needed, but {checks.shown(fitted)} was given; give what rotflex_jax.fit gives."
         )
-    level = checks.number(level, "level", above=0, below=1, example="0.95")
+    level = max(checks.number(level, "level", above=0, below=1, example="0.95"), LEAST_LEVEL)
     given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
     along = Along.of(of, fitted)
     with double_precision():
@@ -348,6 +350,7 @@ def profile(
         nuisances=np.array([p.values for p in points]),
         parameter_names=fitted.model.mechanism.parameter_names,
         gained=walk.middle.cost - least.cost,
+        level=level,
     )
 
 
