@@ -120,7 +120,7 @@ class SearchState:
         merged: The final model with one effect in the place of several, where it has one.
         machine: Calibrations that belong to the machine.
         tests: Score tests of the current model, of predictions and of free runs.
-        resumed: How many of the effects an earlier search has added, which was stopped.
+        resumed: After how many rounds of a search that was stopped this one went on.
         digest: Of all that the models depend on.
     """
 
@@ -360,25 +360,22 @@ def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, pat
     """What a search that was stopped had found, validated again."""
     stages = read_stages(path, digest)
     say(f"going on after {len(stages) - 1} finished rounds")
-    state = None
+    # All of them before any is reported: what is reported is what a file of rounds so far keeps.
+    found: list[ValidatedHypothesis] = []
     for stage in stages:
         try:
             h = restored(horizons.prediction.problem, stage.prediction)
             runs = restored(horizons.free_run.problem, stage.free_run)
         except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError):
             raise not_kept(path) from None
-        before = state.current if state else None
-        found = horizons.validated(h, runs, before)
-        if state is None:
-            state = SearchState(
-                model, horizons, say, found, digest, len(stages) - 1, passed=[found], tried=[found]
-            )
-            state.reached("as it is")
-            if len(stages) > 1:
-                _rank(state)
-        else:
-            _add(state, found, stage.added)
-    assert state
+        found.append(horizons.validated(h, runs, found[-1] if found else None))
+    first, *later = found
+    state = SearchState(model, horizons, say, first, digest, len(later), passed=[first], tried=[first])
+    if later:
+        _rank(state)
+    state.reached("as it is")
+    for reached, stage in zip(later, stages[1:], strict=True):
+        _add(state, reached, stage.added)
     return state
 
 
@@ -615,7 +612,10 @@ def _resumed(count: int) -> tuple[str, ...]:
     if not count:
         return ()
     found = "one round" if count == 1 else f"{count} rounds"
-    return (f"The search went on after {found} of one that was stopped; the time is that of the rest.",)
+    return (
+        f"The search went on after {found} of one that was stopped; the time, and the sets of effects that "
+        "have a probability, are those of the rest.",
+    )
 
 
 def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stage:
