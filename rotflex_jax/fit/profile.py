@@ -8,6 +8,7 @@ whatever the width: given its own `g`, nothing lowers the cost. Every point goes
 of the fit, with the numbers of its neighbour as a start.
 """
 
+import contextlib
 import dataclasses
 import itertools
 from collections import deque
@@ -25,6 +26,7 @@ from rotflex_jax.fit.problem import LikelihoodEquations
 from rotflex_jax.fit.profile_result import LEAST_LEVEL, Profile, Quantity
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.fit.windows import Windows
+from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
@@ -49,11 +51,13 @@ NEAR = 1e-3
 REMEMBERED = 6
 # Step of a difference quotient in the coordinates of a fit.
 STEP = 1e-5
+# The sign of a function is looked at for so many parameters, about so far from the fit in its coordinates.
+DRAWS, AWAY = 100, 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Along:
-    """A quantity of a fit, and the coordinate along which a profile walks: its logarithm if it is positive.
+    """A quantity of a fit, and the coordinate along which a profile walks: its logarithm if always positive.
 
     Attributes:
         name: For people.
@@ -116,7 +120,7 @@ class Along:
             )
         name = getattr(of, "__name__", "quantity")
         name = "quantity" if name == "<lambda>" else name
-        positive = value > 0
+        positive = value > 0 and _stays_positive(of, m, fitted.free_names)
         return cls(name, "", of, (0.0 if positive else -np.inf, np.inf), positive)
 
     def walked(self, value: float) -> float:
@@ -352,6 +356,19 @@ def profile(
         gained=walk.middle.cost - least.cost,
         level=level,
     )
+
+
+def _stays_positive(of: Callable[[Mapping[str, float]], float], m: Mechanism, free: Sequence[str]) -> bool:
+    """Whether a function is positive at random parameters, as a ratio is and a difference is not."""
+    rng, transform = np.random.default_rng(0), Transform.of(m.parameter_specifications)
+    z, moves = transform.unconstrain(m.values), np.isin(m.parameter_names, free)
+    for _ in range(DRAWS):
+        values = transform.physical(np.where(moves, z + AWAY * rng.standard_normal(len(z)), z))[0]
+        # Where it fails, the parameters are outside of what it is for.
+        with contextlib.suppress(TypeError, ValueError, ArithmeticError), np.errstate(all="ignore"):
+            if of(dict(zip(m.parameter_names, values.tolist(), strict=True))) <= 0:
+                return False
+    return True
 
 
 def _distinct(values: list[float]) -> list[bool]:
