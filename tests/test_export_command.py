@@ -119,7 +119,7 @@ def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
     for arguments, words in (
         ((saved, "--to", "fortran"), ("'fortran'", "c, latex, text, statespace")),
         (("paper", "--to", "c"), ("needs a sampling period", "--Ts")),
-        (("paper", "--to", "fmu", "--out", tmp_path / "x.fmu"), ("needs a sampling period", "--Ts")),
+        (("paper", "--to", "fmu", "--out", tmp_path / "x.fmu"), ("an FMU needs a sampling period", "--Ts")),
         ((saved, "--to", "fmu"), ("archive", "--out")),
         (("paper", "--to", "bam"), ("one servo", "xl330_pendulum")),
         ((tmp_path / "no.xml", "--to", "text"), ("cannot be read",)),

@@ -90,7 +90,8 @@ def export(
         period = forms.read(model).Ts
     if form in ("c", "controller", "fmu") and period is None:
         raise InputError(
-            f"{model} does not say how its data were sampled, but C code needs a sampling period; give --Ts."
+            f"{model} does not say how its data were sampled, but {'an FMU' if form == 'fmu' else 'C code'} "
+            "needs a sampling period; give --Ts."
         )
     text: str | bytes
     if form in given.SIMULATORS:
