@@ -116,7 +116,10 @@ def test_files_that_hold_no_search(kind: str, tmp_path: Path) -> None:
         rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, resume=path)
 
 
-@pytest.mark.parametrize("where", ["z", "local_z", "x0", "K", "locations", "free", "process_noise", "order"])
+@pytest.mark.parametrize(
+    "where",
+    ["z", "local_z", "x0", "K", "locations", "free", "process_noise", "a port", "an intensity", "order"],
+)
 def test_changed_numbers_are_refused(searched: tuple[rf.Discovery, Path], where: str, tmp_path: Path) -> None:
     written = json.loads(searched[1].read_text())
     stages = [copy.deepcopy(entry["search"]) for entry in written["stages"]]
@@ -130,6 +133,9 @@ def test_changed_numbers_are_refused(searched: tuple[rf.Discovery, Path], where:
     }
     if where == "order":
         stages.reverse()
+    elif where in ("a port", "an intensity"):
+        noise = {"nowhere": 1e-6} if where == "a port" else {"shaft": float("nan")}
+        stages[0]["prediction"]["process_noise"] = noise
     else:
         stages[0]["prediction"][where] = bad.get(where, 7)
     path = tmp_path / "x.stopped.json"
