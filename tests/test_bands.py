@@ -162,3 +162,23 @@ def test_what_makes_no_sense_is_refused():
         rf.prediction_bands([fitted()], recording(8))
     with pytest.raises(rf.InputError, match="`weight` must be a finite number above 0"):
         rf.prediction_bands([(fitted(), -1.0)], recording(8))
+
+
+def test_a_run_that_diverges_has_no_bands():
+    """Neither over the recording nor over one that is known: the width would be no number."""
+    calm = recording(8)
+    huge = rf.Recording(u=1e307 * calm.u / np.abs(calm.u).max(), y=calm.y, Ts=TS, channels=("theta",))
+    strong = {"hub.motor.gear_ratio": 1e4}
+    fit = dataclasses.replace(fitted(), model=rf.Model(fitted().model.mechanism.with_values(strong)))
+    assert np.isfinite(rf.prediction_bands(fit, calm).upper).all()
+    with pytest.raises(rf.InputError, match="diverges"):
+        rf.prediction_bands(fit, huge)
+    with pytest.raises(rf.InputError, match="diverges"):
+        rf.prediction_bands(fit, calm, known=[huge])
+
+
+def test_bands_are_of_one_recording():
+    with pytest.raises(rf.InputError, match="2 recordings were given as `recording`, but one is needed"):
+        rf.prediction_bands(fitted(), [recording(1), recording(2)])
+    with pytest.raises(rf.InputError, match="one is needed"):
+        rf.prediction_bands(fitted(), recording(1)).coverage([recording(1), recording(2)])

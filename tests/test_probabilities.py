@@ -138,7 +138,7 @@ def test_what_is_told(found):
     assert "Stribeck" in found.sentence and "none of these 4 %" in found.sentence
     left = probabilities([fitted("")], is_explained=False, rule=RULE)
     assert left.elsewhere == 0.25 and "catalogue" in left.remarks[1]
-    assert "nothing more 75 %" in left.sentence
+    assert left.sentence == "One set of effects was fitted: nothing more 75 %; another one 25 %."
 
 
 def test_calibration_error_by_hand():

@@ -213,3 +213,24 @@ def test_what_makes_no_sense_is_refused():
     local = rf.fit(axis(CONSTANT), [recording(), recording()], local=[CONSTANT])
     with pytest.raises(rf.InputError, match="for 2 recordings, but 1 were given"):
         rf.profile(local, recording(), CONSTANT)
+
+
+def test_no_interval_is_wider_than_the_profile():
+    """An end that was not looked for is not an open end."""
+    with pytest.raises(rf.InputError, match=r"the profile reaches 0.95; make it with level=0.99"):
+        profiled().interval(0.99)
+    value, entry, rss = regression()
+    wide = rf.profile(fitted(), recording(), CONSTANT, level=0.99)
+    half = np.sqrt(rss * entry * np.expm1(scipy.stats.chi2.ppf(0.99, 1) * wide.factor / N))
+    np.testing.assert_allclose(wide.interval(0.99), (value - half, value + half), rtol=0, atol=2e-3 * half)
+    assert rf.profile(fitted(), recording(), CONSTANT, level=0.5).shape == "closed"
+
+
+def test_a_difference_may_be_negative():
+    """Half a standard deviation above zero: the interval is the parameter's, moved, and not cut at zero."""
+    low, high = profiled().interval()
+    shift = profiled().value - profiled().std / 2
+    p = rf.profile(fitted(), recording(), lambda values: values[CONSTANT] - shift)
+    assert p.shape == "closed" and p.limits == (-np.inf, np.inf)
+    np.testing.assert_allclose(p.interval(), (low - shift, high - shift), rtol=0, atol=0.01 * p.std)
+    assert rf.profile(fitted(), recording(), lambda values: 1 / values[CONSTANT]).limits == (0.0, np.inf)

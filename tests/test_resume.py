@@ -4,6 +4,7 @@ import copy
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.cli import main
 from rotflex_jax.cli.rounds_so_far import RoundsSoFar
+from rotflex_jax.discover.horizon import Horizons
 from rotflex_jax.effects import CATALOG, Inertia, Motor, Viscous
 from rotflex_jax.errors import InputError
+from rotflex_jax.recording.digest import content
 
 MOTOR = ("torque_constant", "back_emf", "resistance", "gear_ratio", "efficiency")
 SPINDLE = rf.Mechanism(
@@ -113,7 +116,10 @@ def test_files_that_hold_no_search(kind: str, tmp_path: Path) -> None:
         rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, resume=path)
 
 
-@pytest.mark.parametrize("where", ["z", "local_z", "x0", "K", "locations", "free", "process_noise", "order"])
+@pytest.mark.parametrize(
+    "where",
+    ["z", "local_z", "x0", "K", "locations", "free", "process_noise", "a port", "an intensity", "order"],
+)
 def test_changed_numbers_are_refused(searched: tuple[rf.Discovery, Path], where: str, tmp_path: Path) -> None:
     written = json.loads(searched[1].read_text())
     stages = [copy.deepcopy(entry["search"]) for entry in written["stages"]]
@@ -127,6 +133,9 @@ def test_changed_numbers_are_refused(searched: tuple[rf.Discovery, Path], where:
     }
     if where == "order":
         stages.reverse()
+    elif where in ("a port", "an intensity"):
+        noise = {"nowhere": 1e-6} if where == "a port" else {"shaft": float("nan")}
+        stages[0]["prediction"]["process_noise"] = noise
     else:
         stages[0]["prediction"][where] = bad.get(where, 7)
     path = tmp_path / "x.stopped.json"
@@ -146,3 +155,38 @@ def test_option_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtur
     with pytest.raises(SystemExit) as end:
         main(["discover", str(file), "--each", "--continue", "x.stopped.json"])
     assert end.value.code == 2 and "--continue and --each" in capsys.readouterr().err
+
+
+def test_what_a_recording_continues_belongs_to_it() -> None:
+    """States that no sensor measures start where the part before ends, so a search there is another one."""
+    _, later = spun().split(0.7)
+    assert later.continues is not None
+    alone = copy.copy(later)
+    object.__setattr__(alone, "continues", None)
+    assert content(alone) == content(later)[:3] != content(later)
+
+
+def test_nothing_is_reported_before_all_is_read(
+    searched: tuple[rf.Discovery, Path],
+) -> None:
+    """What it reports replaces the file that it goes on from: a second stop must not lose rounds."""
+    written = json.loads(searched[1].read_text())
+    reached: list[int] = []
+
+    def stop(line: str) -> None:
+        if getattr(line, "errors", None) is not None:
+            reached.append(len(validations))
+
+    validations: list[int] = []
+    validated = Horizons.validated
+
+    def counted(self: Horizons, *given: Any) -> Any:
+        validations.append(1)
+        return validated(self, *given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Horizons, "validated", counted)
+        rf.discover(
+            SPINDLE, *spun().split(0.7), candidates=PAIRS, rounds=1, resume=searched[1], progress=stop
+        )
+    assert reached[:2] == [len(written["stages"])] * 2

@@ -124,6 +124,16 @@ def test_programs_not_used_for_longest_leave_the_memory(
     assert traced.count(0.0) == 1
 
 
+def test_released_programs_leave_the_memory(folder: Path) -> None:
+    release_programs()
+    one, other, x = new(), new(), np.ones(2, np.float32)
+    one(1.5, x)
+    other(1.5, x)
+    one.release_programs()
+    assert (len(one), len(other)) == (0, 1)
+    assert [held.place for held in persistent_jit._recent] == [other._held]
+
+
 @pytest.mark.parametrize("damage", ["cut", "a bit", "empty", "something else"])
 def test_a_damaged_file_is_replaced(folder: Path, damage: str) -> None:
     x = np.arange(3, dtype=np.float32)

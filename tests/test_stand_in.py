@@ -92,3 +92,13 @@ def test_sensor_faults_of_an_impossible_size_are_not_physical():
         for name in names:
             low, high = specifications(fault(at="theta"))[name].physical
             assert -0.14 < low < -0.02 < 0.02 < high < 0.14
+
+
+def test_a_window_that_diverges_says_nothing(same):
+    """The others do: the numbers are those of the windows that are left."""
+    at, h = same
+    x0 = h.x0.copy()
+    x0[0, 0] = np.nan
+    sizes = window_sizes(at, dataclasses.replace(h, x0=x0), [HUB])[HUB]
+    assert sizes.scatter < SCATTER / 3 and sizes.change > 2 * LEAST_CHANGE
+    assert window_sizes(at, dataclasses.replace(h, x0=np.full_like(x0, np.nan)), [HUB]) == {}

@@ -12,7 +12,7 @@ from rotflex_jax.basis import Basis, Delays, Volterra
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.series import Series
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import listed
+from rotflex_jax.recording.listing import single
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def identify(
     Raises:
         InputError: no such channel, or a basis that is not the one that the filter is made for.
     """
-    (recording,) = listed(recording, "recording")
+    recording = single(recording, "recording")
     y, n = recording.channel(channel), recording.n_init
     if filter.from_input:
         done = run(filter, _own_input(filter, basis, recording)[n:], y[n:], keep_every=keep_every)

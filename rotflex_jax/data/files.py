@@ -31,7 +31,7 @@ from rotflex_jax.data.tables import (
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import listed
+from rotflex_jax.recording.listing import single
 from rotflex_jax.recording.quality import Finding, acceptable, whole_numbers
 from rotflex_jax.recording.samples import even_spacing, finite, real_numbers, sampling_period
 from rotflex_jax.text.files import write_file
@@ -449,7 +449,7 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     Raises:
         InputError: it cannot be written; an old file stays.
     """
-    (recording,) = listed(recording, "recording")
+    recording = single(recording, "recording")
     header = ",".join(["t", recording.input_name, *recording.channels])
     columns = np.column_stack([recording.t, recording.u, recording.y])
     # 17 digits carry a number exactly; the time is known to fewer.

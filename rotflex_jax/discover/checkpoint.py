@@ -1,6 +1,7 @@
 """The models that a search has reached, as plain JSON; a search that was stopped goes on from them."""
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,6 +71,9 @@ def _check(problem: LikelihoodProblem, h: Hypothesis) -> None:
     if not set(h.locations) <= {*s.candidates, *s.calibrations} or sorted((*h.free, *h.local)) != sorted(
         (*s.baseline_free, *on)
     ):
+        raise ValueError(h)
+    intensities = h.process_noise.values()
+    if not set(h.process_noise) <= set(problem.ports) or not all(0 <= q < math.inf for q in intensities):
         raise ValueError(h)
     states = len(s.active(s.gates(h.locations)).states)
     expected = {

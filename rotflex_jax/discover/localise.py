@@ -14,7 +14,7 @@ from rotflex_jax.fit.inference import correlation_length
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import listed
+from rotflex_jax.recording.listing import single
 from rotflex_jax.text.numbers import as_read
 
 TIME_SEGMENTS = 20
@@ -232,7 +232,7 @@ def locate(
     Source: Westfall and Young 1993 (largest statistic over several); Lo 1991 (time); Benjamini and
         Hochberg 1995.
     """
-    (recording,) = listed(recording, "recording")
+    recording = single(recording, "recording")
     if window_seconds is not None:
         positive(window_seconds, "window_seconds")
     e = np.asarray(residual, dtype=float)

@@ -124,6 +124,8 @@ class Probabilities:
         named = [s for s in self.sets[:3] if s.probability >= LEAST_NAMED] or [self.sets[0]]
         first, *others = (f"{set_label(s.effects)} {percent(s.probability)}" for s in named)
         rest = f"; then {', '.join(others)}" if others else ""
+        if len(self.sets) == 1:
+            return f"One set of effects was fitted: {first}; another one {percent(self.elsewhere)}."
         return (
             f"Most probable of the {len(self.sets)} sets of effects that were fitted: {first}{rest}; "
             f"none of these {percent(self.elsewhere)}."

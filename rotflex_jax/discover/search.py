@@ -118,9 +118,10 @@ class SearchState:
         tried: Models fitted and validated at both horizons on the way.
         alternatives: Models fitted and validated at the reported horizon beside the final one.
         merged: The final model with one effect in the place of several, where it has one.
+        in_place_of: That effect -> the one of several whose place in the order it took.
         machine: Calibrations that belong to the machine.
         tests: Score tests of the current model, of predictions and of free runs.
-        resumed: How many of the effects an earlier search has added, which was stopped.
+        resumed: After how many rounds of a search that was stopped this one went on.
         digest: Of all that the models depend on.
     """
 
@@ -145,6 +146,7 @@ class SearchState:
     tried: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
     alternatives: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
     merged: ValidatedHypothesis | None = None
+    in_place_of: dict[EffectLocation, EffectLocation] = dataclasses.field(default_factory=dict)
     machine: list[EffectLocation] = dataclasses.field(default_factory=list)
     tests: tuple[ScoreTest, ScoreTest] | None = None
 
@@ -233,7 +235,7 @@ def discover(
         test: Recordings that have no say in anything; the errors on them are reported beside.
         candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
             answer to those of the flexible joint (`mechanism.roles`).
-        rounds: Most effects to add.
+        rounds: Most effects to add; two that are added together count as two.
         window_seconds: Length of short free runs [s].
         calibrate_seconds: The errors reported as calibrated allow each recording that no fit saw the offsets
             that its own first seconds give [s]; 0 for none.
@@ -360,25 +362,22 @@ def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, pat
     """What a search that was stopped had found, validated again."""
     stages = read_stages(path, digest)
     say(f"going on after {len(stages) - 1} finished rounds")
-    state = None
+    # All of them before any is reported: what is reported is what a file of rounds so far keeps.
+    found: list[ValidatedHypothesis] = []
     for stage in stages:
         try:
             h = restored(horizons.prediction.problem, stage.prediction)
             runs = restored(horizons.free_run.problem, stage.free_run)
         except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError):
             raise not_kept(path) from None
-        before = state.current if state else None
-        found = horizons.validated(h, runs, before)
-        if state is None:
-            state = SearchState(
-                model, horizons, say, found, digest, len(stages) - 1, passed=[found], tried=[found]
-            )
-            state.reached("as it is")
-            if len(stages) > 1:
-                _rank(state)
-        else:
-            _add(state, found, stage.added)
-    assert state
+        found.append(horizons.validated(h, runs, found[-1] if found else None))
+    first, *later = found
+    state = SearchState(model, horizons, say, first, digest, len(later), passed=[first], tried=[first])
+    if later:
+        _rank(state)
+    state.reached("as it is")
+    for reached, stage in zip(later, stages[1:], strict=True):
+        _add(state, reached, stage.added)
     return state
 
 
@@ -512,6 +511,7 @@ def _simplify(state: SearchState) -> None:
         final, notes = one.final, (*notes, one.note)
         state.scores[one.effect] = state.scores[one.simpler]
         state.gains[one.effect] = state.gains[one.simpler]
+        state.in_place_of[one.effect] = one.simpler
         order = [one.effect if p == one.simpler else p for p in order if p not in one.replaced[1:]]
         state.merged = one.validated
         rivals[one.effect] = [*rivals.get(one.simpler, []), *(one.replaced if one.same_count else ())]
@@ -615,7 +615,10 @@ def _resumed(count: int) -> tuple[str, ...]:
     if not count:
         return ()
     found = "one round" if count == 1 else f"{count} rounds"
-    return (f"The search went on after {found} of one that was stopped; the time is that of the rest.",)
+    return (
+        f"The search went on after {found} of one that was stopped; the time, and the sets of effects that "
+        "have a probability, are those of the rest.",
+    )
 
 
 def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stage:
@@ -672,7 +675,9 @@ def _rounds(
 def _stand_ins(state: SearchState) -> dict[EffectLocation, tuple[str, ...]]:
     """Signs that effects stand in for something else, of the final model at both horizons."""
     gains = {p: at.gain + at.training_gain for p, (at, _) in state.gains.items()}
-    return signs((state.horizons.prediction, state.horizons.free_run), state.current, gains)
+    found = signs((state.horizons.prediction, state.horizons.free_run), state.current, gains)
+    # One effect in the place of several has the signs of the one whose place in the order it took.
+    return found | {new: found[old] for new, old in state.in_place_of.items() if old in found}
 
 
 def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: Stage, before: Stage) -> float:

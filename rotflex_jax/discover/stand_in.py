@@ -52,7 +52,7 @@ def window_sizes(
 
     Args:
         problem: Free runs over the recordings.
-        h: Fitted to them, or to others.
+        h: Fitted to them, or to others. Windows in which its run diverges say nothing.
         locations: Effects of `h`; those without an amplitude, and those with values for each recording, are
             left out.
     """
@@ -75,7 +75,10 @@ def window_sizes(
             for _, samples in problem.windows.of(r):
                 slopes = W[moved, r, samples].reshape(len(own), -1) / derivative[own, None]
                 rows = np.concatenate([slopes, w[None, r, samples].reshape(1, -1)])
-                rows = _without(rows, W[beside, r, samples].reshape(len(beside), -1))
+                others = W[beside, r, samples].reshape(len(beside), -1)
+                if not (np.isfinite(rows).all() and np.isfinite(others).all()):
+                    continue  # the run diverges in this window
+                rows = _without(rows, others)
                 slopes, left = rows[:-1], rows[-1]
                 step = np.linalg.lstsq(slopes.T, left, rcond=1e-6)[0]
                 totals += [np.sum((x @ slopes) ** 2) for x in (step, values[own])] + [0.0]

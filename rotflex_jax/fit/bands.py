@@ -27,7 +27,7 @@ from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.linear import inverse_mass, output_units, process_covariance
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed, single
 from rotflex_jax.runtime.xla import double_precision
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import plain_number, readable
@@ -84,7 +84,7 @@ class Bands:
         Raises:
             InputError: A recording of another length, or without a channel.
         """
-        (recording,) = listed(self.recording if recording is None else recording, "recording")
+        recording = single(self.recording if recording is None else recording, "recording")
         missing = [c for c in self.channels if c not in recording.channels]
         if missing or len(self.middle) != recording.N:
             what = f"lacks the channel {missing[0]!r}" if missing else f"has {recording.N} samples"
@@ -189,7 +189,7 @@ def prediction_bands(
     """
     level = checks.number(level, "level", above=0, below=1, example="0.9")
     models = _weighted(fitted)
-    (recording,) = listed(recording, "recording", shortest=SHORTEST_TO_FIT)
+    recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
     others = list(listed(known, "known", shortest=SHORTEST_TO_FIT)) if _any(known) else []
     quantile = float(scipy.stats.norm.ppf((1 + level) / 2))
     runs, variances, weights = [], [], []
@@ -197,8 +197,6 @@ def prediction_bands(
         y_hat, parts = _run(one, recording)
         lacks = _lacking(one, others, quantile, level, parts["sensor"][0])
         parts["what the model lacks"] = np.broadcast_to(lacks, y_hat.shape)
-        if not np.isfinite(y_hat).all():
-            raise InputError("The model diverges over this recording, so that it has no bands; fit it first.")
         runs.append(y_hat)
         variances.append(parts)
         weights.append(weight)
@@ -263,6 +261,11 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
     y = model.measured(recording).astype(float)
     start = model.states_at(recording, np.array([0]))
     y_hat, J = _slopes(model, m, recording, start, free)
+    if not (np.isfinite(y_hat).all() and np.isfinite(J).all()):
+        raise InputError(
+            "The model diverges over a recording, so that it has no bands; fit it first, or leave the "
+            "recording out."
+        )
     noise = sensor_noise([recording], model)
     known = np.array([n in recording.constants for n in fitted.free_names], bool)
     J[..., : len(free)][..., known] = 0.0

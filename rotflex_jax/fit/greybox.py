@@ -685,7 +685,7 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
         recordings: Those that were fitted.
 
     Raises:
-        InputError: Other recordings, where each has parameters of its own.
+        InputError: Another number of recordings, where each has parameters of its own.
     """
     asked, m = fitted.options, fitted.model.mechanism
     own = fitted.local.values()

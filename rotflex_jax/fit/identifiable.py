@@ -31,7 +31,7 @@ from rotflex_jax.mechanism.mechanism import ROTOR
 from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.recording.listing import SHORTEST_TO_FIT, single
 from rotflex_jax.runtime.xla import double_precision
 from rotflex_jax.text.markup import bullets, card, paragraph
 
@@ -224,7 +224,7 @@ def identifiable(mechanism: Mechanism | Model | Fit, recording: Recording | None
     fitted = mechanism if isinstance(mechanism, Fit) else None
     model = fitted.model if fitted else Model.of(mechanism)  # type: ignore[arg-type]
     if recording is not None:
-        (recording,) = listed(recording, "recording", shortest=SHORTEST_TO_FIT)
+        recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
         model = model.at(recording)
     m = model.mechanism
     if not m.free_names:

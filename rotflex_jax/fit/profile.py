@@ -8,6 +8,7 @@ whatever the width: given its own `g`, nothing lowers the cost. Every point goes
 of the fit, with the numbers of its neighbour as a start.
 """
 
+import contextlib
 import dataclasses
 import itertools
 from collections import deque
@@ -22,9 +23,10 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import FitAttempt, FitPoint, FitStage, GreyBoxProblem, problem_of, report
 from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE
 from rotflex_jax.fit.problem import LikelihoodEquations
-from rotflex_jax.fit.profile_result import Profile, Quantity
+from rotflex_jax.fit.profile_result import LEAST_LEVEL, Profile, Quantity
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.fit.windows import Windows
+from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
@@ -49,11 +51,13 @@ NEAR = 1e-3
 REMEMBERED = 6
 # Step of a difference quotient in the coordinates of a fit.
 STEP = 1e-5
+# The sign of a function is looked at for so many parameters, about so far from the fit in its coordinates.
+DRAWS, AWAY = 100, 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Along:
-    """A quantity of a fit, and the coordinate along which a profile walks: its logarithm if it is positive.
+    """A quantity of a fit, and the coordinate along which a profile walks: its logarithm if always positive.
 
     Attributes:
         name: For people.
@@ -116,7 +120,7 @@ class Along:
             )
         name = getattr(of, "__name__", "quantity")
         name = "quantity" if name == "<lambda>" else name
-        positive = value > 0
+        positive = value > 0 and _stays_positive(of, m, fitted.free_names)
         return cls(name, "", of, (0.0 if positive else -np.inf, np.inf), positive)
 
     def walked(self, value: float) -> float:
@@ -252,7 +256,7 @@ class Walk:
                 target = float(np.clip(target, (at + 3 * low) / 4, (at + 3 * high) / 4))
             further = self.held(target, here.point)
             moved = way * (self.along.walked(further.value) - at)
-            if not np.isfinite(further.cost) or moved < STUCK * abs(target - at):
+            if not np.isfinite(further.cost) or moved <= STUCK * abs(target - at):
                 break
             found.append(further)
             if self.root(further) > BEYOND_LEVEL * goal:
@@ -310,13 +314,15 @@ def profile(
         recordings: Those that were fitted.
         of: Full name of a free parameter, or a function that receives the values of all parameters by full
             name and gives a number: `lambda p: p["hub.coulomb.level"] / p["joint.spring.stiffness"]`.
-        level: Up to which confidence level the profile reaches.
+        level: Up to which confidence level the profile reaches; never less than 0.95, by which its shape is
+            told.
 
     Returns:
         Profile with `interval(level)`, `shape`, `wald` and a figure.
 
     Raises:
-        InputError: No such parameter, a function that gives no number, or other recordings than were fitted.
+        InputError: No such parameter, a function that gives no number, or another number of recordings than
+            were fitted where each has parameters of its own.
 
     Source: S. A. Murphy and A. W. van der Vaart, J. Am. Stat. Assoc. 95, 2000; A. Raue et al., Bioinformatics
     25, 2009; the factor: R. E. Chandler and S. Bate, Biometrika 94, 2007.
@@ -325,7 +331,7 @@ def profile(
         raise InputError(
             f"A fit is needed, but {checks.shown(fitted)} was given; give what rotflex_jax.fit gives."
         )
-    level = checks.number(level, "level", above=0, below=1, example="0.95")
+    level = max(checks.number(level, "level", above=0, below=1, example="0.95"), LEAST_LEVEL)
     given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
     along = Along.of(of, fitted)
     with double_precision():
@@ -348,7 +354,21 @@ def profile(
         nuisances=np.array([p.values for p in points]),
         parameter_names=fitted.model.mechanism.parameter_names,
         gained=walk.middle.cost - least.cost,
+        level=level,
     )
+
+
+def _stays_positive(of: Callable[[Mapping[str, float]], float], m: Mechanism, free: Sequence[str]) -> bool:
+    """Whether a function is positive at random parameters, as a ratio is and a difference is not."""
+    rng, transform = np.random.default_rng(0), Transform.of(m.parameter_specifications)
+    z, moves = transform.unconstrain(m.values), np.isin(m.parameter_names, free)
+    for _ in range(DRAWS):
+        values = transform.physical(np.where(moves, z + AWAY * rng.standard_normal(len(z)), z))[0]
+        # Where it fails, the parameters are outside of what it is for.
+        with contextlib.suppress(TypeError, ValueError, ArithmeticError), np.errstate(all="ignore"):
+            if of(dict(zip(m.parameter_names, values.tolist(), strict=True))) <= 0:
+                return False
+    return True
 
 
 def _distinct(values: list[float]) -> list[bool]:

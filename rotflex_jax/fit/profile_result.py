@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Float
 
 from rotflex_jax import checks
+from rotflex_jax.errors import InputError
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import as_read, digits, plain_number, readable, unit_text
 
@@ -22,6 +23,8 @@ Quantity = str | Callable[[Mapping[str, float]], float]
 # A Wald interval is poor where an end of it lies at another level: its root of the likelihood ratio is off
 # 1.96 by more than this share. 0.15 is 90 or 97.6 % at one end in place of 95 %.
 POOR = 0.15
+# Every profile reaches this level: shape and sentence are those of its interval.
+LEAST_LEVEL = 0.95
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,6 +48,7 @@ class Profile:
         nuisances: Values of all parameters at each value.
         parameter_names: Their full names.
         gained: By how much the least cost is below that of the fit [nat]; zero if the fit was the least.
+        level: Confidence level up to which points were placed.
     """
 
     name: str
@@ -58,6 +62,7 @@ class Profile:
     nuisances: Float[np.ndarray, "K P"]
     parameter_names: tuple[str, ...]
     gained: float = 0.0
+    level: float = LEAST_LEVEL
 
     @property
     def wald(self) -> tuple[float, float]:
@@ -81,8 +86,20 @@ class Profile:
         return scipy.interpolate.PchipInterpolator(self.values, self.root, extrapolate=False)(values)
 
     def regions(self, level: float = 0.95) -> list[tuple[float, float]]:
-        """All values that are not excluded, as intervals; an open end is an end of `limits`."""
+        """All values that are not excluded, as intervals; an open end is an end of `limits`.
+
+        Args:
+            level: Confidence level, at most that of the profile.
+
+        Raises:
+            InputError: A level that is not between 0 and 1, or above that of the profile.
+        """
         level = checks.number(level, "level", above=0, below=1, example="0.95")
+        if level > self.level:
+            raise InputError(
+                f"An interval of level {level:g} was asked for, but the profile reaches {self.level:g}; make "
+                f"it with level={level:g}."
+            )
         most = math.sqrt(scipy.stats.chi2.ppf(level, 1))
         excess = np.abs(self.root) - most
         inside = excess <= 0
@@ -99,10 +116,10 @@ class Profile:
         """From the least to the largest value that is not excluded; `regions` has the gaps between.
 
         Args:
-            level: Confidence level; profiles reach a little beyond 0.95 unless asked for more.
+            level: Confidence level, at most that of the profile.
 
         Raises:
-            InputError: A level that is not between 0 and 1.
+            InputError: A level that is not between 0 and 1, or above that of the profile.
         """
         found = self.regions(level)
         return found[0][0], found[-1][1]

@@ -256,7 +256,7 @@ class LatentTorque:
                 said.append(
                     f"The torque at the {port} has a sine of {line.frequency:.3g} Hz that the input has not: "
                     f"amplitude {line.amplitude:.3g} {self.effort} [{low:.3g}, {high:.3g}], a periodic "
-                    f"disturbance (chance of none {line.p_value:.0e})."
+                    f"disturbance unless a controller closes a loop (chance of none {line.p_value:.0e})."
                 )
             if slow := self.drift(port):
                 way = "rises" if slow.change > 0 else "falls"

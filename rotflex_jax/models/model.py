@@ -22,7 +22,7 @@ from rotflex_jax.mechanism.simulate import first_state
 from rotflex_jax.mechanism.validation import process_noise_of
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import listed
+from rotflex_jax.recording.listing import single
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -121,7 +121,7 @@ class Model:
 
     def measured(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """The channels of a recording that the mechanism has as outputs, in its order."""
-        (recording,) = listed(recording, "recording")
+        recording = single(recording, "recording")
         missing = [c for c in self.mechanism.channels if c not in recording.channels]
         if missing:
             raise InputError(
@@ -202,7 +202,7 @@ class Model:
             recording: Its voltage drives the model.
             x0: First positions and speeds, where they are known.
         """
-        (recording,) = listed(recording, "recording")
+        recording = single(recording, "recording")
         if x0 is None:
             return self._run(recording, self._start(recording))[1]
         start = first_state(rest_state(self.mechanism.structure, np.float64), x0)

@@ -13,7 +13,9 @@ def content(recording: Recording) -> tuple[bytes, ...]:
     labels = (r.Ts, r.channels, r.units, r.input_name, r.input_unit)
     labels = (*labels, r.n_init, r.start, r.accept, sorted(r.resolution.items()))
     labels = (*labels, sorted(r.constants.items()))
-    return (repr(labels).encode(), *(np.ascontiguousarray(a).tobytes() for a in (r.u, r.y)))
+    own = (repr(labels).encode(), *(np.ascontiguousarray(a).tobytes() for a in (r.u, r.y)))
+    # States that no sensor measures start where a run over the recording before ends.
+    return own if r.continues is None else (*own, *content(r.continues))
 
 
 def digest_of(*parts: bytes) -> str:

@@ -53,3 +53,22 @@ read a file with rotflex_jax.load.
                 "the motion from the noise of the sensors; give a longer one."
             )
     return found
+
+
+def single(recording: Any, name: str = "recording", shortest: int = 1) -> Recording:
+    """The one recording that was given, alone or in a list.
+
+    Args:
+        recording: What was given.
+        name: Of the argument.
+        shortest: Samples that it must have.
+
+    Raises:
+        InputError: None or several, anything else, or one that is too short.
+    """
+    found = listed(recording, name, shortest)
+    if len(found) != 1:
+        raise InputError(
+            f"{len(found)} recordings were given as `{name}`, but one is needed; give one at a time."
+        )
+    return found[0]

@@ -139,6 +139,9 @@ class PersistentJit:
 
     def release_programs(self) -> None:
         """Let go of the programs in memory."""
+        with _recent_lock:
+            for held in list(self._held.values()):
+                _recent.pop(held, None)
         self._held.clear()
 
     def _made(
@@ -314,7 +317,8 @@ def _used(held: _Held) -> None:
             return
         released = [_recent.popitem(last=False)[0] for _ in range(len(_recent) - LEFT_HELD)]
     for old in released:
-        old.place.pop(old.key, None)
+        if old.place.get(old.key) is old:  # and not one that another thread has made at the same time
+            old.place.pop(old.key, None)
     del released
     _return_memory()
 
