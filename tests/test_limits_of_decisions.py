@@ -143,8 +143,19 @@ def test_runs_are_clearly_better_by_a_hundredth(side: float) -> None:
     assert runs_clearly_better(a, b) is (side > 1)
 
 
+def not_quite_sure(z: float, **changes: float) -> dict[str, float]:
+    """Predictions whose leads on validation and on training data have this z."""
+    return PLENTY | {"scatter": scatter_for(z, PLENTY["held_out"])} | changes
+
+
 @SIDES
 def test_uncertain_free_runs_are_enough_where_predictions_run_a_tenth_better(side: float) -> None:
-    sure_predictions = PLENTY | {"windows": 10.0 * np.exp(-0.1 * side)}
-    found = at_both(sure_predictions, {"windows": 10.0}, COULOMB)
+    predictions = not_quite_sure(3.0, windows=10.0 * np.exp(-0.1 * side))
+    found = at_both(predictions, {"windows": 10.0}, COULOMB)
+    assert admissible(found, FAR, DATA, NOISE) is (side > 1)
+
+
+@SIDES
+def test_or_where_predictions_are_three_and_a_half_deviations_sure(side: float) -> None:
+    found = at_both(not_quite_sure(3.5 * side, windows=10.0 * np.exp(-0.05)), {"windows": 10.0}, COULOMB)
     assert admissible(found, FAR, DATA, NOISE) is (side > 1)

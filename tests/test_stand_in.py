@@ -1,16 +1,20 @@
 """Signs that an effect stands in for something else: sizes by window, changes of free runs, nats left."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
 from small_problem import HUB, NOISE, problem, recordings, records, start, supermodel
 
+from rotflex_jax.discover import search
 from rotflex_jax.discover.horizon import SearchHorizon
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_effect
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import levenberg_marquardt
+from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.stand_in import LEAST_CHANGE, SCATTER, nats_above_noise, signs, window_sizes
+from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet
 from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder
 from rotflex_jax.parameters import specifications
@@ -102,3 +106,18 @@ def test_a_window_that_diverges_says_nothing(same):
     sizes = window_sizes(at, dataclasses.replace(h, x0=x0), [HUB])[HUB]
     assert sizes.scatter < SCATTER / 3 and sizes.change > 2 * LEAST_CHANGE
     assert window_sizes(at, dataclasses.replace(h, x0=np.full_like(x0, np.nan)), [HUB]) == {}
+
+
+def test_one_effect_in_the_place_of_several_has_the_signs_of_its_part(monkeypatch: pytest.MonkeyPatch):
+    """A merged effect stands in no fit at both horizons, so it answers for the part that it took over."""
+    merged = EffectLocation("coulomb_asymmetric", "hub")
+    state = types.SimpleNamespace(
+        gains={HUB: (HorizonGain(1.0, 2.0, 0.5, 3.0), None), merged: (HorizonGain(1.0, 2.0, 0.5, 3.0), None)},
+        horizons=types.SimpleNamespace(prediction=None, free_run=None),
+        current=None,
+        in_place_of={merged: HUB},
+    )
+    asked = {}
+    monkeypatch.setattr(search, "signs", lambda *a: asked.update(gains=a[2]) or {HUB: ("it is small",)})
+    assert search._stand_ins(state)[merged] == ("it is small",)
+    assert asked["gains"][HUB] == 4.0

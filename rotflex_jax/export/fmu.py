@@ -24,6 +24,7 @@ from rotflex_jax.export.mjcf import machine_name, safe_identifier
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.models.model import Model
+from rotflex_jax.text.files import write_file
 from rotflex_jax.text.plain import one_line
 
 # Bytes of the archive depend on nothing but the model.
@@ -165,8 +166,8 @@ def _compiled(identifier: str, header: str, wrapper: str) -> bytes | None:
         return None
     with tempfile.TemporaryDirectory() as folder:
         # Names without the folder: the library does not depend on where it was made.
-        Path(folder, "model.h").write_text(header)
-        Path(folder, "fmi3_model.c").write_text(wrapper)
+        write_file(Path(folder, "model.h"), header)
+        write_file(Path(folder, "fmi3_model.c"), wrapper)
         command = [compiler, "-std=c99", "-shared", "-fPIC", "-O2", "-o", "model.so", "fmi3_model.c", "-lm"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
