@@ -63,7 +63,10 @@ nitpick_ignore_regex = [
     ("py:.*", r"(numpy|jax|jaxlib|jaxtyping|collections|pathlib|os|rich|matplotlib|typing|pandas)\b.*"),
     ("py:.*", r"ndarray|Figure|Minimiser|EffectClass|EffectType|.*\.Effect(Class|Type)|dict.*|tuple.*"),
     ("py:class", r"'[A-Za-z0-9_*. -]*'?|[A-Z]( [A-Z])*"),  # sizes of arrays
+    ("py:class", r"_Buffer|_SupportsArray|_NestedSequence"),  # what NumPy takes for an array
     # Small types of results, told where they are used.
-    ("py:class", r"rotflex_jax\.discover\.\w+\.(Assessment|HorizonGain|ModelTests|RunErrors)"),
+    ("py:class", r"rotflex_jax\.discover\.\w+\.(Assessment|ConditionalInterval|HorizonGain)"),
+    ("py:class", r"rotflex_jax\.discover\.\w+\.(ModelTests|RunErrors)"),
+    ("py:class", r"rotflex_jax\.latent\.\w+\.(Drift|PeriodicTorque)"),
     ("py:class", r"rotflex_jax\.(fit|mechanism|runtime)\.\w+\.(LoadRows|Performance|Remark)"),
 ]

@@ -44,7 +44,7 @@ class ControlAssessment:
 
     @property
     def broken(self) -> dict[str, str]:
-        """The models that the controller does not hold: name -> what happens."""
+        """What happens to the models that the controller does not hold, by name."""
         found = {}
         for name, run in self.runs.items():
             if not run.bounded:

@@ -85,7 +85,7 @@ class Controller:
 
     @property
     def input_name(self) -> str:
-        """What it gives: the `voltage` of a motor, another `input` such as a goal or a current."""
+        """What it gives, the `voltage` of a motor or another `input` such as a goal or a current."""
         return "voltage" if self.model.mechanism.units.input == "V" else "input"
 
     @functools.cached_property

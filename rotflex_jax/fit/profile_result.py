@@ -135,7 +135,7 @@ class Profile:
 
     @property
     def wald_is_poor(self) -> bool:
-        """Whether the parabola misleads: at an end of Wald's interval the profile is at another level."""
+        """Whether the parabola misleads, the profile being at another level at an end of Wald's interval."""
         if not math.isfinite(self.std) or self.shape != "closed":
             return True
         at = self.root_at(np.array(self.wald))
