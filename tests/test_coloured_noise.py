@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy
-from test_resume import PAIRS, SPINDLE, spun
+from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.discover.coloured_noise import advice, coloured_noise

@@ -4,11 +4,11 @@ import dataclasses
 import json
 
 import pytest
-from test_resume import PAIRS, SPINDLE, spun
+from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.discover import search
-from rotflex_jax.discover.conditional import HALF_WIDTH, conditional_note, excluding
+from rotflex_jax.discover.conditional import conditional_note, excluding
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.parameters import Estimate, Specification
 
@@ -24,7 +24,7 @@ def test_intervals_exclude_each_other_where_they_have_nothing_in_common(
     apart: float, excluded: bool, way: int
 ) -> None:
     a = inertia(0.02, 1e-4)
-    b = inertia(0.02 + way * apart * HALF_WIDTH * 4e-4, 3e-4)
+    b = inertia(0.02 + way * apart * 1.96 * 4e-4, 3e-4)
     found = excluding([a], [b])
     assert bool(found) is excluded
     assert (max(a.ci95[0], b.ci95[0]) > min(a.ci95[1], b.ci95[1])) is excluded

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from spindle import SPINDLE, spun
 from turntable import FOR_THE_NOTEBOOK, Truth, record, write
 
 import rotflex_jax as rf
@@ -202,40 +203,11 @@ def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
     assert np.prod([errors[1] / errors[0] for errors in shown]) < 1
 
 
-SPINDLE = rf.Mechanism(
-    coordinates=["phi"],
-    ports={"shaft": (1,)},
-    effects=[
-        Motor("shaft", torque_constant=0.05, back_emf=0.05, resistance=2.0, gear_ratio=1.0, efficiency=1.0),
-        Inertia(at="shaft", inertia=0.017),
-        Viscous(at="shaft"),
-    ],
-    outputs={"tacho": ("shaft", "speed")},
-    trusted=[f"shaft.motor.{name}" for name in MOTOR],
-)
-
-
-def spun(level: float = 0.03, seed: int = 1) -> rf.Recording:
-    """An inertia of 0.02 kg m^2 with friction that sticks, its speed alone; Euler steps of 0.2 ms."""
-    rng, Ts, N, inner = np.random.default_rng(seed), 0.004, 3000, 20
-    waves = zip([2.5, 2.0, 1.5, 1.0], [0.23, 0.61, 1.37, 2.9], rng.uniform(0, 6, 4), strict=True)
-    u = sum(a * np.sin(2 * np.pi * f * Ts * np.arange(N) + p) for a, f, p in waves)
-    speed, h, w = np.empty(N), Ts / inner, 0.0
-    for k in range(N):
-        speed[k] = w
-        for _ in range(inner):
-            free = w + h * (0.05 * (u[k] - 0.05 * w) / 2.0 - 0.01 * w) / 0.02
-            held = h * level / 0.02
-            w = 0.0 if abs(free) <= held else free - np.sign(free) * held
-    y = speed + 0.01 * rng.standard_normal(N)
-    return rf.Recording(u=u, y=y, Ts=Ts, channels="tacho", units="rad/s", accept="units")
-
-
 @pytest.mark.slow
 def test_a_machine_of_which_only_speeds_are_measured(tmp_path):
     """No sensor tells where it stands, and so no recording has anything to say about that."""
     pairs = [(CATALOG[name], "shaft") for name in ("coulomb", "quadratic_drag", "cogging")]
-    result = rf.discover(SPINDLE, *spun().split(0.7), candidates=pairs)
+    result = rf.discover(SPINDLE, *spun(3000, inner=20).split(0.7), candidates=pairs)
     assert result.verdict == "found"
     (turn,) = result.rounds
     assert (turn.effect, turn.port) == ("coulomb", "shaft")

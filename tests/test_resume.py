@@ -6,46 +6,15 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.cli import main
 from rotflex_jax.cli.rounds_so_far import RoundsSoFar
 from rotflex_jax.discover.horizon import Horizons
-from rotflex_jax.effects import CATALOG, Inertia, Motor, Viscous
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.digest import content
-
-MOTOR = ("torque_constant", "back_emf", "resistance", "gear_ratio", "efficiency")
-SPINDLE = rf.Mechanism(
-    coordinates=["phi"],
-    ports={"shaft": (1,)},
-    effects=[
-        Motor("shaft", torque_constant=0.05, back_emf=0.05, resistance=2.0, gear_ratio=1.0, efficiency=1.0),
-        Inertia(at="shaft", inertia=0.017),
-        Viscous(at="shaft"),
-    ],
-    outputs={"tacho": ("shaft", "speed")},
-    trusted=[f"shaft.motor.{name}" for name in MOTOR],
-)
-PAIRS = [(CATALOG[name], "shaft") for name in ("coulomb", "quadratic_drag")]
-
-
-def spun(N: int = 1500, seed: int = 1) -> rf.Recording:
-    """An inertia of 0.02 kg m^2 with friction that sticks, its speed alone; Euler steps of 0.4 ms."""
-    rng, Ts, inner, level = np.random.default_rng(seed), 0.004, 10, 0.03
-    waves = zip([2.5, 2.0, 1.5, 1.0], [0.23, 0.61, 1.37, 2.9], rng.uniform(0, 6, 4), strict=True)
-    u = sum(a * np.sin(2 * np.pi * f * Ts * np.arange(N) + p) for a, f, p in waves)
-    speed, h, w = np.empty(N), Ts / inner, 0.0
-    for k in range(N):
-        speed[k] = w
-        for _ in range(inner):
-            free = w + h * (0.05 * (u[k] - 0.05 * w) / 2.0 - 0.01 * w) / 0.02
-            held = h * level / 0.02
-            w = 0.0 if abs(free) <= held else free - np.sign(free) * held
-    y = speed + 0.01 * rng.standard_normal(N)
-    return rf.Recording(u=u, y=y, Ts=Ts, channels="tacho", units="rad/s", accept="units")
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from test_resume import PAIRS, SPINDLE, spun
+from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.discover import search

@@ -51,13 +51,12 @@ def restored(problem: LikelihoodProblem, written: Mapping[str, Any]) -> Hypothes
     """The hypothesis that was written, with the whitener and the likelihood that its innovations give."""
     locations = tuple(EffectLocation(*map(str, p)) for p in written["locations"])
     numbers = {name: np.array(written[name], float) for name in _NUMBERS}
-    noise = problem.noise
     h = Hypothesis(
         locations=locations,
         free=tuple(map(int, written["free"])),
         local=tuple(map(int, written["local"])),
         process_noise={str(p): float(q) for p, q in written["process_noise"].items()},
-        whitener=Whitener(np.ones((len(noise), 1)), np.diag(1 / noise)),
+        whitener=Whitener.of_noise(problem.noise),
         **numbers,
     )
     _check(problem, h)

@@ -1,13 +1,9 @@
 """Whether predictions and free runs give a parameter the same value within its intervals."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rotflex_jax.parameters import Estimate
-
-# Standard deviations from an estimate to an end of its 95 % interval.
-HALF_WIDTH = 1.96
 
 
 class ConditionalInterval(NamedTuple):
@@ -49,8 +45,7 @@ def excluding(
         b = other.get(a.name)
         if b is None or not (a.free and b.free):
             continue
-        reach = HALF_WIDTH * (a.std + b.std)
-        if math.isfinite(reach) and abs(a.value - b.value) > reach:
+        if max(a.ci95[0], b.ci95[0]) > min(a.ci95[1], b.ci95[1]):
             found.append(ConditionalInterval(a, b))
     return tuple(found)
 

@@ -196,7 +196,7 @@ class LikelihoodProblem:
     def evaluated(self, h: Hypothesis, e: Float[np.ndarray, "R N C"]) -> Hypothesis:
         """The hypothesis with the whitener and the likelihood that its innovations give."""
         if self._diverges(e):
-            scale = Whitener(np.ones((len(self.noise), 1)), np.diag(1 / self.noise))
+            scale = Whitener.of_noise(self.noise)
             blocks = np.full_like(in_blocks(self.seen, self.dataset.data), DIVERGED)
             return dataclasses.replace(h, whitener=scale, densities=np.array(-np.inf), blocks=blocks)
         whitener = self.whitener(e)

@@ -13,7 +13,7 @@ import numpy as np
 
 from rotflex_jax.discover.assessment import NATS_PER_SAMPLE, NEAR_FLOOR
 from rotflex_jax.discover.evaluation import process_noise_gain
-from rotflex_jax.discover.horizon import Horizons, as_free_run
+from rotflex_jax.discover.horizon import Horizons
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -32,7 +32,7 @@ from rotflex_jax.discover.selection import (
     distinguished,
     shares_of_gain,
 )
-from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_from
+from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects import CATALOG
@@ -149,8 +149,7 @@ def find_pair(
     assert current.free_run
     grown = refit_pairs(problem, current.hypothesis, [a.starts for a, _ in pairs])
     runs = refit_pairs(runs_problem, current.free_run.hypothesis, [b.starts for _, b in pairs])
-    begun = [(i, as_free_run(runs_problem, h)) for i, h in enumerate(grown)]
-    runs = refit_from(runs_problem, runs, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
+    runs = refit_near_predictions(runs_problem, runs, grown)
     tried: dict[Pair, ValidatedHypothesis] = {}
     for h, f, (score, _) in zip(grown, runs, pairs, strict=True):
         if all(is_plausible(x, p) for x in (h, f) for p in score.locations if p in x.locations):

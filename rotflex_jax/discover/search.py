@@ -71,7 +71,7 @@ from rotflex_jax.discover.stepwise import (
     merge_effects,
     nested_models,
     refit_candidates,
-    refit_from,
+    refit_near_predictions,
     remaining_rivals,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, checked_candidates, scales
@@ -426,9 +426,7 @@ def _refit(
     ]
     problem = horizons.free_run.problem
     runs = refit_candidates(problem, current.free_run.hypothesis, informed)
-    # The cost of free runs has many local minima: one near the parameters of predictions may be better.
-    begun = [(i, as_free_run(problem, h)) for i, h in enumerate(grown)]
-    runs = refit_from(problem, runs, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
+    runs = refit_near_predictions(problem, runs, grown)
     validated = [
         dataclasses.replace(
             horizons.validated(h, f, current),

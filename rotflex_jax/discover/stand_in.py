@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from rotflex_jax.discover.horizon import SearchHorizon
 from rotflex_jax.discover.hypothesis import Hypothesis
@@ -22,6 +21,7 @@ from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.fit.coordinates import orthogonal_to
 
 # Root mean square of the change of size between windows, over the size, that an effect of the machine stays
 # below, and least root mean square that it changes free runs by, over the error that is left.
@@ -78,22 +78,14 @@ def window_sizes(
                 others = W[beside, r, samples].reshape(len(beside), -1)
                 if not (np.isfinite(rows).all() and np.isfinite(others).all()):
                     continue  # the run diverges in this window
-                rows = _without(rows, others)
+                rows = orthogonal_to(rows, others)
                 slopes, left = rows[:-1], rows[-1]
                 step = np.linalg.lstsq(slopes.T, left, rcond=1e-6)[0]
-                totals += [np.sum((x @ slopes) ** 2) for x in (step, values[own])] + [0.0]
-                totals[2] += left @ left
+                totals += [np.sum((step @ slopes) ** 2), np.sum((values[own] @ slopes) ** 2), left @ left]
         wanted, acts, rest = totals
         if acts > 0 and rest > 0:
             found[location] = WindowSizes(float(np.sqrt(wanted / acts)), float(np.sqrt(acts / rest)))
     return found
-
-
-def _without(rows: Float[np.ndarray, "K M"], others: Float[np.ndarray, "D M"]) -> Float[np.ndarray, "K M"]:
-    """Rows less their projection on the span of others."""
-    _, sizes, basis = np.linalg.svd(others, full_matrices=False)
-    basis = basis[sizes > 1e-9 * max(sizes.max(initial=0.0), 1e-300)]
-    return rows - (rows @ basis.T) @ basis
 
 
 def nats_above_noise(problem: LikelihoodProblem, h: Hypothesis) -> float:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rotflex_jax.discover.horizon import Horizons
+from rotflex_jax.discover.horizon import Horizons, as_free_run
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -53,7 +53,7 @@ def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
         x0=embed_initial_state(s, s.calibrations, first),
         K=np.zeros((R, Layout.of(s.mechanism.structure).size, C)),
         process_noise={},
-        whitener=Whitener(np.eye(1, 1).repeat(C, 0), np.diag(1 / noise)),
+        whitener=Whitener.of_noise(noise),
     )
     least, most = problem.process_noise_range
     intensities = (most, np.sqrt(least * most), least)
@@ -115,6 +115,22 @@ def refit_from(
     for (i, _), h in zip(starts, fitted, strict=True):
         best[i] = max(best[i], h, key=lambda x: x.log_likelihood)
     return best
+
+
+def refit_near_predictions(
+    problem: LikelihoodProblem, refitted: list[Hypothesis], predictions: Sequence[Hypothesis]
+) -> list[Hypothesis]:
+    """Refits to free runs, each also from the parameters that suit predictions; the likelier one is kept.
+
+    The cost of free runs has many local minima: one near the parameters of predictions may be better.
+
+    Args:
+        problem: Of free runs.
+        refitted: Fitted to them.
+        predictions: The same structures, fitted to predictions.
+    """
+    begun = [(i, as_free_run(problem, h)) for i, h in enumerate(predictions)]
+    return refit_from(problem, refitted, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
 
 
 def _best_shapes(

@@ -23,6 +23,11 @@ class Whitener:
     a: Float[np.ndarray, "C q"]
     L: Float[np.ndarray, "C C"]
 
+    @classmethod
+    def of_noise(cls, noise: Float[np.ndarray, " C"]) -> "Whitener":
+        """White errors with these standard deviations, each channel apart."""
+        return cls(np.ones((len(noise), 1)), np.diag(1 / noise))
+
     @property
     def log_det(self) -> float:
         """Logarithm of the determinant of the covariance."""

@@ -172,6 +172,15 @@ class Projection:
             _remove(left[:, r], basis)
 
 
+def orthogonal_to(
+    rows: Float[np.ndarray, "K M"], others: Float[np.ndarray, "D M"]
+) -> Float[np.ndarray, "K M"]:
+    """Rows less their projection on the span of others."""
+    left = np.array(rows, float)
+    _remove(left, _basis(others))
+    return left
+
+
 def _basis(rows: np.ndarray) -> np.ndarray:
     """Orthonormal rows (B, M) that span some signals (K, ...)."""
     flat = rows.reshape(len(rows), int(np.prod(rows.shape[1:])))
