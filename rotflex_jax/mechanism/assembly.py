@@ -31,14 +31,13 @@ def matrix_expm1(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """`exp(M) - 1` by scaling, a Taylor polynomial of degree 8, and squaring `X -> 2 X + X X`.
 
     Squaring the difference from one keeps the digits of a small step that squaring `exp` would round
-    away. A fixed number of halvings (2^-14, accurate up to a norm of a few thousand) needs no branch, so it
-    compiles fast and can be differentiated.
+    away. A fixed number of halvings (2^-14, accurate up to a norm of a few thousand) needs no branch, and
+    loops keep one product each in the program, so it compiles fast and can be differentiated.
     """
     halvings, degree = 14, 8
     small = M / 2.0**halvings
-    X = small / degree
-    for k in range(degree - 1, 0, -1):
-        X = (small + small @ X) / k
+    divisors = jnp.arange(degree - 1, 0, -1, dtype=M.dtype)
+    X = jax.lax.scan(lambda X, k: ((small + small @ X) / k, None), small / degree, divisors)[0]
     return jax.lax.fori_loop(0, halvings, lambda _, X: 2 * X + X @ X, X)
 
 
@@ -48,15 +47,11 @@ def phi_functions(
     """`exp(A h)` and `h phi_k(A h) V`, k = 1..orders, from one augmented matrix exponential."""
     size, m = V.shape
     total = size + orders * m
-    big = jnp.zeros((total, total), A.dtype).at[:size, :size].set(A * h)
-    big = big.at[:size, size : size + m].set(V * h)
-    for k in range(orders - 1):
-        rows = slice(size + k * m, size + (k + 1) * m)
-        columns = slice(size + (k + 1) * m, size + (k + 2) * m)
-        big = big.at[rows, columns].set(jnp.eye(m, dtype=A.dtype))
-    expo = matrix_expm1(big)
-    return [expo[:size, :size] + jnp.eye(size, dtype=A.dtype)] + [
-        expo[:size, size + k * m : size + (k + 1) * m] for k in range(orders)
+    moving = jnp.pad(jnp.concatenate([A, V], axis=1) * h, ((0, 0), (0, (orders - 1) * m)))
+    shift = jnp.eye(total - size, total, size + m, dtype=A.dtype)
+    expo = matrix_expm1(jnp.concatenate([moving, shift]))[:size]
+    return [expo[:, :size] + jnp.eye(size, dtype=A.dtype)] + [
+        expo[:, size + k * m : size + (k + 1) * m] for k in range(orders)
     ]
 
 
@@ -172,8 +167,8 @@ def equations(mechanism: Mechanism, gates: Float[Array, " E"]) -> EquationsOfMot
         mechanism: Parameter values may be traced.
         gates: One factor per effect; one where it is on, zero where it is off.
     """
-    layout = Layout.of(mechanism.structure)
-    stamps = [PlacedStamp(e.stamp(), np.array(mechanism.vector(e)), gates[i]) for i, e in stamped(mechanism)]
+    layout, each = Layout.of(mechanism.structure), jnp.unstack(gates)
+    stamps = [PlacedStamp(e.stamp(), np.array(mechanism.vector(e)), each[i]) for i, e in stamped(mechanism)]
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), layout.n)
     return equations_from_stamps(stamps, P, layout.linear, gates.dtype)
 
@@ -182,35 +177,56 @@ def equations_from_stamps(
     stamps: list[PlacedStamp], P: Real[np.ndarray, "p n"], size: int, dtype: jnp.dtype
 ) -> EquationsOfMotion:
     """Equations of motion of `size` states for torques at the ports with the vectors P."""
-    n = P.shape[1]
-    M, D, K = (jnp.zeros((n, n), dtype) for _ in range(3))
-    drive = jnp.zeros(n, dtype)
-    with_states: list[PlacedStamp] = []
+    n, own = P.shape[1], [s for s in stamps if s.stamp.own]
+    # M, D, K and the column of the voltage, side by side, from all numbers at once.
+    numbers, places = [], []
     for stamp, p, gate in stamps:
-        outer = jnp.asarray(np.outer(p, p), dtype)
-        M = M + gate * stamp.inertia * outer
-        D = D + gate * stamp.damping * outer
-        K = K + gate * stamp.stiffness * outer
-        drive = drive + gate * stamp.drive * jnp.asarray(p, dtype)
-        if stamp.own:
-            with_states.append(PlacedStamp(stamp, p, gate))
-    Minv = jnp.linalg.inv(M)
-    A = jnp.zeros((size, size), dtype).at[:n, n : 2 * n].set(jnp.eye(n, dtype=dtype))
-    A = A.at[n : 2 * n, :n].set(-Minv @ K).at[n : 2 * n, n : 2 * n].set(-Minv @ D)
-    B = jnp.zeros(size, dtype).at[n : 2 * n].set(Minv @ drive)
-    row = 2 * n
-    for stamp, p, gate in with_states:
+        at = (n * k + np.arange(n) for k in range(3))
+        for number, columns in zip((stamp.inertia, stamp.damping, stamp.stiffness), at, strict=True):
+            places.append(np.zeros((n, 3 * n + 1)))
+            places[-1][:, columns] = np.outer(p, p)
+            numbers.append((number, gate))
+        places.append(np.zeros((n, 3 * n + 1)))
+        places[-1][:, 3 * n] = p
+        numbers.append((stamp.drive, gate))
+    used = [k for k, (number, _) in enumerate(numbers) if not (isinstance(number, float) and number == 0)]
+    sizes, gates = (jnp.stack([_scalar(numbers[k][i], dtype) for k in used]) for i in range(2))
+    placed = jnp.asarray(np.array([places[k] for k in used]), dtype)
+    found = jnp.sum((sizes * gates)[:, None, None] * placed, axis=0)
+    Minv = _inverse(found[:, :n])
+    vectors = np.column_stack([P.T, *(s.port for s in own)])
+    right = jnp.concatenate([found[:, n:], jnp.asarray(vectors, dtype)], axis=1)
+    solved = jnp.sum(Minv[:, :, None] * right[None], axis=1)
+    D, K, B, answers = jnp.split(solved, (n, 2 * n, 2 * n + 1), axis=1)
+    # What states of their own do to the motion, and their own equations.
+    forces, below, inputs = [], [], []
+    for k, (stamp, p, gate) in enumerate(own):
         m, vector = len(stamp.own), jnp.asarray(p, dtype)
-        own = jnp.stack([jnp.stack([_scalar(c, dtype) for c in row]) for row in stamp.own])
-        speed = jnp.stack([_scalar(c, dtype) for c in stamp.from_speed])
-        torque = jnp.stack([_scalar(c, dtype) for c in stamp.torque])
-        A = A.at[row : row + m, row : row + m].set(own)
-        A = A.at[row : row + m, n : 2 * n].set(speed[:, None] * vector[None, :])
-        A = A.at[n : 2 * n, row : row + m].set(gate * (Minv @ vector)[:, None] * torque[None, :])
-        B = B.at[row : row + m].set(jnp.stack([_scalar(c, dtype) for c in stamp.from_voltage]))
-        row += m
-    ports = jnp.zeros((size, len(P)), dtype).at[n : 2 * n].set(Minv @ jnp.asarray(P.T, dtype))
-    return EquationsOfMotion(A, B, ports, Minv)
+        listed = [*stamp.own, stamp.from_speed, stamp.from_voltage, stamp.torque]
+        table = jnp.stack([_scalar(c, dtype) for row in listed for c in row]).reshape(m + 3, m)
+        forces.append(gate * answers[:, len(P) + k, None] * table[m + 2])
+        before, rows = sum(block.shape[1] for block in forces[:-1]), [jnp.zeros((m, n), dtype)]
+        rows += [table[m][:, None] * vector, jnp.zeros((m, before), dtype), table[:m]]
+        below.append(jnp.concatenate(rows, axis=1))
+        inputs.append(table[m + 1])
+    wide = lambda block: jnp.pad(block, ((0, 0), (0, size - block.shape[1])))  # noqa: E731
+    moving = [jnp.eye(n, size, n, dtype=dtype), wide(jnp.concatenate([-K, -D, *forces], axis=1))]
+    A = jnp.concatenate([*moving, *map(wide, below)])
+    B = jnp.concatenate([jnp.zeros(n, dtype), B[:, 0], *inputs])
+    ports = jnp.pad(answers[:, : len(P)], ((n, size - 2 * n), (0, 0)))
+    still = size - len(A)  # the rotor's states
+    return EquationsOfMotion(jnp.pad(A, ((0, still), (0, 0))), jnp.pad(B, (0, still)), ports, Minv)
+
+
+def _inverse(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Inverse of a mass matrix; written out where it is small, which compiles many times faster."""
+    n = len(M)
+    if n == 1:
+        return 1 / M
+    if n == 2:
+        (a, b), (c, d) = (jnp.unstack(row) for row in jnp.unstack(M))
+        return jnp.stack([d, -b, -c, a]).reshape(2, 2) / (a * d - b * c)
+    return jnp.linalg.inv(M)
 
 
 def _scalar(value: Scalar, dtype: jnp.dtype) -> Array:
@@ -232,7 +248,7 @@ class Constants(NamedTuple):
         hold: `h phi_1 b_p`, the response to a constant port torque.
         ramp: `h phi_2 b_p`.
         rise: `h phi_3 b_p`.
-        half_E: `E` of a step of `h / 2`.
+        half_E: `E` of a step of `h / 2`; None, as the next two, where the rule has no half steps.
         half_input: `input` of such a step.
         half_hold: `hold` of such a step.
         stop: Speed that a unit torque at port j, held for one step, gives port i [rad/s per N m].
@@ -250,9 +266,9 @@ class Constants(NamedTuple):
     hold: Float[Array, "m p *D"]
     ramp: Float[Array, "m p *D"]
     rise: Float[Array, "m p *D"]
-    half_E: Float[Array, "m m *D"]
-    half_input: Float[Array, "m *D"]
-    half_hold: Float[Array, "m p *D"]
+    half_E: Float[Array, "m m *D"] | None
+    half_input: Float[Array, "m *D"] | None
+    half_hold: Float[Array, "m p *D"] | None
     stop: Float[Array, "p p *D"]
     mobility: Float[Array, "p p *D"]
     push: Float[Array, "m p *D"]
@@ -261,11 +277,15 @@ class Constants(NamedTuple):
 
 
 def constants(
-    mechanism: Mechanism, values: Real[Array, " P"], gates: Float[Array, " E"], h: Float[Array, ""]
+    mechanism: Mechanism,
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    h: Float[Array, ""],
+    halves: bool = True,
 ) -> Constants:
-    """Constants of a step of length `h` [s] for traced parameter values."""
+    """Constants of a step of length `h` [s] for traced parameter values; on request those of half a step."""
     layout = Layout.of(mechanism.structure)
-    return from_equations(equations(mechanism.with_values(values), gates), layout, values, gates, h)
+    return from_equations(equations(mechanism.with_values(values), gates), layout, values, gates, h, halves)
 
 
 def from_equations(
@@ -274,15 +294,16 @@ def from_equations(
     values: Real[Array, " P"],
     gates: Float[Array, " E"],
     h: Float[Array, ""],
+    halves: bool = True,
 ) -> Constants:
     """Constants of a step of length `h` [s] for equations whose states are in the order of the layout."""
     n = layout.n
     V = jnp.concatenate([eq.B[:, None], eq.ports], axis=1)
     E, one, two, three = phi_functions(eq.A, V, h, 3)
-    half_E, half = phi_functions(eq.A, V, h / 2, 1)
+    half_E, half = phi_functions(eq.A, V, h / 2, 1) if halves else (None, None)
     P = jnp.asarray(np.array(layout.port_matrix).reshape(len(layout.torque_ports), n), E.dtype)
     # An impulse at a port moves the coordinates as the torque accelerates them.
-    push = jnp.zeros_like(eq.ports).at[:n].set(eq.ports[n : 2 * n])
+    push = jnp.pad(eq.ports[n : 2 * n], ((0, layout.linear - n), (0, 0)))
     if layout.linear > layout.rotor:
         push = push.at[layout.rotor].set(eq.ports[layout.rotor + 1])
 
@@ -301,8 +322,8 @@ def from_equations(
         ramp=two[:, 1:],
         rise=three[:, 1:],
         half_E=half_E,
-        half_input=half[:, 0],
-        half_hold=half[:, 1:],
+        half_input=None if half is None else half[:, 0],
+        half_hold=None if half is None else half[:, 1:],
         stop=moved(one[n : 2 * n, 1:], one[:, 1:], layout.rotor + 1),
         mobility=moved(push[:n], push, layout.rotor),
         push=push,

@@ -90,7 +90,7 @@ def gear_constants(
     (a, b), (p, q) = line[angle], line[speed]
     # In flight the gear transmits no torque.
     load = jax.tree.map(jnp.zeros_like, tight.load)
-    flight = from_equations(eq, layout, values, gates, h)._replace(load=load)
+    flight = from_equations(eq, layout, values, gates, h, tight.half_E is not None)._replace(load=load)
     teeth = gear.teeth()
     if teeth is not None:
         # The rotor of a gear that is switched off stays at rest, and its teeth never touch.

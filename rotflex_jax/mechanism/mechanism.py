@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
@@ -231,6 +232,8 @@ class Mechanism:
                 f"parameters, but is {shown(values)}; give them by name, {{'port.effect.parameter': value}}."
             )
         listed: Any = values.tolist() if isinstance(values, np.ndarray) else values
+        if isinstance(values, jax.Array):  # all at once, which traces many times faster than one by one
+            listed = jnp.unstack(values)
         effects, start = [], 0
         for e in self.effects:
             names = tuple(e.values)

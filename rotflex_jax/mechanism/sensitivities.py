@@ -234,11 +234,11 @@ def accumulate_outputs(
         return read_outputs(structure.with_values(p), g, x)
 
     def derivatives(f: Callable[[Array, Array], Any]) -> Any:
-        derivative = lambda *tangent: jax.jvp(f, (values, gates), tangent)[1]  # noqa: E731
-        return jax.vmap(derivative, out_axes=-1)(directions.values, directions.gates)
+        both = lambda *tangent: jax.jvp(f, (values, gates), tangent)  # noqa: E731
+        return jax.vmap(both, out_axes=(None, -1))(directions.values, directions.gates)
 
-    c, dc = prepare(values, gates), derivatives(prepare)
-    dv = derivatives(drive) if effects_of(structure, Actuation) else None
+    c, dc = derivatives(prepare)
+    v, dv = derivatives(drive) if effects_of(structure, Actuation) else (drive(values, gates), None)
     free, predictor = FreeStep(structure, solver), PredictorStep(structure, solver)
 
     def step(v: Any, x: Array, c: Any, sample: Any) -> Array:
@@ -272,7 +272,7 @@ def accumulate_outputs(
 
     first, measured = samples.started_at(jnp.asarray(x0))
     carry = (first, x0_directions, start)
-    (_, _, sums), stored = jax.lax.scan(advance, carry, (drive(values, gates), dv, measured))
+    (_, _, sums), stored = jax.lax.scan(advance, carry, (v, dv, measured))
     return sums, stored
 
 

@@ -355,7 +355,7 @@ class Exponential:
     ) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
         h = Ts / (self.substeps * gear_steps(structure))
-        c = constants(structure, values, gates, h)
+        c = constants(structure, values, gates, h, halves=self.order == 4)
         c = c._replace(load=load_rows(structure.with_values(values), gates))
         return c._replace(gear=gear_constants(structure, values, gates, c))
 
