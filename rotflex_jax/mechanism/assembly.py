@@ -204,9 +204,9 @@ def equations_from_stamps(
         m, vector = len(stamp.own), jnp.asarray(p, dtype)
         listed = [*stamp.own, stamp.from_speed, stamp.from_voltage, stamp.torque]
         table = jnp.stack([_scalar(c, dtype) for row in listed for c in row]).reshape(m + 3, m)
-        forces.append(gate * answers[:, len(P) + k, None] * table[m + 2])
+        forces.append(gate * answers[:, len(P) + k, None] * table[None, m + 2])
         before, rows = sum(block.shape[1] for block in forces[:-1]), [jnp.zeros((m, n), dtype)]
-        rows += [table[m][:, None] * vector, jnp.zeros((m, before), dtype), table[:m]]
+        rows += [table[m][:, None] * vector[None], jnp.zeros((m, before), dtype), table[:m]]
         below.append(jnp.concatenate(rows, axis=1))
         inputs.append(table[m + 1])
     wide = lambda block: jnp.pad(block, ((0, 0), (0, size - block.shape[1])))  # noqa: E731

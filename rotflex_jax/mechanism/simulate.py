@@ -36,20 +36,22 @@ def sensor_readings(
     x: Float[Array, "n *S"] | None,
 ) -> Float[Array, "C *S"]:
     """Sensor readings of true outputs; of the states `x`, which only sensors with dynamics need."""
-    y, rows = true, own_states(mechanism)
-    for i, effect in effects_of(mechanism, Sensing):
+    found = effects_of(mechanism, Sensing)
+    if not found:
+        return true
+    y, ideal, gate, rows = list(jnp.unstack(true)), jnp.unstack(true), jnp.unstack(gates), own_states(mechanism)
+    for i, effect in found:
         c = mechanism.channels.index(effect.at)
         measure: Callable[..., Any] = lambda e, *seen: e.measure(*seen)  # noqa: E731
         beside: tuple[Array, ...] = ()
         if effect.beside == "other":
-            beside = (true[0 if c else 1],)
+            beside = (ideal[0 if c else 1],)
         elif effect.beside == "states" and x is not None:
             order = mechanism.quantities[c].derivative
             measure = lambda e, value, *z, order=order: e.measure(value, z, order)  # noqa: E731
             beside = tuple(x[row] for row in rows[i])
-        read = y[c] + gates[i] * (evaluate_effect(effect, measure, y[c], *beside) - y[c])
-        y = jnp.concatenate([y[:c], read[None], y[c + 1 :]])
-    return y
+        y[c] = y[c] + gate[i] * (evaluate_effect(effect, measure, y[c], *beside) - y[c])
+    return jnp.stack(y)
 
 
 def read_outputs(

@@ -34,7 +34,8 @@ from rotflex_jax.mechanism.small_matrices import (
 def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "p *S"], Float[Array, "p *S"]]:
     """Positions and speeds of the torque ports at linear states."""
     P, n = layout.port_matrix, layout.n
-    position, speed = sparse_matvec(P, x[:n]), sparse_matvec(P, x[n : 2 * n])
+    speeds = tuple((0.0,) * n + row for row in P)
+    position, speed = jnp.split(sparse_matvec(P + speeds, x), 2)
     if any(layout.rotor_side):
         side = expand_axes(jnp.asarray(layout.rotor_side, x.dtype), position)
         position, speed = position + side * x[layout.rotor][None], speed + side * x[layout.rotor + 1][None]
@@ -264,15 +265,15 @@ def torques(
         gates: One factor per effect.
     """
     layout = Layout.of(mechanism.structure)
-    position, speed = port_motion(layout, x)
-    total = [jnp.zeros(x.shape[1:], x.dtype)] * len(layout.torque_ports)
+    position, speed = map(jnp.unstack, port_motion(layout, x))
+    gate, memory, total = jnp.unstack(gates), jnp.unstack(z), [jnp.zeros(x.shape[1:], x.dtype)] * len(position)
     for i, e in effects_of(mechanism, Force):
         k = layout.torque_ports.index(e.at)
-        total[k] = total[k] + gates[i] * _force(e, position[k], speed[k], v)
+        total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], v)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
         drive = memory_drive(mechanism, e, x, v, gates)
-        total[k] = total[k] + gates[i] * _force(e, z[m], position[k], speed[k], drive)
+        total[k] = total[k] + gate[i] * _force(e, memory[m], position[k], speed[k], drive)
     return jnp.stack(total)
 
 
@@ -285,12 +286,12 @@ def memory_rates(
 ) -> Float[Array, "z *S"]:
     """Time derivatives of the memories; arguments as for `torques`."""
     layout = Layout.of(mechanism.structure)
-    position, speed = port_motion(layout, x)
-    rates, flow = [], lambda e, *signals: e.flow(*signals)
+    position, speed = map(jnp.unstack, port_motion(layout, x))
+    memory, rates, flow = jnp.unstack(z), [], lambda e, *signals: e.flow(*signals)
     for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
         drive = memory_drive(mechanism, e, x, v, gates)
-        rates.append(jnp.asarray(evaluate_effect(e, flow, z[m], position[k], speed[k], drive)))
+        rates.append(jnp.asarray(evaluate_effect(e, flow, memory[m], position[k], speed[k], drive)))
     return jnp.stack(rates)
 
 
@@ -443,15 +444,16 @@ def _friction_levels(
     """Friction levels against positive and negative motion of each friction port."""
     layout = Layout.of(mechanism.structure)
     position, before = port_motion(layout, x)
-    speed = jnp.abs(before + port_motion(layout, end)[1]) / 2
+    speed = jnp.unstack(jnp.abs(before + port_motion(layout, end)[1]) / 2)
     load = transmitted_torques(mechanism, c.load, (x + end) / 2, z, v, c.gates)
+    position, gate = jnp.unstack(position), jnp.unstack(c.gates)
     up = [jnp.zeros(x.shape[1:], x.dtype)] * layout.contacts
     down = list(up)
     for i, e in effects_of(mechanism, DryFriction):
         k = layout.torque_ports.index(e.at)
         for levels, direction in ((up, 1.0), (down, -1.0)):
             level = friction_level(e, position[k], speed[k], direction, None if load is None else load[k])
-            levels[k] = levels[k] + c.gates[i] * level
+            levels[k] = levels[k] + gate[i] * level
     return jnp.stack(up), jnp.stack(down)
 
 
