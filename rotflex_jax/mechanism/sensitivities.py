@@ -147,32 +147,43 @@ def inactive_sensitivities(
     changes_voltage = any(isinstance(effects[i], Actuation) for i in inactive)
     switched = any(not effects[i].amplitudes for i in inactive)
 
-    def prepared(values: Array, gates: Array) -> Any:
-        return prepared_run(structure, solver, values, gates, samples.u, samples.Ts)[1:]
+    def voltage(values: Array, gates: Array) -> Any:
+        known = structure.with_values(values)
+        return solver.inputs(motor_voltage(known, gates, samples.u, samples.Ts))
 
-    v, c = prepared(parameters.values, parameters.gates)
+    def prepare(values: Array, gates: Array) -> Any:
+        return solver.prepare(structure, values, gates, samples.Ts)
+
+    def with_derivatives(f: Callable[[Array, Array], Any], moves: bool) -> tuple[Any, Any]:
+        """A value, and its derivative along each direction; None where it has none."""
+        at = parameters.values, parameters.gates
+        if not moves:
+            return f(*at), None
+        return jax.vmap(lambda *way: jax.jvp(f, at, way), out_axes=(None, 0))(dvalues, dgates)
+
+    v, dv = with_derivatives(voltage, changes_voltage)
+    c, dc = with_derivatives(prepare, enters_matrices)
     x0, measured = samples.started_at(parameters.x0)
     X = run.X
     if X.shape[1] < len(x0):  # with the inactive effects' own states, driven by the run
         X = states(step, x0, (v, *measured), (c, parameters.K))
     # One by one, so that numbers of other effects have no derivative.
-    scalars = list(parameters.values)
+    scalars = list(jnp.unstack(parameters.values))
     inputs, constants = (v, *measured), (c._replace(values=scalars), parameters.K)
 
-    def derivative(dv: Array, dg: Array) -> Array:
-        direction = (parameters.values, parameters.gates), (dv, dg)
-        still = jax.tree.map(lambda _: None, c)
-        dc = jax.jvp(prepared, *direction)[1][1] if enters_matrices else still
-        dc = dc._replace(values=[dv[i] if i in own else None for i in range(len(scalars))])
-        dc = dc._replace(gates=dg if switched else None)
-        dvoltage = jax.jvp(prepared, *direction)[1][0] if changes_voltage else None
+    still = jax.tree.map(lambda _: None, c)
+
+    def derivative(dvalues: Array, dgates: Array, dvoltage: Any, dc: Any) -> Array:
+        dc = still if dc is None else dc
+        dc = dc._replace(values=[dvalues[i] if i in own else None for i in range(len(scalars))])
+        dc = dc._replace(gates=dgates if switched else None)
         b = forcing(step, X, inputs, (dvoltage, *(None for _ in measured)), constants, (dc, None))
         dx = tangent_recursion(run.A, b[:, active], jnp.zeros_like(x0[active]))
         dX = jnp.zeros_like(X).at[:, active].set(dx)
         read = lambda x, values, gates: read_outputs(structure.with_values(values), gates, x)  # noqa: E731
         return directional(read, (X.T, scalars, parameters.gates), (dX.T, dc.values, dc.gates)).T
 
-    return jax.vmap(derivative)(dvalues, dgates)
+    return jax.vmap(derivative)(dvalues, dgates, dv, dc)
 
 
 Accumulator = Callable[[Any, Float[Array, " C"], Float[Array, "C D"], Any], tuple[Any, Any]]
