@@ -97,7 +97,7 @@ def program():
     def run(whole, dvalues, dgates):
         def e(values, gates):
             each = jax.vmap(functools.partial(predicted, gates))
-            return each(values, whole.x0[:, 0], whole.K, *predictor().on_device())
+            return each(values, whole.x0[:, 0], whole.K, *map(jnp.asarray, predictor().data))
 
         at = (whole.values, whole.gates)
         return e(*at), jax.vmap(lambda dv, dg: jax.jvp(e, at, (dv, dg))[1])(dvalues, dgates)

@@ -20,14 +20,33 @@ from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
     RunParameters,
     TangentDirections,
-    outputs_with_sensitivities,
+    accumulate_outputs,
 )
+from rotflex_jax.models.model import program_length
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import cores, double_precision
 
 # Parameter sets per call for values alone, where further ones cost nearly nothing. Slopes run one set a call:
 # their directions fill the vector units, so more sets would only take longer to compile.
 PARAMETER_SETS_PER_CALL = 4
+
+
+# Windows of a program, at least.
+LEAST_WINDOWS = 16
+
+
+class ProgramSamples(NamedTuple):
+    """Recordings as programs take them: of a length that many recordings share.
+
+    Attributes:
+        data: The recordings, zeros beyond their ends.
+        window: Window of each sample.
+        count: Samples of each recording that are run: up to the last one that counts.
+    """
+
+    data: StackedRecordings
+    window: Int[Any, "R N"]
+    count: Int[Any, " R"]
 
 
 class ParameterSet(NamedTuple):
@@ -65,11 +84,12 @@ def _innovations(
     structure: Mechanism,
     solver: Solver,
     parameter_sets: ParameterSet,
-    data: StackedRecordings,
-    window: jax.Array,
+    samples: ProgramSamples,
 ) -> jax.Array:
+    data, window, count = samples
+
     def one(p: ParameterSet) -> jax.Array:
-        y_hat = predicted(structure, solver, p.values, p.x0, p.gates, data, p.K, window)
+        y_hat = predicted(structure, solver, p.values, p.x0, p.gates, data, p.K, window, count.max())
         return jnp.where(data.seen[:, :, None] > 0, data.y - y_hat, 0.0)
 
     return jax.vmap(one)(parameter_sets)
@@ -81,26 +101,32 @@ def _slopes(
     solver: Solver,
     parameter_set: ParameterSet,
     directions: Directions,
-    data: StackedRecordings,
-    window: jax.Array,
+    samples: ProgramSamples,
 ) -> tuple[jax.Array, jax.Array]:
     x0 = whole_state(structure, parameter_set.x0)
     x0_ways = jnp.pad(directions.x0, ((0, 0), (0, x0.shape[-1] - parameter_set.x0.shape[-1])))
 
-    def one(recording: Any) -> tuple[jax.Array, jax.Array]:
-        values, x0, K, dvalues, (u, y, seen, Ts), window = recording
+    def one(values: Any, x0: Any, K: Any, dvalues: Any, given: ProgramSamples) -> tuple[jax.Array, jax.Array]:
         numbers = RunParameters(values, parameter_set.gates, x0, K)
         ways = TangentDirections(dvalues, directions.gates, x0_ways)
-        run = RecordingSamples(u, y, seen, Ts, window)
-        y_hat, J = outputs_with_sensitivities(structure, solver, numbers, ways, run)
-        return y_hat, jnp.moveaxis(J, -1, 0)
 
-    rows = (parameter_set.values, x0, parameter_set.K, jnp.swapaxes(directions.values, 0, 1), data, window)
-    y_hat, J = jax.lax.map(one, rows)
-    # Not a product: beyond its last sample a run may diverge.
-    seen = data.seen[:, :, None] > 0
-    J = jnp.where(seen[None], -jnp.swapaxes(J, 0, 1), 0.0)
-    return jnp.where(seen, data.y - y_hat, 0.0), J
+        def place(sums: Any, y_hat: jax.Array, J: jax.Array, sample: Any) -> Any:
+            (k, e, slopes), (y, seen) = sums, sample
+            # Not a product: before its last sample that counts a run may diverge.
+            here, J = (jnp.where(seen > 0, a, 0.0) for a in (y - y_hat, -J.T))
+            put = jax.lax.dynamic_update_slice_in_dim
+            return (k + 1, put(e, here[None], k, 0), put(slopes, J[:, None], k, 1)), None
+
+        none = jnp.zeros((len(x0_ways), *given.data.y.shape), given.data.y.dtype)
+        run = RecordingSamples(*given.data, given.window, given.count)
+        return accumulate_outputs(structure, solver, numbers, ways, run, place, (0, none[0], none))[0][1:]
+
+    rows = (parameter_set.values, x0, parameter_set.K, jnp.swapaxes(directions.values, 0, 1), samples)
+    if len(x0) == 1:
+        e, J = one(*jax.tree.map(lambda a: a[0], rows))
+        return e[None], J[:, None]
+    e, J = jax.lax.map(lambda row: one(*row), rows)
+    return e, jnp.swapaxes(J, 0, 1)
 
 
 def _stacked(parameter_sets: list[ParameterSet]) -> ParameterSet:
@@ -129,15 +155,19 @@ class BatchedPredictor:
     compiled: set[Any] = dataclasses.field(default_factory=set)
 
     def restrict(self, parameter_set: ParameterSet, model: ReducedModel) -> ParameterSet:
-        """A parameter set with what the recordings know, without what a reduced model leaves out."""
-        values = parameter_set.values
+        """A parameter set with what the recordings know, without what a reduced model leaves out.
+
+        Its windows are filled up to a number that recordings of other lengths share.
+        """
+        values, number = parameter_set.values, parameter_set.x0.shape[1]
+        filled = program_length(number, LEAST_WINDOWS)
         if self.constants is not None:
             values = values.copy()
             known = ~np.isnan(self.constants)
             values[:, : known.shape[1]][known] = self.constants[known]
         return ParameterSet(
             values[:, model.parameters],
-            parameter_set.x0,
+            parameter_set.x0[:, np.minimum(np.arange(filled), number - 1)],
             parameter_set.gates[np.array(model.effects)],
             parameter_set.K[:, np.array(model.states)],
         )
@@ -151,9 +181,8 @@ class BatchedPredictor:
             model, indices = job
             with double_precision():
                 batch = _stacked([self.restrict(parameter_sets[i], model) for i in indices])
-                data, index = self.on_device(), jnp.asarray(window)
-                e = _innovations(model.mechanism.structure, self.solver, batch, data, index)
-                return np.asarray(e)[: len(indices)]
+                e = _innovations(model.mechanism.structure, self.solver, batch, self.on_device(window))
+                return np.asarray(e)[: len(indices), :, : window.shape[1]]
 
         size = PARAMETER_SETS_PER_CALL
         jobs: list[tuple[ReducedModel, list[int]]] = []
@@ -182,9 +211,8 @@ class BatchedPredictor:
             along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
             with double_precision():
                 structure, inputs = model.mechanism.structure, self.restrict(parameter_sets[i], model)
-                data, index = self.on_device(), jnp.asarray(window)
-                e, J = _slopes(structure, self.solver, inputs, along, data, index)
-                return np.asarray(e), np.asarray(J)
+                e, J = _slopes(structure, self.solver, inputs, along, self.on_device(window))
+                return np.asarray(e)[:, : window.shape[1]], np.asarray(J)[:, :, : window.shape[1]]
 
         gates = [np.vstack([p.gates, d.gates]) for p, d in zip(parameter_sets, directions, strict=True)]
         jobs = [(model, [i]) for model, indices in self._by_structure(gates) for i in indices]
@@ -216,9 +244,22 @@ class BatchedPredictor:
         self.compiled.update(new)
         return [done[i] for i in range(len(jobs))]
 
-    def on_device(self) -> StackedRecordings:
-        """The recordings as arrays of JAX; call it inside the precision that is wanted."""
-        return jax.tree.map(jnp.asarray, self.data)
+    @functools.cached_property
+    def _placed(self) -> dict[int, tuple[Int[np.ndarray, "R N"], ProgramSamples]]:
+        """Samples as programs take them, by the identity of the windows, which are kept with them."""
+        return {}
+
+    def on_device(self, window: Int[np.ndarray, "R N"]) -> ProgramSamples:
+        """The recordings as programs take them, arrays of JAX; to be called in double precision."""
+        if id(window) not in self._placed:
+            N, seen = window.shape[1], self.data.seen > 0
+            more = program_length(N) - N
+            fill = lambda a: np.pad(a, ((0, 0), (0, more), (0, 0))[: a.ndim])  # noqa: E731
+            data = StackedRecordings(*map(fill, self.data[:3]), self.data.Ts)
+            count = np.where(seen.any(axis=1), N - np.argmax(seen[:, ::-1], axis=1), 0)
+            samples = ProgramSamples(data, np.pad(window, ((0, 0), (0, more)), "edge"), count)
+            self._placed[id(window)] = window, jax.tree.map(jnp.asarray, samples)
+        return self._placed[id(window)][1]
 
 
 def _on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:

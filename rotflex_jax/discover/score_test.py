@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, ProgramSamples
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ReducedModel, SuperModel
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.coordinates import FitCoordinates, Projection
-from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.fit.problem import each_recording
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver
 from rotflex_jax.mechanism.assembly import Layout, rest_state
@@ -42,15 +41,14 @@ def _run_slopes(
     structure: Mechanism,
     solver: Solver,
     parameter_set: ParameterSet,
-    data: StackedRecordings,
-    window: jax.Array,
+    samples: ProgramSamples,
 ) -> LinearisedRun:
     def one(values: Any, x0: Any, K: Any, *samples: Any) -> Any:
         return linearised_run(
             structure, solver, RunParameters(values, parameter_set.gates, x0, K), RecordingSamples(*samples)
         )
 
-    p = parameter_set
+    p, (data, window, _) = parameter_set, samples
     return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
 
 
@@ -63,8 +61,7 @@ def _inactive_slopes(
     present: jax.Array,
     run: LinearisedRun,
     directions: Directions,
-    data: StackedRecordings,
-    window: jax.Array,
+    samples: ProgramSamples,
 ) -> jax.Array:
     def one(values: Any, x0: Any, K: Any, run: Any, dvalues: Any, *samples: Any) -> Any:
         rest = jnp.broadcast_to(rest_state(structure, np.float64), (len(x0), K.shape[0]))
@@ -72,6 +69,7 @@ def _inactive_slopes(
         given = (numbers, RecordingSamples(*samples), present, run, dvalues, directions.gates)
         return inactive_sensitivities(structure, solver, inactive, *given)
 
+    data, window, _ = samples
     J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0, 0), out_axes=1)(
         parameter_set.values, parameter_set.x0, parameter_set.K, run, directions.values, *data, window
     )
@@ -114,7 +112,8 @@ def candidate_sensitivities(
         solver = dataclasses.replace(solver, passes=min(solver.passes, contacts + 1))
     with double_precision():
         structure, inputs = active.mechanism.structure, predictor.restrict(current, active)
-        linearised = _run_slopes(structure, solver, inputs, predictor.on_device(), jnp.asarray(window))
+        samples = predictor.on_device(window)
+        linearised = _run_slopes(structure, solver, inputs, samples)
 
     def run(job: tuple[ReducedModel, InactiveCandidates]) -> np.ndarray:
         model, (family, parameter_set, d) = job
@@ -123,8 +122,9 @@ def candidate_sensitivities(
             present = jnp.array([model.states.index(i) for i in active.states])
             structure, inputs = model.mechanism.structure, predictor.restrict(parameter_set, model)
             inactive = tuple(model.effects.index(c.effect) for c in family)
-            given = (present, linearised, along, predictor.on_device(), jnp.asarray(window))
-            return np.asarray(_inactive_slopes(structure, solver, inactive, inputs, *given))
+            given = (present, linearised, along, samples)
+            J = _inactive_slopes(structure, solver, inactive, inputs, *given)
+            return np.asarray(J)[:, :, : window.shape[1]]
 
     jobs = [(s.with_family(current.gates, b.family), b) for b in batches]
     return np.stack(predictor.run_jobs(run, jobs, lambda job: ("probes", active.effects, job[0].effects)))

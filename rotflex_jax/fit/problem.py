@@ -34,6 +34,7 @@ from rotflex_jax.mechanism.sensitivities import (
     accumulate_outputs,
     outputs_with_sensitivities,
 )
+from rotflex_jax.mechanism.simulate import first_predictions
 from rotflex_jax.optimise.damped_least_squares import RIDGE, NormalEquations, solution_within
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import spread
@@ -48,6 +49,7 @@ def predicted(
     data: StackedRecordings,
     K: Float[Array, "R n C"],
     window: Int[Array, "R N"] | None = None,
+    count: Int[Array, ""] | None = None,
 ) -> Float[Array, "R N C"]:
     """Outputs of R recordings, predicted with gain `K`; a free run where it is zero.
 
@@ -60,12 +62,15 @@ def predicted(
         data: The recordings.
         K: Gains.
         window: Window of each sample, where runs start again at each; `x0` is then (R, W, s).
+        count: Samples that are run, with windows; all if None.
     """
-    run = functools.partial(predictor_run, structure, solver)
+    run = functools.partial(predictor_run if count is None else first_predictions, structure, solver)
     rows = (values, gates, whole_state(structure, x0), data.u, data.y, data.seen, K, data.Ts)
     axes: tuple[int | None, ...] = (0, None, 0, 0, 0, 0, 0, 0)
     if window is not None:
         rows, axes = (*rows, window), (*axes, 0)
+    if count is not None:
+        return each_recording(run, (*axes, None))(*rows, count)
     return each_recording(run, axes)(*rows)[1]
 
 

@@ -65,6 +65,7 @@ class RecordingSamples(NamedTuple):
         seen: One where a sample may correct the state, zero where it may not.
         Ts: Sampling period [s].
         window: Window of each sample, where the run starts again at each; None for one run.
+        count: Samples that are run, where it is not all of them.
     """
 
     u: Float[Array, "*batch N"]
@@ -72,6 +73,7 @@ class RecordingSamples(NamedTuple):
     seen: Float[Array, "*batch N"]
     Ts: Float[Array, "*batch"]
     window: Integer[Array, "*batch N"] | None = None
+    count: Integer[Array, "*batch"] | None = None
 
     def started_at(self, x0: Float[Array, "*W n"]) -> tuple[Float[Array, " n"], tuple[Any, ...]]:
         """The first state of a run, and the measured inputs of its step."""
@@ -228,7 +230,7 @@ def accumulate_outputs(
         start: Sums before the first sample.
 
     Returns:
-        The last sums, and what was stored (N, ...).
+        The last sums, and what was stored (N, ...), nothing where the samples have a count.
     """
     values, gates, x0, K = parameters
     D = len(directions.x0)
@@ -282,9 +284,12 @@ def accumulate_outputs(
         return (x, dx, sums), stored
 
     first, measured = samples.started_at(jnp.asarray(x0))
-    carry = (first, x0_directions, start)
-    (_, _, sums), stored = jax.lax.scan(advance, carry, (v, dv, measured))
-    return sums, stored
+    carry, inputs = (first, x0_directions, start), (v, dv, measured)
+    if samples.count is None:
+        (_, _, sums), stored = jax.lax.scan(advance, carry, inputs)
+        return sums, stored
+    at = lambda k: jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k, 0, False), inputs)  # noqa: E731
+    return jax.lax.fori_loop(0, samples.count, lambda k, carry: advance(carry, at(k))[0], carry)[2], None
 
 
 def _takes_repeated_constants(structure: Mechanism, solver: Solver) -> bool:

@@ -39,7 +39,12 @@ def sensor_readings(
     found = effects_of(mechanism, Sensing)
     if not found:
         return true
-    y, ideal, gate, rows = list(jnp.unstack(true)), jnp.unstack(true), jnp.unstack(gates), own_states(mechanism)
+    y, ideal, gate, rows = (
+        list(jnp.unstack(true)),
+        jnp.unstack(true),
+        jnp.unstack(gates),
+        own_states(mechanism),
+    )
     for i, effect in found:
         c = mechanism.channels.index(effect.at)
         measure: Callable[..., Any] = lambda e, *seen: e.measure(*seen)  # noqa: E731
@@ -217,6 +222,37 @@ def predictor_run(
     x0, restart = (x0, ()) if window is None else restarts(x0, window)
     X = states(PredictorStep(structure, solver), x0, (v, y, seen, *restart), (c, K))
     return X, read_outputs(mechanism, gates, X.T).T
+
+
+def first_predictions(
+    structure: Mechanism,
+    solver: Solver,
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    x0: Float[Array, "W n"],
+    u: Float[Array, " N"],
+    y: Float[Array, "N C"],
+    seen: Float[Array, " N"],
+    K: Float[Array, "n C"],
+    Ts: Float[Array, ""],
+    window: Integer[Array, " N"],
+    count: Integer[Array, ""],
+) -> Float[Array, "N C"]:
+    """The first `count` outputs that `predictor_run` predicts, zeros after them; not to be differentiated.
+
+    One program predicts runs of any length up to N.
+    """
+    mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
+    first, restart = restarts(x0, window)
+    step, inputs = PredictorStep(structure, solver), (v, y, seen, *restart)
+
+    def body(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        x, Y = carry
+        w = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k, 0, False), inputs)
+        placed = jax.lax.dynamic_update_index_in_dim(Y, read_outputs(mechanism, gates, x), k, 0)
+        return step(x, w, (c, K)), placed
+
+    return jax.lax.fori_loop(0, count, body, (first, jnp.zeros_like(y)))[1]
 
 
 @persistent_jit(static=2)

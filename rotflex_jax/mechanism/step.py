@@ -266,7 +266,11 @@ def torques(
     """
     layout = Layout.of(mechanism.structure)
     position, speed = map(jnp.unstack, port_motion(layout, x))
-    gate, memory, total = jnp.unstack(gates), jnp.unstack(z), [jnp.zeros(x.shape[1:], x.dtype)] * len(position)
+    gate, memory, total = (
+        jnp.unstack(gates),
+        jnp.unstack(z),
+        [jnp.zeros(x.shape[1:], x.dtype)] * len(position),
+    )
     for i, e in effects_of(mechanism, Force):
         k = layout.torque_ports.index(e.at)
         total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], v)

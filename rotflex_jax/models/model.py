@@ -42,6 +42,24 @@ def _motor_voltage(structure: Mechanism, values: Array, gates: Array, u: Array, 
     return motor_voltage(structure.with_values(values), gates, u, Ts)
 
 
+def program_length(number: int, least: int = 1024) -> int:
+    """A length of arrays that other numbers of samples share, and with it the compiled program.
+
+    The next power of two; of more than 16384 one of eight lengths between powers of two, as long runs take
+    longer than what a further program costs.
+    """
+    step = 1 if number <= MOST_DOUBLED else 2 ** (number.bit_length() - 4)
+    return -(-number // step) * step if step > 1 else max(least, 2 ** (number - 1).bit_length())
+
+
+MOST_DOUBLED = 16384
+
+
+def _filled(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
+    """A voltage held beyond its end, up to a length that other recordings share."""
+    return np.pad(u, (0, program_length(len(u)) - len(u)), "edge")
+
+
 @dataclasses.dataclass(frozen=True)
 class Model:
     """A mechanism with its integration rule; it simulates recordings.
@@ -145,8 +163,8 @@ class Model:
             return u, here
         gates = self._switches()
         with double_precision():
-            given = map(jnp.asarray, (here.mechanism.values, gates, u, float(recording.Ts)))
-            v = np.asarray(_motor_voltage(self.mechanism.structure, *given))
+            given = map(jnp.asarray, (here.mechanism.values, gates, _filled(u), float(recording.Ts)))
+            v = np.asarray(_motor_voltage(self.mechanism.structure, *given))[: len(u)]
         gates[[i for i, _ in acting]] = 0.0
         return v, dataclasses.replace(here, gates=tuple(gates.tolist()))
 
@@ -185,10 +203,10 @@ class Model:
                 self.solver,
                 *self.at(recording).parameters_and_gates(),
                 jnp.asarray(start),
-                jnp.asarray(recording.u.astype(float)),
+                jnp.asarray(_filled(recording.u.astype(float))),
                 jnp.asarray(float(recording.Ts)),
             )
-            return np.asarray(run[0]), np.asarray(run[1])
+            return np.asarray(run[0])[: recording.N], np.asarray(run[1])[: recording.N]
 
     def simulate(
         self, recording: Recording, x0: Real[np.ndarray, " m"] | Sequence[float] | None = None
@@ -227,9 +245,11 @@ class Model:
         y = self.measured(recording).astype(float)
         u, inner = self._behind_actuation(recording)
         starts, length = window_starts(recording, seconds)
-        pick = starts[:, None] + np.arange(length)[None, :]
+        # Filled up, so that recordings of other lengths share the program.
+        many = np.minimum(np.arange(program_length(len(starts), least=8)), len(starts) - 1)
+        pick = starts[many, None] + np.arange(program_length(length))[None, :]
         inside = np.minimum(pick, len(u) - 1)
-        x0 = self.states_at(recording, starts)
+        x0 = self.states_at(recording, starts)[many]
         with double_precision():
             run = _free_many(
                 inner.mechanism.structure,
@@ -239,7 +259,7 @@ class Model:
                 jnp.asarray(u[inside]),
                 jnp.asarray(float(recording.Ts)),
             )
-            answers = np.asarray(run[1])
+            answers = np.asarray(run[1])[: len(starts)]
         out = np.empty_like(y)
         for window, start, end in zip(answers, starts, [*starts[1:], len(u)], strict=True):
             out[start:end] = window[: end - start]
