@@ -58,7 +58,9 @@ def predictor() -> BatchedPredictor:
     u = 1.5 * np.repeat(rng.normal(size=(2, N // 5)), 5, axis=1)
     y = np.stack([simulate(paper(stiffness=1.5), v, Ts) for v, Ts in zip(u, TS, strict=True)])
     y = y + 5e-4 * rng.normal(size=y.shape)
-    data = StackedRecordings(u, y, 1.0 * (rng.random((2, N)) < 0.95), np.array(TS))
+    seen = 1.0 * (rng.random((2, N)) < 0.95)
+    seen[0, 2 * N // 3 :] = 0.0  # as where the first seconds alone count
+    data = StackedRecordings(u, y, seen, np.array(TS))
     return BatchedPredictor(supermodel(), Exponential(), data)
 
 

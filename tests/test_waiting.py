@@ -17,9 +17,10 @@ CANDIDATES = [(fx.Coulomb, "hub"), (fx.CubicSpring, "joint")]
 FITTED, REPORTED, SCORED = 2, 4, 3
 
 
-def searched(seed: int) -> Discovery:
+def searched(seed: int, samples: int = 1500) -> Discovery:
     made = make_record([("coulomb", "hub")], seed=seed, seconds=3.0, fs=500.0)
-    train, test = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"]).split(0.6)
+    whole = rf.Recording(u=made["u"][:samples], y=made["y"][:samples], Ts=made["Ts"])
+    train, test = whole.split(0.6)
     return rf.discover(rf.joints.paper(), train, test, candidates=CANDIDATES)
 
 
@@ -40,6 +41,14 @@ def test_a_search_makes_few_programs_and_each_once() -> None:
     again, same = made_by(lambda: searched(2010))
     assert again == 0
     np.testing.assert_array_equal(same.final.model.mechanism.values, found.final.model.mechanism.values)
+
+
+def test_another_length_makes_no_more() -> None:
+    """Of the same recording a part, which has another number of samples and fewer windows."""
+    searched(2010)
+    others, found = made_by(lambda: searched(2010, samples=1310))
+    assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
+    assert others == 0
 
 
 def test_other_numbers_make_no_more() -> None:

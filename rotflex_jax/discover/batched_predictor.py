@@ -255,7 +255,8 @@ class BatchedPredictor:
             N, seen = window.shape[1], self.data.seen > 0
             more = program_length(N) - N
             fill = lambda a: np.pad(a, ((0, 0), (0, more), (0, 0))[: a.ndim])  # noqa: E731
-            data = StackedRecordings(*map(fill, self.data[:3]), self.data.Ts)
+            u, y, counts, Ts = self.data
+            data = StackedRecordings(fill(u), fill(y), fill(counts), Ts)
             count = np.where(seen.any(axis=1), N - np.argmax(seen[:, ::-1], axis=1), 0)
             samples = ProgramSamples(data, np.pad(window, ((0, 0), (0, more)), "edge"), count)
             self._placed[id(window)] = window, jax.tree.map(jnp.asarray, samples)
