@@ -42,6 +42,9 @@ def _motor_voltage(structure: Mechanism, values: Array, gates: Array, u: Array, 
     return motor_voltage(structure.with_values(values), gates, u, Ts)
 
 
+MOST_DOUBLED = 16384
+
+
 def program_length(number: int, least: int = 1024) -> int:
     """A length of arrays that other numbers of samples share, and with it the compiled program.
 
@@ -50,9 +53,6 @@ def program_length(number: int, least: int = 1024) -> int:
     """
     step = 1 if number <= MOST_DOUBLED else 2 ** (number.bit_length() - 4)
     return -(-number // step) * step if step > 1 else max(least, 2 ** (number - 1).bit_length())
-
-
-MOST_DOUBLED = 16384
 
 
 def _filled(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
