@@ -92,7 +92,7 @@ def estimate_line(name: str, estimate: Any) -> str:
     low, high = estimate.ci95
     if math.isfinite(low) and math.isfinite(high):
         text += f"   95 %: {digits(low, 4)} .. {digits(high, 4)}"
-    return text
+    return f"{text}   {estimate.remark}" if estimate.given else text
 
 
 def print_discovery(result: Any) -> None:

@@ -38,7 +38,10 @@ class ErrorRow:
 
 @dataclasses.dataclass(frozen=True)
 class ParameterRow:
-    """One parameter in all stages: (value, interval) each, None where the stage lacks it."""
+    """One parameter in all stages: (value, interval) each, None where the stage lacks it.
+
+    `given` are the trusted constants on which the interval of the last stage hangs, in words.
+    """
 
     name: str
     meaning: str
@@ -46,6 +49,7 @@ class ParameterRow:
     held: bool
     stages: tuple[tuple[str, str] | None, ...]
     note: str
+    given: str = ""
 
 
 def stage_labels(discovery: SearchResult) -> tuple[str, ...]:
@@ -146,9 +150,8 @@ def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
     for name in names:
         last = next(s[name] for s in reversed(stages) if name in s)
         each = tuple(value_and_interval(s[name]) if name in s else None for s in stages)
-        rows.append(
-            ParameterRow(name, meanings.get(name, ""), unit_text(last.unit), not last.free, each, last.note)
-        )
+        shown = meanings.get(name, ""), unit_text(last.unit), not last.free, each
+        rows.append(ParameterRow(name, *shown, last.note, last.given_words))
     return tuple(sorted(rows, key=lambda r: r.held))
 
 

@@ -47,6 +47,11 @@ def flexible_joint(
     and the torque constant is trusted too: four numbers describe all that is linear between voltage and
     deflection.
 
+    The free torque constant stands for its product with the efficiency, which nobody knows well: a measured
+    joint of the maker gives 0.0097 N m/A for 0.0077, and with a back-EMF constant that follows it a negative
+    damping of the hub. So the two constants are tied only where the motor says so (`tied=True`); otherwise
+    the back-EMF constant is trusted, and an estimate of the hub's damping says how it hangs on that.
+
     Args:
         hub_inertia: With motor and gears, as the hub feels it [kg m^2].
         arm_inertia: [kg m^2].
@@ -106,6 +111,7 @@ def paper(
     inductance: float | None = None,
     hub_damping: float = 0.0,
     joint_damping: float = 0.0,
+    tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The joint of the paper "Nonlinear Identification of a Rotary Flexible Joint Experiment".
@@ -125,6 +131,7 @@ def paper(
         inductance: [H]; the maker says 0.18 mH. None for a current that follows at once.
         hub_damping: [N m s/rad].
         joint_damping: [N m s/rad].
+        tied: Whether `back_emf` is the torque constant, also in fits; for a known efficiency.
         sensors: What is measured; see `flexible_joint`.
 
     Returns:
@@ -150,6 +157,7 @@ def paper(
             gear_ratio=gear_ratio,
             efficiency=efficiency,
             inductance=inductance,
+            tied=tied,
         ),
         hub_damping=hub_damping,
         joint_damping=joint_damping,
@@ -164,6 +172,7 @@ def quanser_2002(
     hub_anchor: str = "B",
     arm_anchor: int = 2,
     inductance: float | None = None,
+    tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The maker's joint on an SRV02 servo, by the files of 2002.
@@ -176,6 +185,7 @@ def quanser_2002(
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
         inductance: [H] or None.
+        tied: Whether the back-EMF constant is the torque constant, also in fits; for a known efficiency.
         sensors: What is measured; see `flexible_joint`.
 
     Returns:
@@ -184,7 +194,7 @@ def quanser_2002(
     Source: Quanser, config_servo_exp.m and config_flexjoint.m, 2002.
     """
     stiffness = spring_stiffness(spring, hub_anchor, arm_anchor, preload_only=True)
-    return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance, sensors=sensors)
+    return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance, tied=tied, sensors=sensors)
 
 
 def quanser_2010(
@@ -194,6 +204,7 @@ def quanser_2010(
     hub_anchor: str = "B",
     arm_anchor: int = 2,
     inductance: float | None = None,
+    tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The maker's joint on an SRV02 servo, by the files of 2010.
@@ -204,6 +215,7 @@ def quanser_2010(
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
         inductance: [H] or None.
+        tied: Whether the back-EMF constant is the torque constant, also in fits; for a known efficiency.
         sensors: What is measured; see `flexible_joint`.
 
     Returns:
@@ -212,7 +224,7 @@ def quanser_2010(
     Source: Quanser, config_srv02.m and config_rotflex.m, 2010.
     """
     stiffness = spring_stiffness(spring, hub_anchor, arm_anchor)
-    return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance, sensors=sensors)
+    return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance, tied=tied, sensors=sensors)
 
 
 def arm_inertia(arm: int = 2) -> float:
@@ -256,11 +268,12 @@ def hub_inertia(tachometer: bool = True, body: float = 0.0005) -> float:
     return gears + _GEAR_RATIO**2 * 0.90 * motor + body
 
 
-def srv02_motor(inductance: float | None = None) -> Motor:
+def srv02_motor(inductance: float | None = None, *, tied: bool = False) -> Motor:
     """Motor and gear of the maker's servo.
 
     Args:
         inductance: [H] or None.
+        tied: Whether the back-EMF constant is the torque constant, also in fits.
 
     Source: Quanser, config_srv02.m, 2010, in high gear.
     """
@@ -272,6 +285,7 @@ def srv02_motor(inductance: float | None = None) -> Motor:
         gear_ratio=_GEAR_RATIO,
         efficiency=_EFFICIENCY,
         inductance=inductance,
+        tied=tied,
     )
 
 
@@ -281,13 +295,14 @@ def _srv02(
     *,
     hub_damping: float,
     inductance: float | None,
+    tied: bool,
     sensors: str | Sequence[str],
 ) -> Mechanism:
     return flexible_joint(
         hub_inertia=hub_inertia(),
         arm_inertia=arm_inertia(arm),
         stiffness=stiffness,
-        motor=srv02_motor(inductance),
+        motor=srv02_motor(inductance, tied=tied),
         hub_damping=hub_damping,
         sensors=sensors,
     )
