@@ -33,6 +33,7 @@ def fleet(
     scheduler: str | None = None,
     workers: int | None = None,
     split: float = 0.7,
+    pages: bool = False,
     search: Search = discover,
     progress: Callable[[str], None] | None = None,
     **reading: Any,
@@ -57,6 +58,8 @@ def fleet(
             same paths and have one thread each; the processes of this machine if None.
         workers: Processes of this machine; 0 for none but this one; by its cores and memory if None.
         split: Share of each recording for training, the first part.
+        pages: Whether to write `pages/NAME.html` for each, the report of its search without torques that are
+            missing or learned; the summary links to it. For a recording searched before, none is written.
         search: Function of `(model, train, test)`; `functools.partial(rf.discover, rounds=2)` for
             instance.
         progress: Called with a line of text for each recording.
@@ -82,7 +85,7 @@ def fleet(
     places = places_of(model, search, far=scheduler is not None)
     units = output_units(model.mechanism)
     reading = {"outputs": {c: c for c in units}, "units": units, **reading}
-    task = SearchTask(Path(), reading, split, _pickled(model, search), places)
+    task = SearchTask(Path(), reading, split, _pickled(model, search), places, pages)
     common = storage.digest_of_search(model, search, split, reading, places)
     batch = BatchProgress(sources, task, common, storage.created(folder), progress)
     try:

@@ -124,15 +124,21 @@ class TimeLeft:
         self._kind, self._step_began = line.kind, now
 
     def seconds(self) -> float | None:
-        """Time left [s] if this round is the last; None where a step of a kind to come was never measured."""
+        """Time left [s] if this round is the last; None where nothing measured tells it.
+
+        That is so where no step of a kind to come was measured yet, and where the one at work takes longer
+        than the last one of its kind.
+        """
         if self._kind is None:
             return None
         usual = self._usual(self._kind)
-        left = 0.0 if usual is None else max(usual - (self._clock() - self._step_began), 0.0)
         following = [self._usual(kind) for kind in _AFTER[self._kind]]
-        if usual is None or None in following:
+        if usual is None or None in following or self._overdue(usual):
             return None
-        return left + sum(x for x in following if x is not None)
+        return usual - (self._clock() - self._step_began) + sum(x for x in following if x is not None)
+
+    def _overdue(self, usual: float) -> bool:
+        return self._clock() - self._step_began > usual
 
     def _usual(self, kind: StepKind) -> float | None:
         return self._measured.get(kind, self._measured.get(_LIKE.get(kind, kind)))
@@ -141,7 +147,8 @@ class TimeLeft:
         """Time so far, and what is left in round numbers where it can be told."""
         so_far, left = f"{self._clock() - self._began:.0f} s so far", self.seconds()
         if left is None:
-            return so_far
+            usual = self._usual(self._kind) if self._kind else None
+            return so_far + (", longer than expected" if usual is not None and self._overdue(usual) else "")
         last = "" if self._kind in ("needed", "finish") else " if this round is the last"
         return f"{so_far}, {_roughly(left)} left{last}"
 

@@ -10,7 +10,15 @@ from rotflex_jax.discover.coloured_noise import advice, coloured_sensors
 from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, Stage
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label
-from rotflex_jax.text.numbers import multiple, plain_number, ratio, readable, unit_text, value_and_interval
+from rotflex_jax.text.numbers import (
+    multiple,
+    plain_number,
+    ratio,
+    readable,
+    together,
+    unit_text,
+    value_and_interval,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +159,7 @@ def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
         last = next(s[name] for s in reversed(stages) if name in s)
         each = tuple(value_and_interval(s[name]) if name in s else None for s in stages)
         shown = meanings.get(name, ""), unit_text(last.unit), not last.free, each
-        rows.append(ParameterRow(name, *shown, last.note, last.given_words))
+        rows.append(ParameterRow(name, *shown, last.note, together(last.given_words)))
     return tuple(sorted(rows, key=lambda r: r.held))
 
 
