@@ -43,9 +43,10 @@ def flexible_joint(
 
     Angles and voltage determine torques only up to a common factor, so the arm's inertia is
     trusted, and of the motor everything but its torque constant. Free are hub inertia, stiffness,
-    torque constant and both dampers. From the deflection alone no scale of the hub's torques follows either,
-    and the torque constant is trusted too: four numbers describe all that is linear between voltage and
-    deflection.
+    torque constant and both dampers. From the deflection alone four numbers describe all that is linear
+    between voltage and deflection, so that a model without dry friction leaves one combination of the five
+    open, and they have no intervals. Friction at the hub closes it: where it holds depends on the hub's own
+    motion, which a wrong torque constant would scale.
 
     The free torque constant stands for its product with the efficiency, which nobody knows well: a measured
     joint of the maker gives 0.0097 N m/A for 0.0077, and with a back-EMF constant that follows it a negative
@@ -70,8 +71,7 @@ def flexible_joint(
     Source: Lagrange's equations; Quanser, Rotary Flexible Joint workbook, 2011.
     """
     measured = _measured(sensors)
-    alone = measured == ("alpha",)
-    held = [name for name in motor.values if name != "torque_constant" or alone]
+    held = [name for name in motor.values if name != "torque_constant"]
     return Mechanism(
         coordinates=("theta", "alpha"),
         ports=PORTS,
