@@ -79,7 +79,7 @@ def fleet(
             f"Argument `search` must be a function of a model and two recordings, but is {shown(search)}; "
             "leave it out for rotflex_jax.discover."
         )
-    _check(sources, split, scheduler, workers)
+    _check(sources, split, scheduler, workers, pages)
     for name in reading:
         choose(name, inspect.signature(load).parameters, "argument of load")
     places = places_of(model, search, far=scheduler is not None)
@@ -136,11 +136,17 @@ def _sources(recordings: Any) -> list[Source]:
     )
 
 
-def _check(sources: Sequence[Source], split: float, scheduler: str | None, workers: int | None) -> None:
+def _check(
+    sources: Sequence[Source], split: float, scheduler: str | None, workers: int | None, pages: bool
+) -> None:
     """Checks the arguments before any work."""
     if not sources:
         raise InputError("No recording was given, but a fleet needs one or more; give files or recordings.")
     checks.number(split, "split", above=0, below=1, example="0.7")
+    if not isinstance(pages, bool):
+        raise InputError(
+            f"Argument `pages` must be True or False, but is {shown(pages)}; say whether each has a page."
+        )
     if workers is not None:
         checks.whole(workers, "workers", 0)
     if not (scheduler is None or isinstance(scheduler, str)):
