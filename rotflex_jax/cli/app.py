@@ -258,8 +258,8 @@ def _report(result: Any, folder: Path | None, json_file: Path | None) -> None:
 
     try:
         with terminal.progress("Writing the report") as step:
-            told = {"progress": step} if isinstance(result, Discovery) else {}
-            page = result.report(folder, **told)
+            searched = isinstance(result, Discovery)
+            page = result.report(folder, progress=step) if searched else result.report(folder)
     except Exception as error:
         if isinstance(error, OSError):
             reason = f"{error.filename or folder} cannot be used: {error.strerror or error}"

@@ -170,7 +170,9 @@ class Explorer:
         offered = [c for c in candidates if (c.name, c.at) not in {(e.name, e.at) for e in bare.effects}]
         for effect in offered:
             bare = bare + effect
-        self._solver = {} if isinstance(model, Mechanism) else {"solver": _model(model).solver}
+        self._solver: dict[str, Any] = {}
+        if not isinstance(model, Mechanism):
+            self._solver["solver"] = _model(model).solver
         off = {effect_label(e.name, e.at) for e in offered}
         self._train = listed(recordings)
         self._drawn = self._train[0]
