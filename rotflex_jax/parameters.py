@@ -7,13 +7,16 @@ An effect declares its parameters with `parameter(...)`; a fit varies unconstrai
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Real
+
+# Trusted constants that are named beside an interval; of more only their number is said.
+_NAMED_CONSTANTS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,6 +132,22 @@ def _bound_reached(value: float, std: float, spec: Specification) -> str:
     return ""
 
 
+class HeldConstant(NamedTuple):
+    """A trusted constant on which an estimate hangs.
+
+    Attributes:
+        name: Its full name.
+        value: What it was held at [unit].
+        unit: SI unit.
+        change: What the estimate gains where the constant is one per cent larger [unit of the estimate].
+    """
+
+    name: str
+    value: float
+    unit: str
+    change: float
+
+
 @dataclasses.dataclass(frozen=True)
 class Estimate:
     """One fitted or trusted parameter.
@@ -141,6 +160,8 @@ class Estimate:
         unit: SI unit.
         free: False where the value was trusted and held.
         note: What a reader must know, for instance that the estimate is not physical.
+        given: Trusted constants whose usual tolerance moves the estimate out of its interval, the strongest
+            first: the interval holds only as far as these are right.
     """
 
     name: str
@@ -150,6 +171,23 @@ class Estimate:
     unit: str
     free: bool = True
     note: str = ""
+    given: tuple[HeldConstant, ...] = ()
+
+    @property
+    def remark(self) -> str:
+        """Its note, and the trusted constants on which its interval hangs, in words."""
+        return "; ".join(filter(None, (self.note, self.given_words)))
+
+    @property
+    def given_words(self) -> str:
+        """The trusted constants on which its interval hangs, in words; empty where there are none."""
+        if not self.given:
+            return ""
+        named = [f"{c.name} {c.value:.4g} {c.unit}".rstrip() for c in self.given[:_NAMED_CONSTANTS]]
+        more = len(self.given) - len(named)
+        listed = ", ".join(named) + (f" and {more} more" if more else "")
+        which = "it" if len(self.given) == 1 else "the first"
+        return f"given {listed} (1 % more of {which}: {self.given[0].change:+.2g} {self.unit}".rstrip() + ")"
 
     @classmethod
     def of(cls, name: str, value: float, std: float, spec: Specification, note: str = "") -> "Estimate":
@@ -168,20 +206,21 @@ class Estimate:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
+        """Plain JSON types; `given` only where the interval hangs on trusted constants."""
         return {
             "value": self.value,
             "std": None if math.isnan(self.std) else self.std,
             "ci95": None if math.isnan(self.ci95[0]) else list(self.ci95),
             "unit": self.unit,
-        }
+        } | ({"given": [c._asdict() for c in self.given]} if self.given else {})
 
     def __str__(self) -> str:
         if not self.free:
-            return f"{self.name} = {self.value:.6g} {self.unit} (held)"
+            return f"{self.name} = {self.value:.6g} {self.unit} ({self.note or 'held'})"
         low, high = self.ci95
         if math.isnan(low) or math.isnan(high):
             return (
                 f"{self.name} = {self.value:.6g} {self.unit}  (no interval: {self.note or 'not determined'})"
             )
-        return f"{self.name} = {self.value:.6g} {self.unit}  [{low:.4g}, {high:.4g}]"
+        given = f"  {self.given_words}" if self.given else ""
+        return f"{self.name} = {self.value:.6g} {self.unit}  [{low:.4g}, {high:.4g}]{given}"

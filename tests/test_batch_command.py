@@ -107,3 +107,27 @@ def test_bad_arguments_are_refused_with_one_sentence(line, run) -> None:
     assert "Traceback" not in err
     if "torn" not in line:
         assert not Path("rotflex-each").exists()
+
+
+def test_each_file_has_its_page_and_the_summary_links_to_it(run, monkeypatch) -> None:
+    """With the search itself, of the smallest machine there is."""
+    from spindle import SPINDLE, spun
+
+    import rotflex_jax as rf
+    from rotflex_jax.batch import fleet
+
+    recording = spun()
+    search = functools.partial(rf.discover, candidates=[], rounds=0)
+    options = {"folder": "each", "workers": 0, "search": search}
+    found = fleet(SPINDLE, [recording], pages=True, **options)
+    (page,) = Path("each/pages").iterdir()
+    text = page.read_text()
+    assert found.rows[0].verdict.replace("_", " ") in text.lower() and "shaft.inertia.inertia" in text
+    assert f'href="pages/{page.name}"' in Path("each/summary.html").read_text()
+    assert f'href="recordings/{page.stem}.json"' in Path("each/summary.html").read_text()
+    # Where a recording has none, its row leads to its numbers; a second call leaves a page where it is.
+    fleet(SPINDLE, [recording], **options)
+    assert page.read_text() == text
+    page.unlink()
+    fleet(SPINDLE, [recording], **options)
+    assert "pages/" not in Path("each/summary.html").read_text()

@@ -22,6 +22,7 @@ from rotflex_jax.discover.assessment import assess
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Estimate
 from rotflex_jax.runtime import xla
 from rotflex_jax.text.numbers import digits
 
@@ -307,7 +308,7 @@ class FakeSearch:
             test=None,
             test_calibrated=None,
         )
-        level = SimpleNamespace(value=0.03, std=1e-3, ci95=(0.028, 0.032), unit="N m")
+        level = Estimate("hub.coulomb.level", 0.03, 1e-3, (0.028, 0.032), "N m")
         turn = SimpleNamespace(
             effect="coulomb",
             port="hub",

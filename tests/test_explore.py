@@ -83,6 +83,46 @@ def test_nothing_is_compiled_anew(explorer: Explorer) -> None:
     assert len(_free_many) == compiled
 
 
+def test_any_effect_of_the_catalogue_is_added_and_taken_back(explorer: Explorer) -> None:
+    before, labels = dict(explorer.errors), list(explorer.switches)
+    offered = dict(explorer.addable.options)
+    assert ("coulomb", "hub") not in offered.values() and ("coulomb", "joint") in offered.values()
+    explorer.add("coulomb", "joint")
+    assert [*labels, "Coulomb friction at joint"] == list(explorer.switches)
+    assert explorer.errors["alpha"] > 2 * before["alpha"]  # the truth has none there
+    assert ("coulomb", "joint") not in dict(explorer.addable.options).values()
+    explorer.add("gravity", "hub")  # by default of no size: then at a typical one
+    assert explorer.model.mechanism.effect("gravity", "hub").sine == 0.02
+    explorer.undo()
+    explorer.undo()
+    assert list(explorer.switches) == labels and explorer.errors == pytest.approx(before)
+    explorer.undo()  # nothing is left to take back
+    assert explorer.errors == pytest.approx(before)
+    with pytest.raises(InputError, match="in the model already"):
+        explorer.add("coulomb", "hub")
+
+
+def test_several_sliders_a_refit_and_undo(explorer: Explorer) -> None:
+    level, stiffness = "hub.coulomb.level", "joint.spring.stiffness"
+    best = dict(explorer.errors)
+    for name, factor in ((level, 0.4), (stiffness, 1.2)):
+        explorer.keep_slider(name)
+        explorer.sliders[name].value = factor
+    values = dict(zip((m := explorer.model.mechanism).parameter_names, m.values, strict=True))
+    assert (values[level], values[stiffness]) == pytest.approx((0.4 * 0.05, 1.2 * 1.61))
+    assert f"{level} = 0.02 N m" in explorer._text.value and explorer.errors["theta"] > 3 * best["theta"]
+    worse = dict(explorer.errors)
+    explorer.refit()  # from there back to the truth
+    assert explorer.errors["theta"] < 1.2 * best["theta"] and explorer.sliders[level].value == 1.0
+    assert "refitted: converged" in explorer._text.value
+    explorer.undo()
+    assert explorer.errors == pytest.approx(worse) and explorer.sliders[level].value == 0.4
+    explorer.undo()  # the second slider
+    assert explorer.sliders[stiffness].value == 1.0 and explorer.sliders[level].value == 0.4
+    explorer.parameter.value, explorer.factor.value = level, 0.7  # the other way to move it
+    assert explorer.sliders[level].value == 0.7
+
+
 def test_the_picture_is_one(explorer: Explorer) -> None:
     pixels = imread(io.BytesIO(explorer._image.value))
     assert pixels.shape[1] == 900 and pixels.std() > 0.05

@@ -355,6 +355,31 @@ def test_a_whole_number_that_is_chosen_is_a_plain_field(tmp_path, monkeypatch) -
     assert Power(at="joint", order=5).force(2.0, 0.0, 0.0) == -32.0
 
 
+# Sensors
+
+
+def test_a_sensor_that_is_not_read_is_said_and_the_cure_works(run, tmp_path, monkeypatch) -> None:  # noqa: F811
+    file, searched = tmp_path / "run.csv", []
+    speed = np.gradient(THETA, T)
+    frame(alpha=None, speed=speed).to_csv(file, index=False)
+
+    def kept(joint, train, validation, **options):
+        searched.append((joint.mechanism if hasattr(joint, "mechanism") else joint, train[0]))
+        raise InputError("That is enough for this test; stop here.")
+
+    monkeypatch.setattr(rf, "discover", kept)
+    _, _, err = run("discover", file)
+    assert "theta alone is read, though the file has 'speed' too" in err
+    assert "--joint paper:sensors=theta+speed" in err and searched[0][0].channels == ("theta",)
+    _, _, err = run("discover", file, "--joint", "paper:sensors=theta+speed")
+    assert "alone" not in err and searched[1][0].channels == ("theta", "speed")
+    assert searched[1][1].units == ("rad", "rad/s") and np.allclose(searched[1][1].y[:, 1], speed[:2100])
+    # Nothing is left out where both angles are read, or where the file has no other sensor.
+    for table in (frame(speed=speed), frame(alpha=None)):
+        found = rf.load(table, outputs=None if "alpha" in table else "theta")
+        assert not [x for x in found.findings if x.kind == "unused"]
+
+
 # MATLAB and spreadsheets
 
 

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rotflex_jax import joints
-from rotflex_jax.effects import Motor
+from arena.records import COUNT, JITTER, make_record
+from rotflex_jax import Recording, fit, joints
+from rotflex_jax.effects import Coulomb, Motor
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.springs import ARM_ANCHORS, HUB_ANCHORS, SIDE, SPRINGS
 from rotflex_jax.mechanism import linearise
@@ -177,15 +178,14 @@ def test_sensors_of_a_joint(preset: str, sensors: str | list[str], row: int) -> 
     np.testing.assert_allclose(b.C[0], np.eye(4)[row])
 
 
-def test_from_the_deflection_alone_the_torque_constant_is_held() -> None:
-    """Between voltage and deflection there are four numbers: as many as are then free.
+def test_from_the_deflection_alone_a_linear_joint_has_four_numbers() -> None:
+    """Between voltage and deflection; the fifth that is free is for what is not linear.
 
     alpha / V = -c3 s / (s^3 + c2 s^2 + c1 s + c0) / s
     """
     alone = joints.paper(sensors="alpha", hub_damping=0.004, joint_damping=0.003)
     names = alone.free_names
-    assert "hub.motor.torque_constant" not in names
-    assert "hub.motor.torque_constant" in joints.paper(sensors="speed").free_names
+    assert names == joints.paper().free_names and "hub.motor.torque_constant" in names
 
     def coefficients(mechanism) -> np.ndarray:
         linear = linearise(mechanism)
@@ -204,5 +204,22 @@ def test_from_the_deflection_alone_the_torque_constant_is_held() -> None:
         J = np.array(columns)
         return int(np.linalg.matrix_rank(J / np.linalg.norm(J, axis=1, keepdims=True), tol=1e-6))
 
-    assert rank(names) == len(names) == 4
-    assert rank((*names, "hub.motor.torque_constant")) == 4
+    assert (rank(names), len(names)) == (4, 5)
+    assert rank([n for n in names if n != "hub.motor.torque_constant"]) == 4
+
+
+def test_friction_at_the_hub_tells_the_torque_constant_to_the_deflection() -> None:
+    """Held, it would leave several times the noise, for which a search names effects that are not there."""
+    made = make_record([("coulomb", "hub")], kind="noise", seed=2, rms=2.0, seconds=6.0)
+    angle = Recording(u=made["u"], y=made["y"][:, 1], Ts=made["Ts"], channels="alpha", accept=("units",))
+    joint, constant = (
+        joints.paper(sensors="alpha") + Coulomb(at="hub", level=0.02),
+        "hub.motor.torque_constant",
+    )
+    true = made["truth"]["plant"]["k_t"]
+    assert abs(true / 0.00767 - 1) > 0.15  # what the preset says is wrong
+    found = fit(joint, angle)
+    assert found.noise["alpha"] < 1.2 * np.hypot(JITTER, COUNT / np.sqrt(12))
+    assert found[constant].value == pytest.approx(true, abs=4 * found[constant].std)
+    assert found["hub.coulomb.level"].value == pytest.approx(0.03, rel=0.02)
+    assert fit(joint.trust(constant), angle).noise["alpha"] > 3 * found.noise["alpha"]

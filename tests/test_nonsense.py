@@ -367,6 +367,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         (["no.csv"], "no.csv does not exist"),
     ],
     ("fleet", "split"): [(NAN, "is nan"), ("a", "is 'a'"), (0, "is 0"), (1, "is 1")],
+    ("fleet", "pages"): [(3, "True or False, but is 3")],
     ("fleet", "workers"): [(-1, "is -1"), (1.5, "is 1.5"), (NAN, "is nan")],
     ("fleet", "search"): [(3, "a function of a model and two recordings, but is 3")],
     ("fleet", "scheduler"): [(3, "must be an address, but is 3")],
@@ -529,6 +530,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         (3, "list of names, but is 3"),
         ("theta+theta", "but is 'theta.theta'"),
     ],
+    ("joints.paper", "tied"): [("yes", "needs True or False"), (1, "needs True or False")],
     ("joints.quanser_2010", "sensors"): [(["x"], "but is 'x'")],
     ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
 }

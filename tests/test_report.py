@@ -245,7 +245,8 @@ def discovery() -> Discovery:
 def undrawn(monkeypatch) -> None:
     """Pages without figures, which take most of the time."""
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
-    monkeypatch.setattr(Discovery, "latent_torque", lambda self: LatentTorqueComparison(photographed(), None))
+    torques = LatentTorqueComparison(photographed(), None)
+    monkeypatch.setattr(Discovery, "latent_torque", lambda self, progress: torques)
 
 
 @pytest.fixture(scope="module")
@@ -456,7 +457,7 @@ def test_a_map_is_learned_only_where_something_is_unexplained(
 ) -> None:
     asked: list[str] = []
 
-    def learned_torque(self, at: str) -> LearnedTorqueResult:
+    def learned_torque(self, at: str, progress) -> LearnedTorqueResult:
         asked.append(at)
         return map_of_friction(self, True)
 

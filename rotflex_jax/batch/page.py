@@ -162,6 +162,9 @@ def _row(row: RecordingRow, fleet: Fleet) -> dict[str, Any]:
     return {
         "name": row.name,
         "file": f"{storage.RESULTS}/{row.name}.json",
+        "page": f"{storage.PAGES}/{row.name}.html"
+        if storage.page_of(fleet.folder, row.name).exists()
+        else "",
         "verdict": Verdict(row.verdict).label,
         "effects": [
             " or ".join(effect_label(*place) for place in ((effect, port), *others))

@@ -33,6 +33,7 @@ def fleet(
     scheduler: str | None = None,
     workers: int | None = None,
     split: float = 0.7,
+    pages: bool = False,
     search: Search = discover,
     progress: Callable[[str], None] | None = None,
     **reading: Any,
@@ -57,6 +58,8 @@ def fleet(
             same paths and have one thread each; the processes of this machine if None.
         workers: Processes of this machine; 0 for none but this one; by its cores and memory if None.
         split: Share of each recording for training, the first part.
+        pages: Whether to write `pages/NAME.html` for each, the report of its search without torques that are
+            missing or learned; the summary links to it. For a recording searched before, none is written.
         search: Function of `(model, train, test)`; `functools.partial(rf.discover, rounds=2)` for
             instance.
         progress: Called with a line of text for each recording.
@@ -76,13 +79,13 @@ def fleet(
             f"Argument `search` must be a function of a model and two recordings, but is {shown(search)}; "
             "leave it out for rotflex_jax.discover."
         )
-    _check(sources, split, scheduler, workers)
+    _check(sources, split, scheduler, workers, pages)
     for name in reading:
         choose(name, inspect.signature(load).parameters, "argument of load")
     places = places_of(model, search, far=scheduler is not None)
     units = output_units(model.mechanism)
     reading = {"outputs": {c: c for c in units}, "units": units, **reading}
-    task = SearchTask(Path(), reading, split, _pickled(model, search), places)
+    task = SearchTask(Path(), reading, split, _pickled(model, search), places, pages)
     common = storage.digest_of_search(model, search, split, reading, places)
     batch = BatchProgress(sources, task, common, storage.created(folder), progress)
     try:
@@ -133,11 +136,17 @@ def _sources(recordings: Any) -> list[Source]:
     )
 
 
-def _check(sources: Sequence[Source], split: float, scheduler: str | None, workers: int | None) -> None:
+def _check(
+    sources: Sequence[Source], split: float, scheduler: str | None, workers: int | None, pages: bool
+) -> None:
     """Checks the arguments before any work."""
     if not sources:
         raise InputError("No recording was given, but a fleet needs one or more; give files or recordings.")
     checks.number(split, "split", above=0, below=1, example="0.7")
+    if not isinstance(pages, bool):
+        raise InputError(
+            f"Argument `pages` must be True or False, but is {shown(pages)}; say whether each has a page."
+        )
     if workers is not None:
         checks.whole(workers, "workers", 0)
     if not (scheduler is None or isinstance(scheduler, str)):

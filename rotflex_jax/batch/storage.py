@@ -23,7 +23,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.digest import content, digest_of
 from rotflex_jax.text.files import write_file
 
-RESULTS, MODELS = "recordings", "models"
+RESULTS, MODELS, PAGES = "recordings", "models", "pages"
 RESULT_SCHEMA = 1
 
 
@@ -81,12 +81,20 @@ def _short(source: Path | Recording, number: int) -> str:
 
 
 def write(folder: Path, record: Record) -> None:
-    """Writes a result, and before it its model; each completely or not at all."""
+    """Writes a result, and before it its model and its page; each completely or not at all."""
     record = {"schema": RESULT_SCHEMA, **record}
-    model, name = record.pop("model"), f"{record['name']}.json"
+    model, page, name = record.pop("model"), record.pop("page", None), f"{record['name']}.json"
     if model is not None:
         write_file(folder / MODELS / name, model)
+    if page is not None:
+        (folder / PAGES).mkdir(exist_ok=True)
+        write_file(page_of(folder, record["name"]), page)
     write_file(folder / RESULTS / name, json.dumps(record, indent=1) + "\n")
+
+
+def page_of(folder: Path, name: str) -> Path:
+    """Where the page of a recording is, if it has one."""
+    return folder / PAGES / f"{name}.html"
 
 
 def read(folder: Path, name: str, digest: str) -> Record | None:

@@ -14,6 +14,8 @@ from typing import Any
 
 from rotflex_jax.batch.code_digest import MAIN
 from rotflex_jax.data import load
+from rotflex_jax.discover.discovery import Discovery
+from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import imported
@@ -24,7 +26,7 @@ from rotflex_jax.runtime.xla import enable_fast_start
 Search = Callable[[Model, Recording, Recording], Any]
 Record = dict[str, Any]
 """Plain JSON: `state` is `done`, `refused` (bad input) or `broken` (worth another try); with it go `reason`,
-`seconds`, `result`, and `model`, the text of its file."""
+`seconds`, `result`, and the texts of the files `model` and `page`."""
 
 # A search uses a whole core and much memory, so the threads of a worker search one after the other.
 _ONE_SEARCH = threading.Lock()
@@ -40,6 +42,7 @@ class SearchTask:
         share: Share of the recording for training.
         what: Pickled `(model, search)`; they can only be unpickled after the `places` are imported.
         places: Python files or modules with effects of the user.
+        pages: Whether the result has a page too.
     """
 
     source: Path | Recording
@@ -47,6 +50,7 @@ class SearchTask:
     share: float
     what: bytes
     places: tuple[str, ...] = ()
+    pages: bool = False
 
 
 def carry_out(task: SearchTask) -> Record:
@@ -64,7 +68,8 @@ def carry_out(task: SearchTask) -> Record:
 
 def record(state: str, reason: str = "") -> Record:
     """The record of a recording without a result; the reason on one line."""
-    return {"state": state, "reason": " ".join(reason.split()), "seconds": 0.0, "result": None, "model": None}
+    files: Record = {"model": None, "page": None}
+    return {"state": state, "reason": " ".join(reason.split()), "seconds": 0.0, "result": None} | files
 
 
 def prepared(task: SearchTask) -> Record:
@@ -80,7 +85,7 @@ def _searched(task: SearchTask) -> Any:
     source = task.source
     recording = source if isinstance(source, Recording) else load(source, **task.reading)
     found = search(model, *recording.split(task.share))
-    return {"result": found.to_dict(), "model": _model(found)}
+    return {"result": found.to_dict(), "model": _model(found), "page": _page(found) if task.pages else None}
 
 
 def _model(found: Any) -> str | None:
@@ -90,6 +95,15 @@ def _model(found: Any) -> str | None:
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(InputError):
         return found.save(Path(folder) / "model.json").read_text(encoding="utf-8")
     return None
+
+
+def _page(found: Any) -> str | None:
+    """The report of a search as text, without what takes as long as another round; None where it has none."""
+    if not isinstance(found, Discovery):
+        return None
+    from rotflex_jax.report.page import render  # matplotlib is loaded only where it draws
+
+    return render(found, Explanation(remaining=remaining_failures(found)))
 
 
 def subjects(model: Model, search: Search) -> tuple[Any, ...]:

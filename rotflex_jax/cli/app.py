@@ -254,9 +254,12 @@ def _report(result: Any, folder: Path | None, json_file: Path | None) -> None:
     """
     if folder is None:
         return
+    from rotflex_jax.discover.discovery import Discovery  # loaded by what made the result
+
     try:
-        with terminal.progress("Writing the report"):
-            page = result.report(folder)
+        with terminal.progress("Writing the report") as step:
+            searched = isinstance(result, Discovery)
+            page = result.report(folder, progress=step) if searched else result.report(folder)
     except Exception as error:
         if isinstance(error, OSError):
             reason = f"{error.filename or folder} cannot be used: {error.strerror or error}"

@@ -61,6 +61,7 @@ def search_each(
             scheduler=scheduler,
             workers=workers,
             split=share,
+            pages=True,
             progress=lambda line: step(given.as_options(line)),
             **options,
             **columns.reading(),

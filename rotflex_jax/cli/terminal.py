@@ -2,6 +2,8 @@
 
 import csv
 import math
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import StringIO
@@ -20,6 +22,8 @@ from rotflex_jax.text.plain import one_line, printable, spreadsheet_cell
 
 # Rows of a long table that are shown.
 LISTED_RECORDINGS = 60
+# Work says something so often [s], and says a long line again with so many characters of it.
+SILENCE, LONGEST_AGAIN = 10.0, 60
 
 
 class SafeConsole(Console):
@@ -42,9 +46,42 @@ def output() -> Console:
     return console if console.is_terminal else SafeConsole(highlight=False, soft_wrap=True, width=160)
 
 
+class _Told:
+    """The last line of progress, with how long it has stood there."""
+
+    def __init__(self, title: str) -> None:
+        self.line, self.time_left = title, None
+        self.began = self.since = self.shown = time.monotonic()
+
+    def take(self, step: str) -> str:
+        """A new line, as it is shown."""
+        if self.time_left is None and hasattr(step, "kind"):  # a search has begun
+            from rotflex_jax.discover.milestone import TimeLeft
+
+            self.time_left = TimeLeft()
+        if self.time_left is not None:
+            self.time_left.follow(step)
+        self.line = _named(step)
+        self.since = self.shown = time.monotonic()
+        return self.line if step.startswith(" ") else f"{self.line} ({self._times()})"
+
+    def _times(self) -> str:
+        return self.time_left.words() if self.time_left else f"{time.monotonic() - self.began:.0f} s so far"
+
+    def again(self) -> str:
+        """The same line, after a while without another one."""
+        self.shown = time.monotonic()
+        line = self.line.strip()
+        short = line if len(line) <= LONGEST_AGAIN else line[: LONGEST_AGAIN - 1].rsplit(" ", 1)[0] + " …"
+        return f"  still {short} ({self.shown - self.since:.0f} s; {self._times()})"
+
+
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[str], None]]:
     """Show what long work is doing: a spinner on a terminal, one line per step elsewhere.
+
+    Each step has the time so far, and in a search what is left of it where that can be told. Where no step
+    ends for `SILENCE` seconds, the last one is said again with how long it has taken.
 
     Args:
         title: What is shown until the work reports its first step.
@@ -52,12 +89,36 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
     Yields:
         The function to call with one short phrase per step.
     """
-    console = SafeConsole(stderr=True, highlight=False)
-    if not console.is_terminal:
-        yield lambda step: console.print(_named(step), markup=False, soft_wrap=True)
+    console, told, ended = SafeConsole(stderr=True, highlight=False), _Told(title), threading.Event()
+    if console.is_terminal:
+        with console.status(title) as status:
+            show, every = lambda text: status.update(cell(text)), 1.0
+            with _repeating(told, show, every, ended):
+                yield lambda step: show(told.take(step))
         return
-    with console.status(title) as status:
-        yield lambda step: status.update(cell(_named(step)))
+    show = lambda text: console.print(text, markup=False, soft_wrap=True)  # noqa: E731
+    with _repeating(told, show, SILENCE, ended):
+        yield lambda step: show(told.take(step))
+
+
+@contextmanager
+def _repeating(
+    told: _Told, show: Callable[[str], None], every: float, ended: threading.Event
+) -> Iterator[None]:
+    """Says the last line again where nothing was said for so many seconds."""
+
+    def watch() -> None:
+        while not ended.wait(min(every / 4, 1.0)):
+            if time.monotonic() - told.shown >= every:
+                show(told.again())
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
 
 
 def _named(step: str) -> str:
@@ -92,7 +153,7 @@ def estimate_line(name: str, estimate: Any) -> str:
     low, high = estimate.ci95
     if math.isfinite(low) and math.isfinite(high):
         text += f"   95 %: {digits(low, 4)} .. {digits(high, 4)}"
-    return text
+    return f"{text}   {estimate.remark}" if estimate.given else text
 
 
 def print_discovery(result: Any) -> None:

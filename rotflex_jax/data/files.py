@@ -246,6 +246,9 @@ def _first(source: Any, names: Sequence[str]) -> Any:
 OTHER_NAMES = {"t": ("time",), "theta": ("θ",), "alpha": ("α",)}
 """What the columns of the joint may be called as well."""
 
+JOINT_SENSORS = ("theta", "alpha", "speed")
+"""Columns that a joint may have as sensors."""
+
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 """Unit of a time -> seconds."""
 
@@ -379,7 +382,7 @@ def load(
             )
     if arm_absolute:
         y = _deflection(y)
-    remarks: list[Finding] = []
+    remarks = _unused(table, tuple(y), {u_name, clock, *chosen.values()})
     if apart:
         if resample is None:
             raise InputError(
@@ -434,6 +437,23 @@ def load(
         cut = Finding("cut", [*table.columns][-1], table.cut, "note")
         vars(recording)["findings"] = (*recording.findings, cut)
     return recording
+
+
+def _unused(table: Table, channels: Sequence[str], used: set[str]) -> list[Finding]:
+    """What is said of sensors of a joint that the file has too, where one alone is read."""
+    if len(channels) != 1 or channels[0] not in JOINT_SENSORS:
+        return []
+    there = {c: table.find(c, *OTHER_NAMES.get(c, ())) for c in JOINT_SENSORS}
+    left = {c: name for c, name in there.items() if name in table.columns and name not in used}
+    if not left:
+        return []
+    sensors = [c for c in JOINT_SENSORS if c in left or c in channels]
+    others = ", ".join(map(repr, left.values()))
+    message = (
+        f"{table.label}: {channels[0]} alone is read, though the file has {others} too; for a search with "
+        f"all of them give a joint with these sensors, --joint paper:sensors={'+'.join(sensors)}."
+    )
+    return [Finding("unused", next(iter(left)), message, "warning")]
 
 
 def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:

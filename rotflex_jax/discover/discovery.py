@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rotflex_jax import checks
 from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.discover.latent_comparison import LatentTorqueComparison, compare_latent_torques
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult, learn_torque
@@ -57,20 +58,26 @@ class Discovery(SearchResult):
             self.model, self.train, self.validation, at, window_seconds=seconds, progress=progress
         )
 
-    def explanation(self, learned: bool | None = None) -> Explanation:
+    def explanation(
+        self, learned: bool | None = None, progress: Callable[[str], None] | None = None
+    ) -> Explanation:
         """Everything that a report needs beyond the search itself; takes about a minute.
 
         Args:
             learned: Whether to learn a torque at the port where most is left; where the verdict is
                 `unexplained` if None.
+            progress: Called with a line of text at each stage.
         """
-        latent, torque = self.latent_torque(), None
+        say = checks.progress(progress)
+        say("report: torques that the models lack")
+        latent, torque = self.latent_torque(progress), None
         if self.verdict == Verdict.UNEXPLAINED if learned is None else learned:
             gains = (latent.after or latent.before).gain_nats
             try:
-                torque = self.learned_torque(max(gains, key=lambda port: gains[port]))
+                torque = self.learned_torque(max(gains, key=lambda port: gains[port]), progress)
             except InputError:  # no sensor tells how that port moves
                 torque = None
+        say("report: tests of the residuals and frequency responses")
         return Explanation(latent, torque, remaining_failures(self), model_tests(self))
 
     def save(self, path: str | Path) -> Path:
@@ -89,7 +96,13 @@ class Discovery(SearchResult):
         """
         return proposed(self, **changes)
 
-    def report(self, folder: str | Path, *, learned: bool | None = None) -> Path:
+    def report(
+        self,
+        folder: str | Path,
+        *,
+        learned: bool | None = None,
+        progress: Callable[[str], None] | None = None,
+    ) -> Path:
         """Write `report.html` (self-contained) and `result.json` into a folder; returns the HTML path.
 
         Where the verdict is ambiguous, the input to play next lies beside them as a file.
@@ -98,13 +111,16 @@ class Discovery(SearchResult):
             folder: Where to write.
             learned: Whether to learn a torque for what is left, which takes about as long as a round; where
                 the verdict is `unexplained` if None.
+            progress: Called with a line of text at each stage.
         """
         from rotflex_jax.report import write_report  # the layer above, on request
 
         folder = Path(folder)
         # First of all, so that whatever fails below costs nothing of the result.
         write_files(folder, {"result.json": as_json(self.to_dict())})
-        page = write_report(self, folder, self.explanation(learned))
+        explanation = self.explanation(learned, progress)
+        checks.progress(progress)("report: drawing figures")
+        page = write_report(self, folder, explanation)
         if self.proposal is not None:
             self.proposal.save_csv(folder / NEXT)
         return page

@@ -27,6 +27,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit import inference
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import padded_length, prepare
+from rotflex_jax.fit.held_constants import with_held_constants
 from rotflex_jax.fit.inference import Combination, RecordingSlopes, curvature, sandwich
 from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.fit.windows import Windows
@@ -206,7 +207,7 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
         differs = i in h.local and R > 1
         return "mean of " + ", ".join(f"{v:.3g}" for v in values[:, i]) if differs else ""
 
-    return inference.estimates(
+    found = inference.estimates(
         clean.parameter_names,
         values.mean(axis=0)[indices],
         clean.parameter_specifications,
@@ -214,6 +215,7 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
         covariance,
         [note(i) for i in indices],
     )
+    return with_held_constants(clean, found)
 
 
 def differing(

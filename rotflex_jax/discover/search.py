@@ -45,7 +45,7 @@ from rotflex_jax.discover.hypothesis import (
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.localise import locate
-from rotflex_jax.discover.milestone import milestone
+from rotflex_jax.discover.milestone import beginning, milestone
 from rotflex_jax.discover.pairs import find_pair, is_unexplained
 from rotflex_jax.discover.probabilities import Probabilities, probabilities
 from rotflex_jax.discover.proposal import with_proposal
@@ -264,23 +264,23 @@ def discover(
     evaluation = Evaluation.of(model, horizons, _several(test, "test"), calibrate_seconds)
     digest = digest_of_search(model, horizons.prediction.problem.supermodel, window_seconds, seen)
     if resume is None:
-        say("fitting the model as it is")
+        say(beginning("baseline", "fitting the model as it is"))
         state = _fit_as_it_is(model, horizons, say, digest)
     else:
         state = _as_it_was(model, horizons, say, digest, resume)
     while len(state.scores) < rounds:
         left = len(state.problem.supermodel.candidates) - len(state.scores)
-        say(f"round {len(state.scores) + 1}: scoring {left} candidates")
+        say(beginning("score", f"round {len(state.scores) + 1}: scoring {left} candidates"))
         promising_scores, starts, runs_starts = _score_candidates(state)
         if starts:
-            say("refitting " + ", ".join(str(start.location) for start in starts))
+            say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
             if _decide(state, _refit(state, starts, runs_starts), promising_scores):
                 continue
         if len(state.scores) + 2 > rounds or not _add_pair(state):
             break
-    say("checking that each effect is needed")
+    say(beginning("needed", "checking that each effect is needed"))
     _simplify(state)
-    say("simulating the validation recordings")
+    say(beginning("finish", "simulating the validation recordings"))
     return with_proposal(_report(state, evaluation, started))
 
 
@@ -460,6 +460,7 @@ def _add_pair(state: SearchState) -> bool:
     """Add two effects that are needed together, where something is left; False where there are none."""
     if state.tests is None or not is_unexplained(state.horizons, state.current):
         return False
+    state.say(beginning("pairs", "scoring pairs of candidates"))
     pair, tried = find_pair(state.horizons, state.current, state.tests, state.is_plausible, state.say)
     state.tried += tried
     if pair is None:

@@ -10,7 +10,15 @@ from rotflex_jax.discover.coloured_noise import advice, coloured_sensors
 from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, Stage
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label
-from rotflex_jax.text.numbers import multiple, plain_number, ratio, readable, unit_text, value_and_interval
+from rotflex_jax.text.numbers import (
+    multiple,
+    plain_number,
+    ratio,
+    readable,
+    together,
+    unit_text,
+    value_and_interval,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +46,10 @@ class ErrorRow:
 
 @dataclasses.dataclass(frozen=True)
 class ParameterRow:
-    """One parameter in all stages: (value, interval) each, None where the stage lacks it."""
+    """One parameter in all stages: (value, interval) each, None where the stage lacks it.
+
+    `given` are the trusted constants on which the interval of the last stage hangs, in words.
+    """
 
     name: str
     meaning: str
@@ -46,6 +57,7 @@ class ParameterRow:
     held: bool
     stages: tuple[tuple[str, str] | None, ...]
     note: str
+    given: str = ""
 
 
 def stage_labels(discovery: SearchResult) -> tuple[str, ...]:
@@ -146,9 +158,8 @@ def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
     for name in names:
         last = next(s[name] for s in reversed(stages) if name in s)
         each = tuple(value_and_interval(s[name]) if name in s else None for s in stages)
-        rows.append(
-            ParameterRow(name, meanings.get(name, ""), unit_text(last.unit), not last.free, each, last.note)
-        )
+        shown = meanings.get(name, ""), unit_text(last.unit), not last.free, each
+        rows.append(ParameterRow(name, *shown, last.note, together(last.given_words)))
     return tuple(sorted(rows, key=lambda r: r.held))
 
 

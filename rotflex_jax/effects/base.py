@@ -176,6 +176,11 @@ class Effect(abc.ABC):
         return 0
 
     @property
+    def follows(self) -> dict[str, str]:
+        """Parameter -> the other one of this effect that it always equals; a fit moves the other one."""
+        return {}
+
+    @property
     def location(self) -> str:
         """Where it acts, in words."""
         words = {"port": f"at {self.at}", "input": "on the voltage", "channel": f"at the sensor {self.at}"}

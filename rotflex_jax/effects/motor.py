@@ -5,6 +5,7 @@ import math
 from typing import ClassVar
 
 from rotflex_jax.effects.base import Drive, Linear, Memory, Probe, Scalar, Scale, Stamp, register
+from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import parameter
 
 
@@ -19,6 +20,11 @@ class Motor(Linear):
     Without an inductance the current follows the voltage at once. Not for a motor driven by a
     current amplifier: that has no back-EMF.
 
+    In SI units torque constant and back-EMF constant of one motor are one number, and `tied` makes them one:
+    a fit of the torque constant moves the back-EMF with it. Not where the efficiency is a guess: the fitted
+    torque constant then stands for its product with what the gear really loses, and the back-EMF would
+    follow it away from its true value.
+
     Args:
         at: Port the gear drives.
         torque_constant: Torque per current [N m/A].
@@ -27,6 +33,7 @@ class Motor(Linear):
         gear_ratio: Turns of the motor per turn of the port.
         efficiency: Of motor and gear together; 1 for none lost.
         inductance: Of the armature [H], or None.
+        tied: Whether `back_emf` is the torque constant, whatever is given for it.
 
     Source: Quanser, SRV02 user manual, 2011, table 3.1 and the section on modelling.
     """
@@ -51,6 +58,23 @@ class Motor(Linear):
     inductance: float | None = parameter(
         None, unit="H", typical=2e-4, lower=1e-9, meaning="armature inductance"
     )
+
+    tied: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.tied, bool):
+            raise InputError(
+                f"Motor was given tied={self.tied!r}, but it needs True or False; say whether the back-EMF "
+                "constant is the torque constant."
+            )
+        if self.tied:
+            object.__setattr__(self, "back_emf", self.torque_constant)
+        super().__post_init__()
+
+    @property
+    def follows(self) -> dict[str, str]:
+        """The back-EMF constant follows the torque constant, where they are tied."""
+        return {"back_emf": "torque_constant"} if self.tied else {}
 
     @property
     def order(self) -> int:

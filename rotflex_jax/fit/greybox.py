@@ -14,6 +14,7 @@ from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports
+from rotflex_jax.fit.held_constants import with_held_constants
 from rotflex_jax.fit.inference import (
     Combination,
     RecordingSlopes,
@@ -542,7 +543,9 @@ def report(
     determined = [k for k in range(len(free)) if together[:, k].any()]
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
     notes = [at_end.get(name, "") for name in names]
-    fitted, found = m.with_values(common), estimates(names, common, specs, combinations, covariance, notes)
+    fitted = m.with_values(common)
+    found = estimates(names, common, specs, combinations, covariance, notes)
+    found = with_held_constants(fitted, found)
     reach = Reach.of(model, problem.dataset.recordings)
     return Fit(
         model=dataclasses.replace(model, mechanism=fitted),
@@ -560,6 +563,8 @@ def report(
         local=local,
         remarks=(*at_bounds(found), *beyond_recordings(fitted, reach)),
         options=options or FitOptions(),
+        Ts=problem.dataset.recordings[0].Ts,
+        n_init=problem.dataset.recordings[0].n_init,
     )
 
 

@@ -70,6 +70,8 @@ class Fit:
             recordings; `parameters` has the mean.
         remarks: Parameters at a bound, or far beyond what the recordings reach, each with a sentence.
         options: How it was asked for.
+        Ts: Sampling period of the first recording [s], which a saved model keeps; None where none is known.
+        n_init: Samples at its start that the fit looked at, or None.
     """
 
     model: Model
@@ -85,6 +87,8 @@ class Fit:
     local: dict[str, tuple[Estimate, ...]] = dataclasses.field(default_factory=dict)
     remarks: tuple[Remark, ...] = ()
     options: FitOptions = FitOptions()
+    Ts: float | None = None
+    n_init: int | None = None
 
     @property
     def profile_advised(self) -> tuple[str, ...]:
@@ -145,10 +149,11 @@ class Fit:
         return self.status if counted else f"{self.status} after {self.steps} steps"
 
     def save(self, path: str | Path) -> Path:
-        """Write the model as JSON, with estimates and their covariance; `Model.load` reads the model."""
+        """Write model, estimates, covariance and sampling period as JSON; `Model.load` reads the model."""
         from rotflex_jax.models.model_json import Saved, save  # the layer above, on request
 
-        return save(Saved(self.model, self.parameters, self.covariance, self.free_names), path)
+        own = self.model, self.parameters, self.covariance, self.free_names
+        return save(Saved(*own, self.Ts, self.n_init), path)
 
     def plot(self, recording: Recording, seconds: float | None = None) -> "Figure":
         """Measured against simulated outputs, with errors and the fit in per cent; a notebook shows it.
@@ -166,7 +171,7 @@ class Fit:
             value, unit = readable(self.noise[channel], own)
             residuals.append((channel, unit, plain_number(value)))
         for e in sorted(self.parameters, key=lambda e: not e.free):
-            note = e.note if e.free else "held"
+            note = e.remark if e.free else e.note or "held"
             estimates.append((e.name, unit_text(e.unit), note, *value_and_interval(e)))
         for e in self.parameters:
             width = 100 * 1.96 * e.std / abs(e.value) if e.free and e.value else math.nan

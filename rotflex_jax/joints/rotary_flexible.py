@@ -43,9 +43,15 @@ def flexible_joint(
 
     Angles and voltage determine torques only up to a common factor, so the arm's inertia is
     trusted, and of the motor everything but its torque constant. Free are hub inertia, stiffness,
-    torque constant and both dampers. From the deflection alone no scale of the hub's torques follows either,
-    and the torque constant is trusted too: four numbers describe all that is linear between voltage and
-    deflection.
+    torque constant and both dampers. From the deflection alone four numbers describe all that is linear
+    between voltage and deflection, so that a model without dry friction leaves one combination of the five
+    open, and they have no intervals. Friction at the hub closes it: where it holds depends on the hub's own
+    motion, which a wrong torque constant would scale.
+
+    The free torque constant stands for its product with the efficiency, which nobody knows well: a measured
+    joint of the maker gives 0.0097 N m/A for 0.0077, and with a back-EMF constant that follows it a negative
+    damping of the hub. So the two constants are tied only where the motor says so (`tied=True`); otherwise
+    the back-EMF constant is trusted, and an estimate of the hub's damping says how it hangs on that.
 
     Args:
         hub_inertia: With motor and gears, as the hub feels it [kg m^2].
@@ -65,8 +71,7 @@ def flexible_joint(
     Source: Lagrange's equations; Quanser, Rotary Flexible Joint workbook, 2011.
     """
     measured = _measured(sensors)
-    alone = measured == ("alpha",)
-    held = [name for name in motor.values if name != "torque_constant" or alone]
+    held = [name for name in motor.values if name != "torque_constant"]
     return Mechanism(
         coordinates=("theta", "alpha"),
         ports=PORTS,
@@ -106,6 +111,7 @@ def paper(
     inductance: float | None = None,
     hub_damping: float = 0.0,
     joint_damping: float = 0.0,
+    tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The joint of the paper "Nonlinear Identification of a Rotary Flexible Joint Experiment".
@@ -125,6 +131,7 @@ def paper(
         inductance: [H]; the maker says 0.18 mH. None for a current that follows at once.
         hub_damping: [N m s/rad].
         joint_damping: [N m s/rad].
+        tied: Whether `back_emf` is the torque constant, also in fits; for a known efficiency.
         sensors: What is measured; see `flexible_joint`.
 
     Returns:
@@ -150,6 +157,7 @@ def paper(
             gear_ratio=gear_ratio,
             efficiency=efficiency,
             inductance=inductance,
+            tied=tied,
         ),
         hub_damping=hub_damping,
         joint_damping=joint_damping,
@@ -164,6 +172,7 @@ def quanser_2002(
     hub_anchor: str = "B",
     arm_anchor: int = 2,
     inductance: float | None = None,
+    tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The maker's joint on an SRV02 servo, by the files of 2002.
@@ -176,6 +185,7 @@ def quanser_2002(
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
         inductance: [H] or None.
+        tied: Whether the back-EMF constant is the torque constant, also in fits; for a known efficiency.
         sensors: What is measured; see `flexible_joint`.
 
     Returns:
@@ -184,7 +194,7 @@ def quanser_2002(
     Source: Quanser, config_servo_exp.m and config_flexjoint.m, 2002.
     """
     stiffness = spring_stiffness(spring, hub_anchor, arm_anchor, preload_only=True)
-    return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance, sensors=sensors)
+    return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance, tied=tied, sensors=sensors)
 
 
 def quanser_2010(
@@ -194,6 +204,7 @@ def quanser_2010(
     hub_anchor: str = "B",
     arm_anchor: int = 2,
     inductance: float | None = None,
+    tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
     """The maker's joint on an SRV02 servo, by the files of 2010.
@@ -204,6 +215,7 @@ def quanser_2010(
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
         inductance: [H] or None.
+        tied: Whether the back-EMF constant is the torque constant, also in fits; for a known efficiency.
         sensors: What is measured; see `flexible_joint`.
 
     Returns:
@@ -212,7 +224,7 @@ def quanser_2010(
     Source: Quanser, config_srv02.m and config_rotflex.m, 2010.
     """
     stiffness = spring_stiffness(spring, hub_anchor, arm_anchor)
-    return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance, sensors=sensors)
+    return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance, tied=tied, sensors=sensors)
 
 
 def arm_inertia(arm: int = 2) -> float:
@@ -256,11 +268,12 @@ def hub_inertia(tachometer: bool = True, body: float = 0.0005) -> float:
     return gears + _GEAR_RATIO**2 * 0.90 * motor + body
 
 
-def srv02_motor(inductance: float | None = None) -> Motor:
+def srv02_motor(inductance: float | None = None, *, tied: bool = False) -> Motor:
     """Motor and gear of the maker's servo.
 
     Args:
         inductance: [H] or None.
+        tied: Whether the back-EMF constant is the torque constant, also in fits.
 
     Source: Quanser, config_srv02.m, 2010, in high gear.
     """
@@ -272,6 +285,7 @@ def srv02_motor(inductance: float | None = None) -> Motor:
         gear_ratio=_GEAR_RATIO,
         efficiency=_EFFICIENCY,
         inductance=inductance,
+        tied=tied,
     )
 
 
@@ -281,13 +295,14 @@ def _srv02(
     *,
     hub_damping: float,
     inductance: float | None,
+    tied: bool,
     sensors: str | Sequence[str],
 ) -> Mechanism:
     return flexible_joint(
         hub_inertia=hub_inertia(),
         arm_inertia=arm_inertia(arm),
         stiffness=stiffness,
-        motor=srv02_motor(inductance),
+        motor=srv02_motor(inductance, tied=tied),
         hub_damping=hub_damping,
         sensors=sensors,
     )

@@ -77,6 +77,7 @@ class Mechanism:
         put("outputs", validation.outputs(self.outputs))
         put("trusted", frozenset(checks.names(self.trusted, "trusted")))
         check(self)
+        put("trusted", self.trusted | set(self.followers))  # a fit moves what they follow
         for name in sorted(self.trusted):
             self._must_exist(name)
 
@@ -194,6 +195,12 @@ class Mechanism:
         return tuple(f"{e.at}.{e.name}.{p}" for e in self.effects for p in e.values)
 
     @functools.cached_property
+    def followers(self) -> dict[str, str]:
+        """Full name of each parameter that always equals another one -> full name of the other."""
+        heads = ((f"{e.at}.{e.name}.", e.follows) for e in self.effects)
+        return {head + name: head + other for head, follows in heads for name, other in follows.items()}
+
+    @functools.cached_property
     def parameter_specifications(self) -> tuple[Specification, ...]:
         """Unit, bounds and size of each parameter, in the order of `values`."""
         u = self.units
@@ -225,6 +232,10 @@ class Mechanism:
             for name in values:
                 self._must_exist(name)
             old = dict(zip(self.parameter_names, self.values, strict=True))
+            for name in self.followers:
+                # Beside a value of what it follows it may stand as it was: the whole vector by name.
+                if self.followers[name] not in values and values.get(name, old[name]) != old[name]:
+                    self._refuse_follower(name)
             values = list((old | dict(values)).values())
         if not hasattr(values, "__len__") or len(values) != len(self.parameter_names):
             raise InputError(
@@ -251,7 +262,15 @@ class Mechanism:
         """The mechanism with these parameters free in fits."""
         for name in names:
             self._must_exist(name)
+            if name in self.followers:
+                self._refuse_follower(name)
         return dataclasses.replace(self, trusted=self.trusted - set(names))
+
+    def _refuse_follower(self, name: str) -> None:
+        raise InputError(
+            f"Parameter {name!r} was given a value of its own or released, but it is tied to "
+            f"{self.followers[name]!r}; name that one, or make the effect with tied=False."
+        )
 
     # -- pytree ------------------------------------------------------------------------------------
 
@@ -280,13 +299,18 @@ class Mechanism:
             object.__setattr__(rebuilt, field, value)
         return rebuilt
 
+    def _status(self, name: str) -> str:
+        if name in self.followers:
+            return f"tied to {self.followers[name]}"
+        return "held" if name in self.trusted else ""
+
     def _repr_html_(self) -> str:
         """Ports and effects with their equations, and every parameter with unit and value."""
         vectors = ((name, ", ".join(f"{v:g}" for v in p)) for name, p in self.port_vectors.items())
         effects = [(effect_label(e.name, e.at), equation(e.equation)) for e in self.effects]
         described = zip(self.parameter_names, self.parameter_specifications, self.values, strict=True)
         rows = [
-            (name, unit_text(spec.unit), spec.meaning, "held" if name in self.trusted else "", f"{value:.6g}")
+            (name, unit_text(spec.unit), spec.meaning, self._status(name), f"{value:.6g}")
             for name, spec, value in described
         ]
         return card(
@@ -301,7 +325,7 @@ class Mechanism:
         for e in self.effects:
             for name, value in e.values.items():
                 full = f"{e.at}.{e.name}.{name}"
-                held = "  (trusted)" if full in self.trusted else ""
+                held = {"held": "  (trusted)", "": ""}.get(state := self._status(full), f"  ({state})")
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
                 unit = self.units.unit(specifications(e)[name].unit, e.volts_of_input)
                 lines.append(f"  {full} = {number} {unit}{held}")

@@ -19,7 +19,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
 from rotflex_jax.mechanism.units import Units
 from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import Estimate, specifications
+from rotflex_jax.parameters import Estimate, HeldConstant, specifications
 from rotflex_jax.text.files import path_of, write_file
 
 SCHEMA = 1
@@ -348,4 +348,5 @@ def _estimate(name: str, given: Mapping[str, Any]) -> Estimate:
     nan = float("nan")
     std = nan if given["std"] is None else given["std"]
     low, high = (nan, nan) if given["ci95"] is None else given["ci95"]
-    return Estimate(name, given["value"], std, (low, high), given["unit"], given["free"], given["note"])
+    held = tuple(HeldConstant(**c) for c in given.get("given", ()))
+    return Estimate(name, given["value"], std, (low, high), given["unit"], given["free"], given["note"], held)

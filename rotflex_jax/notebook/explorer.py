@@ -1,9 +1,8 @@
 """A model under sliders: switch effects, change a parameter, and see what it does to the run."""
 
-import dataclasses
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -11,13 +10,18 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from rotflex_jax.discover.discovery import Discovery
+from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError, optional
+from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.result import Fit
+from rotflex_jax.joints.by_name import choose
 from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import specifications
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.listing import listed
 from rotflex_jax.text.colours import BASELINE, FINAL, MEASURED, NO_DATA
@@ -110,10 +114,27 @@ def overlay(
 SLIDER_DECADES = 1.0
 
 
+class _State(NamedTuple):
+    """What the widgets say, for undoing.
+
+    Attributes:
+        base: The mechanism with the values that the sliders are factors of.
+        on: Effect, by its label -> whether its switch is on.
+        factors: Parameter -> its factor; 1 where it has none.
+        sliders: Parameters with a slider of their own.
+    """
+
+    base: Mechanism
+    on: dict[str, bool]
+    factors: dict[str, float]
+    sliders: tuple[str, ...]
+
+
 class Explorer:
     """A model, recordings, and widgets that change the one and show what it does to the other.
 
-    Every state of the widgets runs through one compilation: switches are gates, parameters are values.
+    Every state of switches and sliders runs through one compilation: switches are gates, parameters are
+    values. An effect that is added makes another one.
 
     Attributes:
         model: As it stands under the widgets.
@@ -121,7 +142,9 @@ class Explorer:
         given: The same of the model as it was given.
         switches: Effect, as "coulomb at hub" -> its checkbox.
         parameter: Which parameter the slider changes.
-        factor: Slider: the parameter as a multiple of its given value.
+        factor: Slider: the parameter as a multiple of its given or refitted value.
+        sliders: Parameter -> a slider of its own, beside `factor`.
+        addable: Effects of the catalogue that can be added.
     """
 
     def __init__(
@@ -137,67 +160,194 @@ class Explorer:
 
         Args:
             model: What is explored.
-            recordings: Recording that is drawn, or several, of which the first is drawn.
+            recordings: Recording that is drawn, or several, of which the first is drawn; `refit` fits to all.
             test: Recordings whose error is shown; the same ones if None.
             candidates: Effects with their parameters that can be switched on; at first they are off.
             window_seconds: Free runs are restarted after so long [s].
         """
-        widgets = optional("ipywidgets", "Exploring a model")
+        widgets = self._widgets = optional("ipywidgets", "Exploring a model")
         bare = model if isinstance(model, Mechanism) else _model(model).mechanism
         offered = [c for c in candidates if (c.name, c.at) not in {(e.name, e.at) for e in bare.effects}]
         for effect in offered:
             bare = bare + effect
-        solver = {} if isinstance(model, Mechanism) else {"solver": _model(model).solver}
-        off = {(e.name, e.at) for e in offered}
-        gates = tuple(0.0 if (e.name, e.at) in off else 1.0 for e in bare.effects)
-        self._given_model = Model(bare, gates=gates, **solver)
-        self._drawn = listed(recordings)[0]
+        self._solver: dict[str, Any] = {}
+        if not isinstance(model, Mechanism):
+            self._solver["solver"] = _model(model).solver
+        off = {effect_label(e.name, e.at) for e in offered}
+        self._train = listed(recordings)
+        self._drawn = self._train[0]
         self._test = listed(recordings if test is None else test)
         self._seconds = window_seconds
         self._units = {c: self._drawn.units[self._drawn.channels.index(c)] for c in bare.channels}
-        self.switches = {
-            effect_label(e.name, e.at): widgets.Checkbox(
-                value=(e.name, e.at) not in off, description=effect_label(e.name, e.at), indent=False
-            )
-            for e in bare.effects
-            if _can_be_off(e)
-        }
-        specs = zip(bare.parameter_names, bare.parameter_specifications, strict=True)
-        self._unit = {name: unit_text(spec.unit) for name, spec in specs}
-        self.parameter = widgets.Dropdown(options=list(self._unit), description="parameter")
-        self.factor = widgets.FloatLogSlider(
-            value=1.0,
+        self._base, self._factors, self._silent = bare, {}, False
+        self._said, self._earlier = "", []
+        self.switches: dict[str, Any] = {}
+        self.sliders: dict[str, Any] = {}
+        self.parameter = widgets.Dropdown(description="parameter")
+        self.factor = self._slider("times")
+        self.addable = widgets.Dropdown(description="effect")
+        self._text, self._image = widgets.HTML(), widgets.Image(format="png")
+        self._left = widgets.VBox()
+        self._silently(lambda: self._build({label: label not in off for label in _labels(bare)}, ()))
+        self._given = self._state()
+        self._given_model = self.model = self._stands()
+        self.given = self.errors = self._errors(self.model)
+        self.factor.observe(self._changed, "value")
+        self.parameter.observe(self._chosen, "value")
+        self._buttons = widgets.HBox(
+            [
+                self._button("own slider", lambda: self.keep_slider(self.parameter.value)),
+                self._button("refit", self.refit),
+                self._button("undo", self.undo),
+                self._button("reset", self.reset),
+            ]
+        )
+        adding = widgets.HBox([self.addable, self._button("add", lambda: self.add(*self.addable.value))])
+        side = widgets.VBox([self._left, self.parameter, self.factor, self._buttons, adding])
+        self.box = widgets.VBox([widgets.HBox([side, self._text]), self._image])
+        self._show()
+
+    def _button(self, name: str, act: Callable[[], None]) -> Any:
+        button = self._widgets.Button(description=name, layout={"width": "auto"})
+
+        def clicked(_: Any) -> None:
+            try:
+                act()
+            except InputError as error:  # there is nobody else to tell in a notebook's callback
+                self._said = str(error)
+                self._show()
+
+        button.on_click(clicked)
+        return button
+
+    def _slider(self, name: str, value: float = 1.0) -> Any:
+        return self._widgets.FloatLogSlider(
+            value=value,
             min=-SLIDER_DECADES,
             max=SLIDER_DECADES,
             step=0.01,
-            description="times",
+            description=name,
             continuous_update=False,
+            style={"description_width": "initial"},
         )
-        self._text, self._image = widgets.HTML(), widgets.Image(format="png")
-        self._given_values = dict(zip(bare.parameter_names, bare.values.tolist(), strict=True))
-        self._factors: dict[str, float] = {}
-        self._silent = False
-        self.model = self._given_model
-        self.given = self.errors = self._errors(self._given_model)
-        for box in self.switches.values():
-            box.observe(self._changed, "value")
-        self.factor.observe(self._changed, "value")
-        self.parameter.observe(self._chosen, "value")
-        left = widgets.VBox([*self.switches.values(), self.parameter, self.factor])
-        self.box = widgets.VBox([widgets.HBox([left, self._text]), self._image])
+
+    # -- what a person does ----------------------------------------------------------------------------
+
+    def add(self, effect: str, at: str) -> None:
+        """Adds an effect of the catalogue, switched on, at its default size or at a typical one.
+
+        Args:
+            effect: Its name, as `"coulomb"`.
+            at: Port, `input` or channel.
+
+        Raises:
+            InputError: No such effect, or one that the model has or has no place for.
+        """
+        cls = CATALOG[choose(effect, CATALOG, "effect")]
+        if (effect, at) in {(e.name, e.at) for e in self._base.effects}:
+            raise InputError(
+                f"{effect_label(effect, at)} is in the model already; switch it on or off there."
+            )
+        added = cls(at=at)
+        if cls.amplitudes and not any(getattr(added, name) for name in cls.amplitudes):
+            first = cls.amplitudes[0]  # of size zero nothing would be seen, and no factor changes it
+            added = added.replace(**{first: specifications(added)[first].typical})
+        extended = self._base + added
+        self._remember()
+        self._base = extended
+        on = {label: box.value for label, box in self.switches.items()}
+        self._silently(lambda: self._build(on | {effect_label(effect, at): True}, tuple(self.sliders)))
+        self._changed(None)
+
+    def keep_slider(self, parameter: str) -> None:
+        """Gives a parameter a slider of its own, so that several can be moved in turn.
+
+        Args:
+            parameter: Full name.
+
+        Raises:
+            InputError: The model has no such parameter.
+        """
+        choose(parameter, self._base.parameter_names, "parameter")
+        if parameter in self.sliders:
+            return
+        on = {label: box.value for label, box in self.switches.items()}
+        self._silently(lambda: self._build(on, (*self.sliders, parameter)))
         self._show()
+
+    def refit(self) -> None:
+        """Fits the free parameters of what is switched on to the recordings; sliders start from there."""
+        on = self._stands()
+        gates = on.gates or ()
+        mechanism = on.mechanism
+        for e, gate in zip(on.mechanism.effects, gates, strict=True):
+            if not gate:
+                mechanism = mechanism.without(e.name, e.at)
+        fitted = fit(Model(mechanism, **self._solver), self._train, window_seconds=self._seconds)
+        self._remember()
+        found = fitted.model.mechanism
+        values = dict(zip(found.parameter_names, found.values.tolist(), strict=True))
+        self._base, self._factors = on.mechanism.with_values(values), {}
+        self._said = f"refitted: {fitted.ending}"
+        self._silently(self._set_sliders)
+        self._changed(None)
+
+    def undo(self) -> None:
+        """Takes the last change back; nothing where there is none."""
+        if self._earlier:
+            self._restore(self._earlier.pop())
 
     def reset(self) -> None:
         """Everything as it was given."""
-        on = {effect_label(e.name, e.at): g > 0 for e, g in self._pairs()}
-        self._factors = {}
-        self._silently(lambda: [setattr(b, "value", on[label]) for label, b in self.switches.items()])
-        self._silently(lambda: setattr(self.factor, "value", 1.0))
-        self._changed(None)
+        self._remember()
+        self._restore(self._given)
 
-    def _pairs(self) -> list[tuple[Effect, float]]:
-        gates = self._given_model.gates or ()
-        return list(zip(self._given_model.mechanism.effects, gates, strict=True))
+    # -- state -----------------------------------------------------------------------------------------
+
+    def _state(self) -> _State:
+        on = {label: bool(box.value) for label, box in self.switches.items()}
+        return _State(self._base, on, dict(self._factors), tuple(self.sliders))
+
+    def _remember(self) -> None:
+        """Keeps what stands now, once."""
+        if not self._earlier or self._earlier[-1] != self._shown_state:
+            self._earlier.append(self._shown_state)
+
+    def _restore(self, state: _State) -> None:
+        self._base, self._factors = state.base, dict(state.factors)
+        self._silently(lambda: self._build(state.on, state.sliders))
+        self._update()
+
+    def _build(self, on: Mapping[str, bool], sliders: Sequence[str]) -> None:
+        """The widgets of the effects and parameters that there are."""
+        m, widgets = self._base, self._widgets
+        self.switches = {
+            label: widgets.Checkbox(value=on.get(label, True), description=label, indent=False)
+            for label in _labels(m)
+        }
+        self._unit = {
+            n: unit_text(spec.unit)
+            for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)
+            if n not in m.followers
+        }
+        self.sliders = {n: self._slider(n, self._factors.get(n, 1.0)) for n in sliders if n in self._unit}
+        for box in self.switches.values():
+            box.observe(self._changed, "value")
+        for name, slider in self.sliders.items():
+            slider.observe(lambda change, name=name: self._moved(name, change["new"]), "value")
+        chosen = self.parameter.value
+        self.parameter.options = list(self._unit)
+        self.parameter.value = chosen if chosen in self._unit else next(iter(self._unit))
+        self.factor.value = self._factors.get(self.parameter.value, 1.0)
+        present = {(e.name, e.at) for e in m.effects}
+        places = [p for p in ((cls.name, at) for cls, at in search_places(m)) if p not in present]
+        self.addable.options = [(effect_label(*p), p) for p in places if m.accepts(CATALOG[p[0]], p[1])]
+        self._left.children = (*self.switches.values(), *self.sliders.values())
+
+    def _set_sliders(self) -> None:
+        for name, slider in self.sliders.items():
+            slider.value = self._factors.get(name, 1.0)
+        self.factor.value = self._factors.get(self.parameter.value, 1.0)
 
     def _silently(self, change: Callable[[], Any]) -> None:
         """Changes widgets without a simulation for each."""
@@ -209,23 +359,40 @@ class Explorer:
 
     def _chosen(self, change: Any) -> None:
         """Another parameter was chosen: the slider shows its factor."""
-        name = self.parameter.value
-        self._silently(lambda: setattr(self.factor, "value", self._factors.get(name, 1.0)))
+        if self._silent:
+            return
+        self._silently(self._set_sliders)
         self._show()
+
+    def _moved(self, name: str, factor: float) -> None:
+        """A slider was moved."""
+        if self._silent:
+            return
+        self._remember()
+        self._factors[name] = factor
+        self._silently(self._set_sliders)
+        self._update()
 
     def _changed(self, change: Any) -> None:
         if self._silent:
             return
+        if change is not None:
+            self._remember()
         if self.factor.value != self._factors.get(self.parameter.value, 1.0):
             self._factors[self.parameter.value] = self.factor.value
-        gates = tuple(
-            float(self.switches[label].value) if (label := effect_label(e.name, e.at)) in self.switches else g
-            for e, g in self._pairs()
-        )
-        changed = {name: factor * self._given_values[name] for name, factor in self._factors.items()}
-        self.model = dataclasses.replace(
-            self._given_model, mechanism=self._given_model.mechanism.with_values(changed), gates=gates
-        )
+            self._silently(self._set_sliders)
+        self._update()
+
+    def _stands(self) -> Model:
+        """The model that the widgets say."""
+        labels = [effect_label(e.name, e.at) for e in self._base.effects]
+        gates = tuple(float(self.switches[x].value) if x in self.switches else 1.0 for x in labels)
+        values = dict(zip(self._base.parameter_names, self._base.values.tolist(), strict=True))
+        changed = {name: factor * values[name] for name, factor in self._factors.items()}
+        return Model(self._base.with_values(changed), gates=gates, **self._solver)
+
+    def _update(self) -> None:
+        self.model = self._stands()
         self.errors = self._errors(self.model)
         self._show()
 
@@ -237,19 +404,23 @@ class Explorer:
         return dict(zip(model.mechanism.channels, rms.tolist(), strict=True))
 
     def _show(self) -> None:
+        self._shown_state = self._state()
         rows = []
         for channel, now in self.errors.items():
             before = self.given[channel]
             change = f"{100 * (now / before - 1):+.1f} %".replace("-", "−") if before > 0 else ""
             read = readable(1.0, self._units[channel])
             rows.append((channel, read[1], *(plain_number(read[0] * e) for e in (before, now)), change))
-        name = self.parameter.value
-        value = self._factors.get(name, 1.0) * self._given_values[name]
+        m, named = self.model.mechanism, dict.fromkeys((*self.sliders, self.parameter.value))
+        values = dict(zip(m.parameter_names, m.values.tolist(), strict=True))
+        lines = [f"{name} = {values[name]:.4g} {self._unit[name]}".rstrip() for name in named]
         self._text.value = card(
             f"Error of free runs of {self._seconds:g} s",
             table(("channel", "unit", "as given", "now", "change"), rows, words=2),
-            paragraph(f"{name} = {value:.4g} {self._unit[name]}".rstrip()),
+            *(paragraph(line) for line in lines),
+            *([paragraph(self._said)] if self._said else []),
         )
+        self._said = ""
         given, now = (m.simulate_windows(self._drawn, self._seconds) for m in (self._given_model, self.model))
         measured = self.model.measured(self._drawn)
         self._image.value = overlay(self._drawn, measured, given, now, self._units)
@@ -269,6 +440,11 @@ def _model(given: Any) -> Model:
         f"A model was expected, but a {type(given).__name__} was given; give a Fit, Model, Mechanism or "
         "Discovery."
     )
+
+
+def _labels(m: Mechanism) -> list[str]:
+    """Effects that have a switch, in order."""
+    return [effect_label(e.name, e.at) for e in m.effects if _can_be_off(e)]
 
 
 def _can_be_off(effect: Effect) -> bool:

@@ -4,7 +4,7 @@ import sys
 import time
 from typing import Any
 
-from rotflex_jax.discover.milestone import Milestone
+from rotflex_jax.discover.milestone import Milestone, TimeLeft
 from rotflex_jax.text.markup import card, paragraph, picture
 from rotflex_jax.text.svg import staircase
 
@@ -36,10 +36,11 @@ class Live:
         self._line = ""
         self._handle = handle
         self._shown = 0.0
-        self._began = time.perf_counter()
+        self._time_left = TimeLeft()
 
     def __call__(self, line: str) -> None:
         """Show a line of progress."""
+        self._time_left.follow(line)
         new = isinstance(line, Milestone)
         if isinstance(line, Milestone):
             self.labels.append(line.label)
@@ -54,11 +55,10 @@ class Live:
             self._handle.update(self)
 
     def _repr_html_(self) -> str:
-        seconds = time.perf_counter() - self._began
         svg = staircase(self.labels, self.errors, self.floor)
         return card(
             self.title,
-            paragraph(f"{self._line or 'starting'} ({seconds:.0f} s)"),
+            paragraph(f"{self._line or 'starting'} ({self._time_left.words()})"),
             picture(svg, "Held-out error of each model so far, with the noise of the sensor."),
         )
 

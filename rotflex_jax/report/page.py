@@ -133,7 +133,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         "sentence": sentence(added.sentence),
         "equation": equation(added.equation),
         "parameters": [
-            (name, *_shown(e), together(e.unit), _later(discovery, e), e.note)
+            (name, *_shown(e), together(e.unit), _later(discovery, e), e.note, together(e.given_words))
             for name, e in added.parameters.items()
         ],
         "gain": plain_number(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",

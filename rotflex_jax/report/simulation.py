@@ -125,7 +125,7 @@ def _content(simulation: Simulation) -> dict[str, Any]:
     fit = simulation.fit
     estimates = (
         [
-            (e.name, unit_text(e.unit), *value_and_interval(e))
+            (e.name, unit_text(e.unit), *value_and_interval(e), e.remark)
             for e in sorted(fit.parameters, key=lambda e: not e.free)
         ]
         if fit

@@ -1,0 +1,163 @@
+"""A walk through the first hour: files as people have them, commands as they type them, and what comes of it.
+
+A refusal names its cure, and the cure works where it is followed.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+from test_cli import assert_one_sentence, run  # noqa: F401 - a fixture
+
+import rotflex_jax as rf
+from rotflex_jax.data.datasets import demo_recording
+
+RECORDING = demo_recording().slice(0, 2000)
+T, U = RECORDING.t, RECORDING.u
+THETA, ALPHA = RECORDING.y.T
+NAMES = ["t", "voltage", "theta", "alpha"]
+
+
+def table(**changed: object) -> pd.DataFrame:
+    columns = dict(zip(NAMES, (T, U, THETA, ALPHA), strict=True)) | changed
+    return pd.DataFrame({name: values for name, values in columns.items() if values is not None})
+
+
+def renamed(*names: str) -> pd.DataFrame:
+    return table().set_axis(list(names), axis=1)
+
+
+def as_csv(frame: pd.DataFrame, **options: object) -> Callable[[Path], Path]:
+    return lambda folder: _saved(folder / "run.csv", lambda f: frame.to_csv(f, index=False, **options))
+
+
+def _saved(file: Path, write: Callable[[Path], object]) -> Path:
+    write(file)
+    return file
+
+
+def counted(x: np.ndarray) -> np.ndarray:
+    return np.round(x * 4096 / (2 * np.pi)).astype(int)
+
+
+def of_text(name: str, text: str) -> Callable[[Path], Path]:
+    return lambda folder: _saved(folder / name, lambda f: f.write_text(text))
+
+
+def matlab(**variables: object) -> Callable[[Path], Path]:
+    return lambda folder: _saved(folder / "run.mat", lambda f: scipy.io.savemat(f, variables))
+
+
+def npz(folder: Path) -> Path:
+    return _saved(
+        folder / "run.npz", lambda f: np.savez(f, **dict(zip(NAMES, (T, U, THETA, ALPHA), strict=True)))
+    )
+
+
+jitter = 0.2 * 0.002 * np.random.default_rng(1).uniform(-1, 1, len(T))
+holed = THETA.copy()
+holed[700] = np.nan
+MATRIX = np.column_stack([T, U, THETA, ALPHA])
+
+READ = {
+    "as the manual says": (as_csv(table()), ""),
+    "semicolons": (as_csv(table(), sep=";"), ""),
+    "tabs": (as_csv(table(), sep="\t"), ""),
+    "semicolons and decimal commas": (as_csv(table(), sep=";", decimal=","), ""),
+    "units in the header": (as_csv(renamed("Time [s]", "Voltage [V]", "Theta [rad]", "Alpha [rad]")), ""),
+    "Greek letters": (as_csv(renamed("t", "voltage", "θ", "α")), ""),
+    "other columns beside": (as_csv(table(temperature=np.full(len(T), 21.0))), ""),
+    "theta alone": (as_csv(table(alpha=None)), "--output theta"),
+    "no time": (as_csv(table(t=None)), "--Ts 0.002"),
+    "own names": (
+        as_csv(renamed("zeit", "uin", "servo", "link")),
+        "--time zeit --input uin --output servo --output link",
+    ),
+    "numpy": (npz, ""),
+    "MATLAB, variables": (matlab(t=T, voltage=U, theta=THETA, alpha=ALPHA), ""),
+    "MATLAB, a matrix": (
+        matlab(data=MATRIX),
+        "--time data[0] --input data[1] --output data[2] --output data[3]",
+    ),
+    "MATLAB, a structure": (
+        matlab(run={"t": T, "voltage": U, "theta": THETA, "alpha": ALPHA}),
+        "--time run.t --input run.voltage --output run.theta --output run.alpha",
+    ),
+}  # fmt: skip
+"""File, options; the recording is the one that was written."""
+
+CURED = {
+    "degrees": (as_csv(table(theta=np.rad2deg(THETA), alpha=np.rad2deg(ALPHA))), "degrees", "--degrees"),
+    "counts": (
+        as_csv(table(theta=counted(THETA), alpha=counted(ALPHA))),
+        "counts of an encoder",
+        "--counts 4096",
+    ),
+    "milliseconds": (as_csv(table(t=1e3 * T)), "milliseconds", "--time-unit ms"),
+    "jitter": (as_csv(table(t=T + jitter)), "", "--resample auto"),
+}  # fmt: skip
+"""File, what is said of it, the option that is named and works."""
+
+REFUSED = {
+    "a hole": (as_csv(table(theta=holed)), "check", "theta"),
+    "words in a column": (of_text("run.csv", "t,voltage,theta,alpha\n0,1,2,3\n1,1,x,3\n"), "check", "theta"),
+    "a header alone": (of_text("run.csv", "t,voltage,theta,alpha\n"), "check", "run.csv"),
+    "nothing": (of_text("run.csv", ""), "check", "run.csv"),
+    "a picture": (of_text("run.png", "no recording"), "check", ".csv"),
+    "swapped": (as_csv(renamed("t", "voltage", "alpha", "theta")), "check", "swapped"),
+    "another machine": (as_csv(table()), "discover --joint robot", "robot"),
+    "a wrong option": (as_csv(table()), "discover --hold-out a.csv", "--hold-out"),
+    "a share of all": (as_csv(table()), "discover --split 1", "--split"),
+    "rows lost": (as_csv(table().drop(index=range(500, 520))), "check", "gap"),
+    "no such effect": (as_csv(table()), "simulate --add glue@hub", "glue"),
+    "no such method": (as_csv(table()), "compare --methods magic", "magic"),
+    "a report on a file": (as_csv(table()), "discover --report FILE", "folder"),
+}  # fmt: skip
+"""File, command, what the one sentence names."""
+
+
+@pytest.mark.parametrize("case", READ)
+def test_it_is_read(case: str, run, tmp_path: Path) -> None:  # noqa: F811
+    make, options = READ[case]
+    status, out, err = run("check", make(tmp_path), *options.split())
+    assert status == 0, err
+    assert "2000 samples, 4 s at 500 Hz" in out
+
+
+@pytest.mark.parametrize("case", CURED)
+def test_it_is_refused_and_the_cure_works(case: str, run, tmp_path: Path) -> None:  # noqa: F811
+    make, said, cure = CURED[case]
+    file = make(tmp_path)
+    status, _, err = run("check", file)
+    assert status == 2
+    assert_one_sentence(err, said, cure)
+    status, _, err = run("check", file, *cure.split())
+    assert status == 0, err
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_it_is_refused(case: str, run, tmp_path: Path) -> None:  # noqa: F811
+    make, command, named = REFUSED[case]
+    file = make(tmp_path)
+    first, *options = command.replace("FILE", str(file)).split()
+    status, _, err = run(first, file, *options)
+    assert status == 2
+    assert_one_sentence(err, named)
+
+
+def test_a_fitted_model_is_exported_without_another_word(run, tmp_path: Path) -> None:  # noqa: F811
+    from rotflex_jax.export import Saved, save
+
+    joint = rf.joints.paper()
+    file = save(Saved(rf.Model(joint), Ts=RECORDING.Ts), tmp_path / "fit.json")
+    status, out, err = run("export", file, "--to", "c")
+    assert status == 0 and "0.002" in out, err
+    status, _, err = run("export", rf.Model(joint).save(tmp_path / "bare.json"), "--to", "c")
+    assert status == 2
+    assert_one_sentence(err, "--Ts")
+    status, out, err = run("effects", "--json")
+    assert status == 0 and len(json.loads(out)["effects"]) > 30
