@@ -38,8 +38,7 @@ def main() -> None:
     import rotflex_jax as rf
 
     place = Path(str(rf.__file__)).parent
-    here = Path(__file__).resolve().parents[1]
-    assert not place.is_relative_to(here), f"{place} is the tree, not an installed package"
+    assert not (place.parent / "pyproject.toml").exists(), f"{place} is the tree, not an installed package"
     missing = [name for name in DATA if not files("rotflex_jax").joinpath(name).is_file()]
     assert not missing, missing
 
