@@ -68,6 +68,12 @@ def test_a_missing_horizon_says_as_much_as_the_reference():
     np.testing.assert_allclose(set_probabilities([first, runs_alone], rule=RULE), softmax([0.4, 0.0]))
 
 
+def test_the_reference_was_fitted_at_both_horizons():
+    """One that was fitted to predictions alone stands first; free runs of the others still count."""
+    sets = [fitted("b@arm", 5.0, free_run=False), fitted("a@hub", 5.0, 0.8), fitted("c@hub", 5.0, 0.0)]
+    np.testing.assert_allclose(set_probabilities(sets, rule=RULE), softmax([0.4, 0.0, -1.5 * 0.8]))
+
+
 def test_a_lead_within_its_scatter_does_not_decide():
     """A sharp likelihood whose half seconds scatter: the probability is that of the sign of the lead."""
     many, rng = 400, np.random.default_rng(3)
@@ -149,7 +155,7 @@ def test_a_sentence_names_three_sets_at_most_and_none_below_a_hundredth():
         return Probabilities(sets, {}, 0.02).sentence
 
     assert told(0.968, 0.0101).endswith(
-        "Coulomb friction at hub 97 %; then lag at input 1 %; none of these 2 %."
+        "Coulomb friction at hub 97 %; then input lag 1 %; none of these 2 %."
     )
     assert told(0.970, 0.0099).endswith("Coulomb friction at hub 97 %; none of these 2 %.")
     assert "delay" in told(0.5, 0.2, 0.15, 0.13) and "cogging" not in told(0.5, 0.2, 0.15, 0.13)
