@@ -3,6 +3,7 @@
 Nothing is fetched while it is built or read: formulas are drawn, fonts are those of the reader.
 """
 
+import os
 import sys
 from pathlib import Path
 
@@ -26,8 +27,8 @@ extensions = [
     "generate.formulas",
     "generate.pages",
 ]
-exclude_patterns = ["_build", "generate"]
-templates_path: list[str] = []
+exclude_patterns = ["_build", "_templates", "generate"]
+templates_path = ["_templates"]
 
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence", "attrs_inline"]
 default_role = "code"
@@ -37,10 +38,22 @@ suppress_warnings = ["myst.xref_not_used"]
 nb_execution_mode = "off"  # notebooks are run by notebooks/build.py, the site shows what they said
 
 html_theme = "furo"
-html_title = "rotflex_jax"
+html_title = f"rotflex_jax {version}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
+# The other versions, where `docs/versions.py` builds them beside this one.
+html_context = {"versions": os.environ.get("ROTFLEX_DOCS_VERSIONS", "").split(), "this_version": version}
+html_sidebars = {
+    "**": [
+        "sidebar/brand.html",
+        "sidebar/search.html",
+        "versions.html",
+        "sidebar/scroll-start.html",
+        "sidebar/navigation.html",
+        "sidebar/scroll-end.html",
+    ]
+}
 html_math_renderer = "outlines"
 html_show_sphinx = False
 

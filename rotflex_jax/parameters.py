@@ -17,6 +17,8 @@ from jaxtyping import Array, Bool, Float, Real
 
 # Trusted constants that are named beside an interval; of more only their number is said.
 _NAMED_CONSTANTS = 3
+HALF_WIDTH_95 = 1.96
+"""Half of the 95 % interval of a normal number, in its standard deviations."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +128,7 @@ class Transform:
 def _bound_reached(value: float, std: float, spec: Specification) -> str:
     """The bound that an estimate is at: by its number, or near it with an interval that goes beyond."""
     for room, which in ((value - spec.lower, "lower"), (spec.upper - value, "upper")):
-        near = room < 1e-2 * spec.typical and (math.isnan(std) or room <= 1.96 * std)
+        near = room < 1e-2 * spec.typical and (math.isnan(std) or room <= HALF_WIDTH_95 * std)
         if math.isfinite(room) and (room < 1e-6 * spec.typical or near):
             return f"at its {which} bound"
     return ""
@@ -201,9 +203,8 @@ class Estimate:
             remarks.append(bound)
         elif math.isnan(std) and "bound" not in note:
             remarks.append("not determined by these data")
-        return cls(
-            name, value, std, (value - 1.96 * std, value + 1.96 * std), spec.unit, note="; ".join(remarks)
-        )
+        half = HALF_WIDTH_95 * std
+        return cls(name, value, std, (value - half, value + half), spec.unit, note="; ".join(remarks))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types; `given` only where the interval hangs on trusted constants."""

@@ -13,13 +13,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import batch_search
 import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from rotflex_jax.batch import Fleet, fleet, page, workers
+from rotflex_jax.batch import Fleet, fleet, page, storage, workers
 from rotflex_jax.batch.code_digest import code_text
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime import xla
@@ -144,6 +145,16 @@ sys.exit(0 if all(r.known for r in rows) else 5)
 """
     path = HERE["PYTHONPATH"] + os.pathsep + str(Path(batch_search.__file__).parent)
     assert subprocess.run([sys.executable, "-c", program], env=HERE | {"PYTHONPATH": path}).returncode == 0
+
+
+def test_functions_among_the_arguments_are_digested_by_their_names() -> None:
+    """With their addresses, which differ in each process, a fleet that was stopped would begin again."""
+
+    def asked(say: Any) -> str:
+        return storage._named(functools.partial(batch_search.quick, hold=[say, functools.partial(say, 1)]))
+
+    assert asked(print) == asked(print) != asked(repr)
+    assert "0x" not in asked(print) + asked(lambda line: None) + asked([].append)
 
 
 def test_what_is_wrong_with_one_recording_is_a_row_of_the_page(files, tmp_path) -> None:

@@ -240,6 +240,7 @@ def test_a_child_that_turns_the_other_way(tmp_path):
         ({"more": '<option viscosity="1"/>'}, "viscosity of a fluid", None),
         ({"more": '<option actuatorgroupdisable="0"/>'}, "switched off", None),
         ({"a": 'damping="x"'}, 'damping="x"', None),
+        ({"axis": "0 0 0"}, 'a joint with axis="0 0 0"', None),
         ({"a": 'damping="nan"'}, 'damping="nan"', None),
         ({"a": 'class="none"'}, "the class 'none'", None),
         ({"more": '<include file="/etc/passwd"/>'}, "<include>", None),
@@ -259,6 +260,17 @@ def test_what_cannot_be_said_is_refused_by_name(tmp_path, change, words, ignore)
     if ignore:
         assert f"ignore=['{ignore}']" in str(caught.value)
         loaded(tmp_path, text, "a", "b", ignore=[ignore])
+
+
+@pytest.mark.parametrize("zero", ['mass="1" pos="0.1', 'mass="1" pos="0 0', "0.01 0.01 0.01"])
+def test_what_moves_has_mass_and_inertia(tmp_path, zero):
+    """As in MuJoCo, which refuses bodies that any torque would move at once."""
+    mujoco = pytest.importorskip("mujoco")
+    text = TWO.format(**PLAIN).replace(zero, zero.replace("1", "0"))
+    with pytest.raises(ValueError, match="mass and inertia of moving bodies"):
+        mujoco.MjModel.from_xml_string(text)
+    with pytest.raises(InputError, match="has no mass, or no inertia about the axis, in what moves with"):
+        loaded(tmp_path, text, "a", "b")
 
 
 def test_options_add_up(tmp_path):

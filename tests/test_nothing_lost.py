@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
+from kills import kills
 from rotflex_jax.batch import storage
 from rotflex_jax.batch.result import Fleet, RecordingRow
 from rotflex_jax.batch.task import record
@@ -150,6 +151,36 @@ def test_rounds_are_kept_until_the_search_has_ended(tmp_path: Path) -> None:
         milestone("as it is", ["theta"], {"theta": "rad"}, np.ones(1), np.ones(1))
     )
     assert len(said) == 5
+
+
+def test_rounds_of_an_earlier_start_are_not_overwritten_by_fewer(tmp_path: Path) -> None:
+    """A search that goes on reports its rounds again; killed after one of them, it keeps the others."""
+    file = tmp_path / "found.stopped.json"
+
+    def reached(*labels: str, digest: str = "a") -> list[str]:
+        follow = RoundsSoFar(tmp_path / "found.json").following(lambda _: None)
+        for label in labels:
+            line = milestone(label, ["theta"], {"theta": "rad"}, np.ones(1), np.ones(1))
+            line.kept = {"digest": digest}
+            follow(line)
+        return [stage["model"] for stage in json.loads(file.read_text())["stages"]]
+
+    three = reached("as it is", "+ coulomb at hub", "+ lag at input")
+    assert len(three) == 3
+    assert reached("as it is") == reached("as it is", "+ coulomb at hub") == three
+    assert len(reached("as it is", "+ coulomb at hub", "+ lag at input", "+ delay at input")) == 4
+    # Another search, or the same one on another way, counts anew.
+    assert len(reached("as it is", "+ lag at input")) == 2
+    assert reached("as it is", digest="b") == ["as it is"]
+    file.write_text("{")
+    assert reached("as it is") == ["as it is"]
+
+
+@pytest.mark.slow
+def test_killed_at_random_moments_nothing_is_lost(tmp_path: Path) -> None:
+    """A slice of `benchmarks/kills.py`, with the programs of other tests."""
+    programs = Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled" / "programs"
+    assert len(list(kills(3, 1, tmp_path, programs, kinds=("search",)))) == 3
 
 
 SCRIPT = """

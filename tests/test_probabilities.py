@@ -11,6 +11,7 @@ from arena.probability import Event, calibration_error, classes, credible, effec
 from rotflex_jax.discover.probabilities import (
     EvidenceRule,
     FittedSet,
+    Probabilities,
     SetProbability,
     probabilities,
     set_probabilities,
@@ -65,6 +66,12 @@ def test_a_missing_horizon_says_as_much_as_the_reference():
     np.testing.assert_allclose(set_probabilities([at_one, first], rule=RULE), softmax([0.4, 0.0]))
     runs_alone = FittedSet(frozenset({"c@hub"}), None, first.free_run)
     np.testing.assert_allclose(set_probabilities([first, runs_alone], rule=RULE), softmax([0.4, 0.0]))
+
+
+def test_the_reference_was_fitted_at_both_horizons():
+    """One that was fitted to predictions alone stands first; free runs of the others still count."""
+    sets = [fitted("b@arm", 5.0, free_run=False), fitted("a@hub", 5.0, 0.8), fitted("c@hub", 5.0, 0.0)]
+    np.testing.assert_allclose(set_probabilities(sets, rule=RULE), softmax([0.4, 0.0, -1.5 * 0.8]))
 
 
 def test_a_lead_within_its_scatter_does_not_decide():
@@ -139,6 +146,21 @@ def test_what_is_told(found):
     left = probabilities([fitted("")], is_explained=False, rule=RULE)
     assert left.elsewhere == 0.25 and "catalogue" in left.remarks[1]
     assert left.sentence == "One set of effects was fitted: nothing more 75 %; another one 25 %."
+
+
+def test_a_sentence_names_three_sets_at_most_and_none_below_a_hundredth():
+    def told(*shares: float) -> str:
+        names = ("coulomb@hub", "lag@input", "delay@input", "cogging@hub")
+        sets = tuple(SetProbability(frozenset({n}), p) for n, p in zip(names, shares, strict=False))
+        return Probabilities(sets, {}, 0.02).sentence
+
+    assert told(0.968, 0.0101).endswith(
+        "Coulomb friction at hub 97 %; then input lag 1 %; none of these 2 %."
+    )
+    assert told(0.970, 0.0099).endswith("Coulomb friction at hub 97 %; none of these 2 %.")
+    assert "delay" in told(0.5, 0.2, 0.15, 0.13) and "cogging" not in told(0.5, 0.2, 0.15, 0.13)
+    # Of many that are all unlikely the first is named.
+    assert "Coulomb friction at hub < 1 %; none" in told(0.009, 0.008)
 
 
 def test_calibration_error_by_hand():

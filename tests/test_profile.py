@@ -213,6 +213,9 @@ def test_what_makes_no_sense_is_refused():
     local = rf.fit(axis(CONSTANT), [recording(), recording()], local=[CONSTANT])
     with pytest.raises(rf.InputError, match="for 2 recordings, but 1 were given"):
         rf.profile(local, recording(), CONSTANT)
+    for other in (recording(2 * NOISE), [recording(), recording()], recording().slice(1, N)):
+        with pytest.raises(rf.InputError, match="the fit was not made from"):
+            rf.profile(fitted(), other, CONSTANT)
 
 
 def test_no_interval_is_wider_than_the_profile():

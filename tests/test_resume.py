@@ -4,6 +4,7 @@ import copy
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from spindle import PAIRS, SPINDLE, spun
 import rotflex_jax as rf
 from rotflex_jax.cli import main
 from rotflex_jax.cli.rounds_so_far import RoundsSoFar
+from rotflex_jax.discover.checkpoint import digest_of_search
 from rotflex_jax.discover.horizon import Horizons
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.digest import content
@@ -133,6 +135,13 @@ def test_what_a_recording_continues_belongs_to_it() -> None:
     alone = copy.copy(later)
     object.__setattr__(alone, "continues", None)
     assert content(alone) == content(later)[:3] != content(later)
+
+
+def test_the_same_recordings_shared_out_otherwise_are_another_search() -> None:
+    a, b = spun().split(0.7)
+    s: Any = SimpleNamespace(mechanism=SPINDLE)
+    model = rf.Model(SPINDLE)
+    assert digest_of_search(model, s, 2.0, [a, b], []) != digest_of_search(model, s, 2.0, [a], [b])
 
 
 def test_nothing_is_reported_before_all_is_read(

@@ -11,6 +11,7 @@ import rotflex_jax as rf
 from rotflex_jax.discover import search
 from rotflex_jax.discover.assessment import NEAR_FLOOR, Assessment, in_noise
 from rotflex_jax.errors import InputError
+from rotflex_jax.recording.digest import shared_samples
 
 NAN = float("nan")
 
@@ -18,6 +19,35 @@ NAN = float("nan")
 def again(recording: rf.Recording) -> rf.Recording:
     """The same numbers, read once more."""
     return dataclasses.replace(recording, u=recording.u.copy(), y=recording.y.copy(), source="again.csv")
+
+
+def test_pieces_of_one_recording_are_told_by_their_samples() -> None:
+    """However they were cut; standstill, the same input and a few samples at an end prove nothing."""
+    whole, N = spun(), 1500
+    piece = whole.slice
+    alike = [
+        (piece(1, N), whole, 1499),
+        (piece(0, 1499), piece(1, N), 1498),
+        (piece(0, 900), piece(600, N), 300),
+    ]
+    for a, b, samples in alike:
+        assert shared_samples(a, b) == shared_samples(b, a) == samples
+    noise = np.where(np.arange(1499) == 700, 1e-9, 0.0)[:, None]
+    changed = dataclasses.replace(piece(1, N), y=piece(1, N).y + noise)
+    late = np.arange(N) >= 1000
+    still = dataclasses.replace(whole, u=whole.u * late, y=whole.y * late[:, None])
+    apart = [(whole, spun(seed=2)), whole.split(0.5), (piece(0, 900), piece(800, N)), (changed, whole)]
+    for a, b in (*apart, (still.slice(0, 900), still.slice(50, 950))):
+        assert shared_samples(a, b) == 0
+
+
+def test_a_recording_cut_by_a_sample_validates_and_tests_nothing() -> None:
+    a, b = spun().split(0.7)
+    reason = "search decides on data that no fit has seen"
+    with pytest.raises(InputError, match=rf"with the same \d+ samples were given to fit and .*{reason}"):
+        rf.discover(SPINDLE, a, a.slice(1, a.N), candidates=PAIRS)
+    with pytest.raises(InputError, match="were given to search and to test"):
+        rf.discover(SPINDLE, a, b, test=b.slice(3, b.N), candidates=PAIRS)
 
 
 @pytest.mark.parametrize("how", ["the same", "read twice", "as training alone", "one of several"])

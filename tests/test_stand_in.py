@@ -7,13 +7,20 @@ import numpy as np
 import pytest
 from small_problem import HUB, NOISE, problem, recordings, records, start, supermodel
 
-from rotflex_jax.discover import search
+from rotflex_jax.discover import search, stand_in
 from rotflex_jax.discover.horizon import SearchHorizon
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_effect
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import levenberg_marquardt
 from rotflex_jax.discover.result import HorizonGain
-from rotflex_jax.discover.stand_in import LEAST_CHANGE, SCATTER, nats_above_noise, signs, window_sizes
+from rotflex_jax.discover.stand_in import (
+    LEAST_CHANGE,
+    SCATTER,
+    WindowSizes,
+    nats_above_noise,
+    signs,
+    window_sizes,
+)
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet
 from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder
@@ -88,6 +95,32 @@ def test_each_sign_is_a_sentence(same):
     apart = SearchHorizon(other, ValidationSet(other, 2.0))
     (scattered,) = signs((apart, apart), validated(with_friction(other, 0.03)), {HUB: 1e9})[HUB]
     assert scattered.startswith("windows of 2 s differ by")
+
+
+@pytest.mark.parametrize("folds", [True, False], ids=["validating each other", "held out"])
+@pytest.mark.parametrize("beyond", [None, "scatter", "change", "gain"])
+def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pytest.MonkeyPatch):
+    """15 % of the size, half of the error that is left, the nats left in both sets; the worse set counts."""
+    space = types.SimpleNamespace
+    validation = space(folds=folds, problem="free runs, held out", window_seconds=2.0)
+    prediction = space(problem="predictions", validation=space(problem="predictions, held out"))
+    runs = space(hypothesis=space(locations=(HUB,)), adapted=None)
+    scatter = 0.152 if beyond == "scatter" else 0.148
+    change = 0.495 if beyond == "change" else 0.505
+    sizes = {"free runs": WindowSizes(0.01, 9.0), "free runs, held out": WindowSizes(scatter, change)}
+    if folds:  # the recordings for training are all there are
+        sizes = {"free runs": sizes["free runs, held out"]}
+    left = {"predictions": 30.0, "predictions, held out": 20.0}
+    monkeypatch.setattr(stand_in, "window_sizes", lambda problem, h, locations: {HUB: sizes[problem]})
+    monkeypatch.setattr(stand_in, "nats_above_noise", lambda problem, h: left[problem])
+    rest = 60.0 if folds else 50.0
+    final = space(free_run=runs, hypothesis=None, adapted=None)
+    horizons = (prediction, space(problem="free runs", validation=validation))
+    found = signs(horizons, final, {HUB: rest - 0.1 if beyond == "gain" else rest})[HUB]
+    words = {"scatter": "windows of 2 s differ by 15%", "change": "changes free runs by 0.49 of the error"}
+    words |= {"gain": f"{rest:.0f} are left above the sensor noise"}
+    assert len(found) == (beyond is not None)
+    assert beyond is None or words[beyond] in found[0]
 
 
 def test_sensor_faults_of_an_impossible_size_are_not_physical():

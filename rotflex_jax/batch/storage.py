@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 import json
 import math
 import os
@@ -53,10 +54,20 @@ def digest_of_recording(source: Path | Recording, common: str) -> str:
 
 
 def _named(search: Any) -> str:
-    """Name of a function, with its bound arguments."""
+    """Name of a function, with its bound arguments; the same in every process."""
     if isinstance(search, functools.partial):
-        return f"{_named(search.func)}{search.args!r}{sorted(search.keywords.items())!r}"
+        words = sorted((name, _written(value)) for name, value in search.keywords.items())
+        return f"{_named(search.func)}{_written(search.args)}{words!r}"
     return f"{search.__module__}.{search.__qualname__}"
+
+
+def _written(value: Any) -> str:
+    """An argument as text; functions by their names, since their `repr` has an address in it."""
+    if isinstance(value, list | tuple):
+        return f"{type(value).__name__}({', '.join(map(_written, value))})"
+    if isinstance(value, functools.partial) or inspect.isroutine(value):
+        return _named(value)
+    return repr(value)
 
 
 def names_of(sources: Sequence[Path | Recording]) -> list[str]:

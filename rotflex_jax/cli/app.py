@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from rotflex_jax.recording import Recording
 
 app = typer.Typer(
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Find the physics a model of a rotary flexible joint is missing, from a recording of it.",
 )

@@ -42,12 +42,15 @@ class RoundsSoFar:
         return follow
 
     def _write(self, file: Path) -> None:
-        kept = {"schema": 1, "stopped": True, "stages": self._stages}
-        try:
-            write_file(file, json.dumps(kept, indent=2) + "\n")
-        except InputError:
-            return  # the search is worth more than its trace
-        done = len(self._stages) - 1
+        # A search that goes on comes by the rounds of the file again, and must not lose them if it is killed.
+        stages = _longer(file, self._stages) or self._stages
+        kept = {"schema": 1, "stopped": True, "stages": stages}
+        if stages is self._stages:
+            try:
+                write_file(file, json.dumps(kept, indent=2) + "\n")
+            except InputError:
+                return  # the search is worth more than its trace
+        done = len(stages) - 1
         rounds = "one finished round" if done == 1 else f"{done} finished rounds"
         STOP.kept = (
             f"the model as it is and after {rounds} are in {file}: the same command with --continue goes on "
@@ -59,6 +62,17 @@ class RoundsSoFar:
         STOP.kept = ""
         if self.file is not None and self._stages:
             self.file.unlink(missing_ok=True)
+
+
+def _longer(file: Path, stages: list[dict[str, Any]]) -> list[Any] | None:
+    """What a file has kept of the same search, where that begins with these stages and has more of them."""
+    try:
+        known = json.loads(file.read_text(encoding="utf-8"))["stages"]
+        begins = [(a["model"], a["search"]["digest"]) for a in known[: len(stages)]]
+        same = begins == [(a["model"], a["search"]["digest"]) for a in stages]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return known if same and len(known) > len(stages) else None
 
 
 def _is_special(path: Path) -> bool:

@@ -23,6 +23,7 @@ from rotflex_jax.fit.dataset import sensor_noise
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.digest import check_apart
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.runtime.xla import one_thread
@@ -147,11 +148,8 @@ def _training_and_test(
             "recordings of their own or the end of each; give one of the two."
         )
     tested = listed(test, "test", SHORTEST_TO_FIT)
-    if any(r is s for r in recordings for s in tested):
-        raise InputError(
-            "The same recording was given to learn from and as test data, but an error on "
-            "training data proves nothing; leave `test` out to use the end of the recording."
-        )
+    reason = "an error on training data proves nothing; leave `test` out to use the end of the recording"
+    check_apart(recordings, tested, "to learn from and as test data", reason)
     return recordings, tested
 
 

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,19 +25,24 @@ from rotflex_jax.text.files import path_of
 _NUMBERS = ("z", "local_z", "x0", "K")
 
 
-def digest_of_search(model: Model, s: SuperModel, seconds: float, recordings: Iterable[Recording]) -> str:
+def digest_of_search(
+    model: Model, s: SuperModel, seconds: float, train: Sequence[Recording], validation: Sequence[Recording]
+) -> str:
     """Digest of all that the models of a search depend on; the code of one's own effects is not among it.
 
     Args:
         model: The user's model.
         s: It with every candidate.
         seconds: Length of short free runs [s].
-        recordings: For training, then for validation.
+        train: Recordings that are fitted.
+        validation: Recordings that decide; none where those for training do.
     """
     m = model.mechanism
     physics = (m.coordinates, m.ports, m.effects, m.outputs, sorted(m.trusted), m.units)
     text = repr((__version__, physics, model.solver, model.gates, s.mechanism.parameter_names, seconds))
-    return digest_of(text.encode(), *(part for r in recordings for part in content(r)))
+    # The same recordings, shared out otherwise, are another search.
+    count = str(len(train)).encode()
+    return digest_of(text.encode(), count, *(part for r in (*train, *validation) for part in content(r)))
 
 
 def kept(h: Hypothesis) -> dict[str, Any]:

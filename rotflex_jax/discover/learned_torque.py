@@ -24,6 +24,7 @@ from rotflex_jax.fit.motion import motion
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.digest import check_apart
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 
@@ -197,11 +198,9 @@ def learn_torque(
     model, say = Model.of(model), checks.progress(progress)
     trained, held_back = listed(train, "train", SHORTEST_TO_FIT), listed(test, "test", SHORTEST_TO_FIT)
     checks.positive(window_seconds, "window_seconds")
-    if any(a is b for a in trained for b in held_back):
-        raise InputError(
-            "The same recording was given to fit and to validate, but a map is kept only where data that no "
-            "fit has seen become likelier; give other recordings, or the two parts of recording.split(0.7)."
-        )
+    reason = "a map is kept only where data that no fit has seen become likelier; give other recordings, or "
+    reason += "the two parts of recording.split(0.7)"
+    check_apart(trained, held_back, "to fit and to validate", reason)
     position, speed = _motion(model, trained, at)
     dataset = prepare(model, trained, noise_of=held_back)
     torque = dataset.torque_scale

@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
+from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.text.colours import BASELINE, FINAL, INK, MUTED
 from rotflex_jax.text.numbers import equation, readable
 from rotflex_jax.text.plotting import blank, legend_above, styled
@@ -45,9 +46,8 @@ def learned_figure(result: LearnedTorqueResult) -> Figure:
         (right, (q, np.full(PROFILE_POINTS, moving)), a * q),
     ):
         mean, std = result.torque(*at)
-        ax.fill_between(
-            x, mean - 1.96 * std, mean + 1.96 * std, color=FINAL, alpha=0.3, lw=0, label="95 % band"
-        )
+        half = HALF_WIDTH_95 * std
+        ax.fill_between(x, mean - half, mean + half, color=FINAL, alpha=0.3, lw=0, label="95 % band")
         ax.plot(x, mean, color=FINAL, lw=1.6, label="learned")
         if result.formula.terms:
             ax.plot(x, result.read_torque(*at), color=BASELINE, lw=1.2, ls=(0, (4, 2)), label="formula")

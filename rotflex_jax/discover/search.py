@@ -86,6 +86,7 @@ from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.digest import check_apart
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 from rotflex_jax.runtime.xla import one_thread
@@ -261,8 +262,12 @@ def discover(
     held_back = _several(validation, "validation")
     seen = (*trained, *held_back)
     horizons = _prepare(model, trained, held_back, candidates, window_seconds)
-    evaluation = Evaluation.of(model, horizons, _several(test, "test"), calibrate_seconds)
-    digest = digest_of_search(model, horizons.prediction.problem.supermodel, window_seconds, seen)
+    tested = _several(test, "test")
+    reason = "errors are reported on data that had no say; give other recordings, or leave `test` out"
+    check_apart(seen, tested, "to search and to test", reason)
+    evaluation = Evaluation.of(model, horizons, tested, calibrate_seconds)
+    s = horizons.prediction.problem.supermodel
+    digest = digest_of_search(model, s, window_seconds, trained, held_back)
     if resume is None:
         say(beginning("baseline", "fitting the model as it is"))
         state = _fit_as_it_is(model, horizons, say, digest)
@@ -328,13 +333,10 @@ def _prepare(
 
 def _check_apart(train: Sequence[Recording], held_back: Sequence[Recording]) -> None:
     """Refuses data that were fitted in the place of data that no fit has seen."""
+    reason = "a search decides on data that no fit has seen; give another recording, or the two parts of "
+    reason += "recording.split(0.7)"
     for k, a in enumerate(train):
-        for b in held_back or train[k + 1 :]:
-            if a is b or (a.Ts == b.Ts and np.array_equal(a.u, b.u) and np.array_equal(a.y, b.y)):
-                raise InputError(
-                    "The same recording was given to fit and to validate, but a search decides on data that "
-                    "no fit has seen; give another recording, or the two parts of recording.split(0.7)."
-                )
+        check_apart([a], held_back or train[k + 1 :], "to fit and to validate", reason)
 
 
 def _check_constants(m: Mechanism, s: SuperModel, recordings: Sequence[Recording]) -> None:

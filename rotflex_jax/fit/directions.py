@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.parameters import HALF_WIDTH_95
+
 # Entries below this share of the largest belong to no sentence.
 LEAST_SHARE = 0.1
 # Entries of a vector below this are zero, and two vectors are the same where no entry differs by more than
@@ -40,9 +42,10 @@ class Direction:
     def sentence(self) -> str:
         """What is known, in words."""
         names, v = self.parameters, self.shares
-        wide = "" if np.isinf(self.std) else f" (together known to ± {100 * 1.96 * self.std:.2g} % only)"
+        half = f"{100 * HALF_WIDTH_95 * self.std:.2g}"
+        wide = "" if np.isinf(self.std) else f" (together known to ± {half} % only)"
         if len(names) == 1:
-            known = f"is known to ± {100 * 1.96 * self.std:.2g} % only"
+            known = f"is known to ± {half} % only"
             return f"{names[0]} {'has no effect on what is measured' if np.isinf(self.std) else known}"
         both = f"{', '.join(names[:-1])} and {names[-1]}"
         sizes = np.array([v[n] for n in names])

@@ -48,6 +48,7 @@ from rotflex_jax.optimise.damped_least_squares import (
 )
 from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.digest import digest_of_recordings
 from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread
 
@@ -565,6 +566,7 @@ def report(
         options=options or FitOptions(),
         Ts=problem.dataset.recordings[0].Ts,
         n_init=problem.dataset.recordings[0].n_init,
+        data=digest_of_recordings(problem.dataset.recordings),
     )
 
 
@@ -690,7 +692,7 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
         recordings: Those that were fitted.
 
     Raises:
-        InputError: Another number of recordings, where each has parameters of its own.
+        InputError: Other recordings, or another number of them.
     """
     asked, m = fitted.options, fitted.model.mechanism
     own = fitted.local.values()
@@ -700,6 +702,11 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
             f"{len(recordings)} were given; give those that were fitted."
         )
     problem = _problem(fitted.model, recordings, asked.first, asked.max_steps, None, None, lambda _: None)
+    if fitted.data and digest_of_recordings(recordings) != fitted.data:
+        raise InputError(
+            "Recordings were given that the fit was not made from, but a profile fits the same data again "
+            "with one quantity held; give those that were fitted, in their order, or fit these first."
+        )
     windows = problem.horizons(asked.window_seconds)[-1]
     point = problem.start([m.parameter_names.index(n) for n in asked.local], windows)
     transform, local_z = problem.transform, point.local_z.copy()

@@ -321,8 +321,7 @@ def profile(
         Profile with `interval(level)`, `shape`, `wald` and a figure.
 
     Raises:
-        InputError: No such parameter, a function that gives no number, or another number of recordings than
-            were fitted where each has parameters of its own.
+        InputError: No such parameter, a function that gives no number, or other recordings than were fitted.
 
     Source: S. A. Murphy and A. W. van der Vaart, J. Am. Stat. Assoc. 95, 2000; A. Raue et al., Bioinformatics
     25, 2009; the factor: R. E. Chandler and S. Bate, Biometrika 94, 2007.

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
+from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import as_read, digits, plain_number, readable, unit_text
 
@@ -139,7 +140,7 @@ class Profile:
         if not math.isfinite(self.std) or self.shape != "closed":
             return True
         at = self.root_at(np.array(self.wald))
-        return not bool(np.all(np.abs(np.abs(at) / 1.96 - 1) <= POOR))
+        return not bool(np.all(np.abs(np.abs(at) / HALF_WIDTH_95 - 1) <= POOR))
 
     @property
     def sentence(self) -> str:

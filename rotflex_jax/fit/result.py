@@ -15,7 +15,7 @@ from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.models.comparison import compare_plot
 from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import Estimate
+from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import card, paragraph, picture, table
 from rotflex_jax.text.numbers import plain_number, readable, unit_text, value_and_interval
@@ -72,6 +72,7 @@ class Fit:
         options: How it was asked for.
         Ts: Sampling period of the first recording [s], which a saved model keeps; None where none is known.
         n_init: Samples at its start that the fit looked at, or None.
+        data: Digest of the recordings, in their order; "" where it is not known.
     """
 
     model: Model
@@ -89,6 +90,7 @@ class Fit:
     options: FitOptions = FitOptions()
     Ts: float | None = None
     n_init: int | None = None
+    data: str = ""
 
     @property
     def profile_advised(self) -> tuple[str, ...]:
@@ -101,7 +103,7 @@ class Fit:
         specs = dict(zip(m.parameter_names, m.parameter_specifications, strict=True))
         found = []
         for e in self.parameters:
-            spec, half = specs[e.name], 1.96 * e.std
+            spec, half = specs[e.name], HALF_WIDTH_95 * e.std
             bounds = [b for b in (spec.lower, spec.upper) if math.isfinite(b)]
             room = min((abs(e.value - b) for b in bounds), default=math.inf)
             if e.free and not half <= WIDE_INTERVAL * room:
@@ -174,7 +176,7 @@ class Fit:
             note = e.remark if e.free else e.note or "held"
             estimates.append((e.name, unit_text(e.unit), note, *value_and_interval(e)))
         for e in self.parameters:
-            width = 100 * 1.96 * e.std / abs(e.value) if e.free and e.value else math.nan
+            width = 100 * HALF_WIDTH_95 * e.std / abs(e.value) if e.free and e.value else math.nan
             widths.append((e.name, width, f"± {width:.2g} %"))
         return card(
             f"Fit: {self.ending}, cost {plain_number(self.cost, 4)} nat",

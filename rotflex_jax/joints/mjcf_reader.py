@@ -101,6 +101,9 @@ class _Reader:
         bodies = self.file.below(hub.body)
         outer = [] if arm is None else self.file.below(arm.body)
         inner = [b for b in bodies if b not in outer]
+        self._check_masses(hub, inner)
+        if arm is not None:
+            self._check_masses(arm, outer)
         armature = told(hub.told, "armature")
         self.effects.append(Inertia(at=self.port, inertia=self._inertia(inner) + armature))
         if arm is not None:
@@ -119,6 +122,14 @@ class _Reader:
         self._tendons()
         self._equalities()
         return self._assembled()
+
+    def _check_masses(self, joint: FileJoint, bodies: list[int]) -> None:
+        """Refuse bodies without mass or inertia, which any torque would move at once, as MuJoCo does."""
+        if not sum(self.file.bodies[k].mass for k in bodies) > 0 or not self._inertia(bodies) > 0:
+            raise InputError(
+                f"{one_line(self.file.path)} has no mass, or no inertia about the axis, in what moves "
+                f"with the joint {one_line(joint.name)!r}; write the mass and the inertia of its bodies."
+            )
 
     def _check_options(self) -> None:
         """Options that change the forces of the whole file."""

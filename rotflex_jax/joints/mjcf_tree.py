@@ -226,7 +226,13 @@ class FileModel:
             kind = own.get("type", "hinge")
             if kind not in ("hinge", "slide"):
                 continue  # moves in more than one way: no machine of one joint, and named by nobody
-            axis = _unit(turn @ (self.numbers(own, "axis", 3, np.array([0.0, 0.0, 1.0]))))
+            axis = self.numbers(own, "axis", 3, np.array([0.0, 0.0, 1.0]))
+            if not np.linalg.norm(axis) > SMALLEST:
+                raise self.error(
+                    f'has a joint with axis="{one_line(own["axis"])[:40]}"',
+                    "write a direction that is not zero",
+                )
+            axis = _unit(turn @ axis)
             anchor = at + turn @ (self.numbers(own, "pos", 3, np.zeros(3)))
             label = own.get("name", f"joint {len(self.joints)}")
             self.joints.append(FileJoint(label, number, kind == "slide", axis, anchor, own))

@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rotflex_jax.latent.result import Abscissa, LatentTorque
+from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, MUTED
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, styled, thinned
@@ -63,7 +64,7 @@ def latent_time(before: LatentTorque, after: LatentTorque | None = None) -> Figu
     for (left, right), port in zip(grid, before.ports, strict=True):
         i, floor = before.ports.index(port), MIN_SCALE_OF_MOTOR * before.scale
         for torque, style in _styles(before, after):
-            t, d, half = torque.time[last], torque.torque[last, i], 1.96 * torque.std[last, i]
+            t, d, half = torque.time[last], torque.torque[last, i], HALF_WIDTH_95 * torque.std[last, i]
             left.fill_between(t, d - half, d + half, color=style["color"], alpha=0.22, lw=0)
             left.plot(*thinned(t, d), lw=0.9, **style)
             f, size = torque.spectrum(port)

@@ -7,6 +7,8 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float
 
+from rotflex_jax.parameters import HALF_WIDTH_95
+
 # Chance of a false line, and of a false drift, in one torque.
 FALSE_ALARM = 1e-3
 # A line has at least so many periods in its recording; what is slower is drift.
@@ -105,7 +107,7 @@ def periodic_torques(
         frequency, sine = _harmonic(left, t, float(f[k]), float(f[1]))
         amplitude = float(np.hypot(*np.linalg.lstsq(_waves(t, frequency), left, rcond=None)[0]))
         std = math.sqrt(2 * float(level[k]) / N)
-        interval = (max(amplitude - 1.96 * std, 0.0), amplitude + 1.96 * std)
+        interval = (max(amplitude - HALF_WIDTH_95 * std, 0.0), amplitude + HALF_WIDTH_95 * std)
         found.append(PeriodicTorque(frequency, amplitude, interval, p))
         left = left - sine
         usable &= np.abs(f - frequency) > 2.5 * f[1]  # what is left of a line is none

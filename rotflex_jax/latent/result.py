@@ -14,6 +14,7 @@ from rotflex_jax.latent.in_time import Drift, PeriodicTorque, drift, periodic_to
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import effects_of
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.colours import FINAL, MUTED
 from rotflex_jax.text.markup import bullets, card, picture, table
@@ -101,8 +102,8 @@ def binned_mean(
     return {
         "at": at[kept],
         "mean": mean[kept],
-        "low": (mean - 1.96 * error)[kept],
-        "high": (mean + 1.96 * error)[kept],
+        "low": (mean - HALF_WIDTH_95 * error)[kept],
+        "high": (mean + HALF_WIDTH_95 * error)[kept],
         "spread": np.sqrt(scatter[kept]),
         "count": count[kept].astype(int),
         "visits": visits[kept],

@@ -26,7 +26,7 @@ from rotflex_jax.discover.tables import (
 )
 from rotflex_jax.effects.labels import effect_label, effect_title, sentence
 from rotflex_jax.latent import LatentTorque
-from rotflex_jax.parameters import Estimate
+from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.text.colours import stage_colours
@@ -266,7 +266,8 @@ def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> di
         "terms": [
             (
                 equation(t.name) if t.name != "1" else "constant",
-                f"{plain_number(t.coefficient)} ± {plain_number(1.96 * t.std, 2)} {together(unit(t.unit))}",
+                f"{plain_number(t.coefficient)} ± {plain_number(HALF_WIDTH_95 * t.std, 2)} "
+                f"{together(unit(t.unit))}",
                 f"{100 * t.share:.0f}\xa0%",
             )
             for t in learned.formula.terms

@@ -11,7 +11,7 @@ from rotflex_jax.discover.probabilities import LEAST_NAMED, parts, percent, set_
 from rotflex_jax.discover.result import NEAR_FLOOR, SearchResult
 from rotflex_jax.discover.tables import Outcome, channel_units, noise_ratios, outcomes, stage_labels
 from rotflex_jax.effects.labels import effect_label
-from rotflex_jax.parameters import Estimate
+from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.report.figures.registry import figure
 from rotflex_jax.text.colours import FINAL, INK, MEASURED, MUTED, NOISE, stage_colours
 from rotflex_jax.text.numbers import plain_number, readable
@@ -225,7 +225,7 @@ def parameters(discovery: SearchResult) -> Figure | None:
             if e is None or not math.isfinite(e.value):
                 continue
             centre = 100 * (e.value / final.value - 1)
-            half_width = 100 * 1.96 * e.std / abs(final.value) if math.isfinite(e.std) else 0.0
+            half_width = 100 * HALF_WIDTH_95 * e.std / abs(final.value) if math.isfinite(e.std) else 0.0
             ax.errorbar(
                 centre,
                 k + spread[stage],
