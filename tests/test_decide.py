@@ -287,3 +287,16 @@ def test_errors_of_windows_leave_out_what_a_model_has_seen(sides):
         runs.append(run)
     assert all(isinstance(r, Recording) and r.N == 640 for r in validation.problem.dataset.recordings)
     np.testing.assert_allclose(validation.window_rmse(runs), [0.03, 0.04])
+
+
+def test_of_two_that_nothing_distinguishes_the_one_with_fewer_parameters_leads():
+    close = {"train": 200.0, "windows": 5.0, "scatter": 3.0}
+    many = trial(ARM, held_out=210.0, **close, seed=2, numbers=2)
+    few = trial(COULOMB, held_out=200.0, **close, numbers=1)
+    assert not distinguished(many, few)
+    winner, rivals = choose([many, few], BASE, DATA, NOISE)
+    assert winner is few and rivals == [many]
+    # As many parameters: the larger gain. Beyond doubt better: the better one, whatever it takes.
+    assert choose([many, dataclasses.replace(few, parameter_count=2)], BASE, DATA, NOISE)[0] is many
+    better = trial(ARM, held_out=400.0, train=400.0, windows=5.0, scatter=3.0, seed=2, numbers=2)
+    assert distinguished(better, few) and choose([better, few], BASE, DATA, NOISE) == (better, [])
