@@ -31,6 +31,9 @@ WINDOWS_WORSE, WINDOWS_BETTER = 0.02, 0.01
 # Two effects are distinguished by this many standard deviations of their paired block differences, or by free
 # runs over short windows whose errors differ by more than this (mean log ratio).
 SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
+# Where the winner leaves errors far from the noise, likelihood distinguishes only what gains this share less:
+# what is missing besides suits one of two that do nearly the same better by as much.
+GAIN_APART = 0.1
 # What predictions do not want, free runs must want by so many standard deviations of their block gains, on
 # validation and on training data, with an error that falls by so much (mean log ratio).
 FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
@@ -180,13 +183,13 @@ def choose(
         winner = max(simpler, key=lambda t: shares[t.location])
     # Which of two that nothing distinguishes leads is chance; the one with fewer parameters goes first.
     fewer = [t for t in able if t.parameter_count < winner.parameter_count and not _related(t, winner)]
-    if alike := [t for t in fewer if not distinguished(winner, t)]:
+    if alike := [t for t in fewer if _alike(winner, t, current, noise)]:
         winner = min(alike, key=lambda t: (t.parameter_count, -shares[t.location]))
     rivals = [t for t in candidates if t is not winner and not _related(t, winner)]
     gains = [
         t for t in rivals if t.log_likelihood > current.log_likelihood and _training_gain(t, current)[0] > 0
     ]
-    return winner, [t for t in gains if not distinguished(winner, t)]
+    return winner, [t for t in gains if _alike(winner, t, current, noise)]
 
 
 def replaced_by(
@@ -249,7 +252,7 @@ def validate_from_best_states(
 
 def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
     """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
-    if float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART:
+    if _free_runs_apart(winner, rival):
         return True
     # Where runs validate each other, the blocks of training are the same samples once more.
     both = [(t.blocks,) if t.folds else (t.blocks, t.hypothesis.blocks) for t in (winner, rival)]
@@ -257,9 +260,30 @@ def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bo
     return paired_gain(a, b)[1] >= SEPARATE_Z
 
 
+def _alike(
+    winner: ValidatedHypothesis,
+    rival: ValidatedHypothesis,
+    current: ValidatedHypothesis,
+    noise: Float[np.ndarray, " C"],
+) -> bool:
+    """Whether a rival does what the winner does, as far as a model that leaves so much can tell."""
+    if not distinguished(winner, rival):
+        return True
+    if _free_runs_apart(winner, rival) or not np.any(best_window_rmse(winner) > 2 * noise):
+        return False
+    gains = [
+        paired_gain(t.blocks, current.blocks)[0] + _training_gain(t, current)[0] for t in (winner, rival)
+    ]
+    return gains[1] > (1 - GAIN_APART) * gains[0] > 0
+
+
 def _related(a: ValidatedHypothesis, b: ValidatedHypothesis) -> bool:
     """Whether one of two effects is a special case of the other."""
     return _contained(a, b) or _contained(b, a)
+
+
+def _free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
+    return float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART
 
 
 def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
