@@ -142,7 +142,7 @@ def _link(stage: int) -> Callable[[list[rf.Recording]], list[Direction]]:
     """
 
     def ways(runs: list[rf.Recording]) -> list[Direction]:
-        named = dict(zip(("lqr", "feedback"), runs[stage - 1 :: 2], strict=True))
+        named: dict[str, rf.Recording] = dict(zip(("lqr", "feedback"), runs[stage - 1 :: 2], strict=True))
         return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
 
     return ways
