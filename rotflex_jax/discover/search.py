@@ -459,7 +459,8 @@ def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: l
     if winner is None or winner.location is None:
         return False
     if more := _refit_replaced(state, winner, [c.location for c in candidates if c.location]):
-        winner, rivals = choose([*candidates, *more], current, data, state.problem.noise)
+        scored = [*scored, *(s for s, _ in more)]
+        winner, rivals = choose([*candidates, *(c for _, c in more)], current, data, state.problem.noise)
         assert winner and winner.location
     nats = next((s.nats for s in scored if s.location == winner.location), 0.0)
     not_distinguished = tuple(r.location for r in rivals if r.location)
@@ -470,7 +471,7 @@ def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: l
 
 def _refit_replaced(
     state: SearchState, winner: ValidatedHypothesis, tried: Sequence[EffectLocation]
-) -> list[ValidatedHypothesis]:
+) -> list[tuple[Score, ValidatedHypothesis]]:
     """Candidates in whose place the winner may stand, refitted without it, where it leaves something."""
     if not is_unexplained(state.horizons, winner):
         return []
@@ -481,11 +482,11 @@ def _refit_replaced(
     if not locations:
         return []
     state.say("refitting what it may stand for: " + ", ".join(map(str, locations)))
-    first, second = ({x.location: x.start for x in listed} for listed in before)
-    more = _refit(state, [first[p] for p in locations], [second[p] for p in locations])
+    first, second = ({x.location: x for x in listed} for listed in before)
+    more = _refit(state, [first[p].start for p in locations], [second[p].start for p in locations])
     for candidate in more:
         state.say("  " + describe(candidate, state.current))
-    return more
+    return [(first[c.location], c) for c in more if c.location]
 
 
 def _add_pair(state: SearchState) -> bool:
