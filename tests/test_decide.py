@@ -176,8 +176,10 @@ def test_what_cannot_be_told_apart_is_named_together():
     refused = trial(EffectLocation("dead_zone", "input"), **GOOD | {"train": 0.0}, seed=4)
     winner, rivals = choose([far, close, refused, best], BASE, DATA, NOISE)
     assert winner is best and rivals == [close]
-    # The same difference without scatter is beyond doubt.
-    steady = trial(ARM, **GOOD | {"held_out": 200.0, "train": 200.0}, seed=1)
+    # The same difference without scatter is beyond doubt, where both leave little more than noise.
+    near = GOOD | {"windows": 1.5}
+    best = trial(DRAG, **near | {"held_out": 210.0, "train": 210.0}, seed=1)
+    steady = trial(ARM, **near | {"held_out": 200.0, "train": 200.0}, seed=1)
     assert choose([steady, best], BASE, DATA, NOISE) == (best, [])
 
 
@@ -211,8 +213,8 @@ def test_the_simpler_effect_wins_unless_the_richer_earns_it():
     much = trial(STRIBECK, **GOOD | {"held_out": 300.0, "train": 300.0}, seed=1, numbers=3)
     winner, rivals = choose([plain, much], BASE, DATA, NOISE)
     assert winner is much and rivals == []
-    # At another port it is another effect.
-    elsewhere = trial(ARM, **GOOD, seed=1)
+    # At another port it is another effect, which must gain as much with as many parameters.
+    elsewhere = trial(ARM, **GOOD, seed=1, numbers=3)
     assert choose([elsewhere, little], BASE, DATA, NOISE)[0] is little
     # Where the simpler one is refused, the richer stands alone.
     weak = trial(COULOMB, **GOOD | {"windows": 11.0}, seed=1)
@@ -287,3 +289,31 @@ def test_errors_of_windows_leave_out_what_a_model_has_seen(sides):
         runs.append(run)
     assert all(isinstance(r, Recording) and r.N == 640 for r in validation.problem.dataset.recordings)
     np.testing.assert_allclose(validation.window_rmse(runs), [0.03, 0.04])
+
+
+def test_of_two_that_nothing_distinguishes_the_one_with_fewer_parameters_leads():
+    close = {"train": 200.0, "windows": 5.0, "scatter": 3.0}
+    many = trial(ARM, held_out=210.0, **close, seed=2, numbers=2)
+    few = trial(COULOMB, held_out=200.0, **close, numbers=1)
+    assert not distinguished(many, few)
+    winner, rivals = choose([many, few], BASE, DATA, NOISE)
+    assert winner is few and rivals == [many]
+    # As many parameters: the larger gain. Beyond doubt better: the better one, whatever it takes.
+    assert choose([many, dataclasses.replace(few, parameter_count=2)], BASE, DATA, NOISE)[0] is many
+    better = trial(ARM, held_out=400.0, train=400.0, windows=5.0, scatter=3.0, seed=2, numbers=2)
+    assert distinguished(better, few) and choose([better, few], BASE, DATA, NOISE) == (better, [])
+
+
+@pytest.mark.parametrize(
+    ("share", "windows", "alike"), [(0.95, 5.0, True), (0.8, 5.0, False), (0.95, 1.5, False)]
+)
+def test_a_model_that_leaves_much_does_not_distinguish_effects_that_gain_nearly_the_same(
+    share, windows, alike
+):
+    """The same lead beyond doubt: it counts where it is a large part of the gain, or nothing else is left."""
+    strong = trial(ARM, held_out=1000.0, train=1000.0, windows=windows)
+    weak = trial(COULOMB, held_out=1000.0 * share, train=1000.0 * share, windows=windows)
+    assert distinguished(strong, weak)
+    assert choose([strong, weak], BASE, DATA, NOISE) == (strong, [weak] if alike else [])
+    few = dataclasses.replace(strong, parameter_count=2), weak
+    assert choose([*few], BASE, DATA, NOISE)[0] is few[alike]

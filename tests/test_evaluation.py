@@ -11,7 +11,7 @@ from rotflex_jax.discover.evaluation import SAME_SIZE, PairedEstimates, disagree
 from rotflex_jax.discover.hypothesis import CandidateStart
 from rotflex_jax.discover.result import HorizonGain, RunErrors
 from rotflex_jax.discover.score_test import LEAST_SHARE, Score, promising_at_both
-from rotflex_jax.discover.selection import HELD_OUT_Z, helps
+from rotflex_jax.discover.selection import HELD_OUT_Z, helps, replaced_by
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.parameters import Estimate, Specification
 
@@ -72,6 +72,31 @@ def test_both_rankings_propose():
     assert few[0] == "coulomb" and "viscous" not in few
     assert LEAST_SHARE * 1.7 > 5 / 100 + 20 / 1000
     assert ranked({"dahl": -1.0}, {"dahl": -2.0}) == []
+
+
+def replaced(before: tuple[dict, dict], after: tuple[dict, dict], tried=(), winner="dahl") -> list[str]:
+    both = (
+        [[score(n, x) for n, x in sorted(d.items(), key=lambda i: -i[1])] for d in s] for s in (before, after)
+    )
+    found = replaced_by(EffectLocation(winner, "hub"), *both, [EffectLocation(n, "hub") for n in tried])
+    return [p.effect for p in found]
+
+
+def test_candidates_whose_score_the_winner_took_are_refitted_too():
+    before = ({"gravity": 100.0, "coulomb": 15.0}, {"coulomb": 400.0, "cogging": 500.0, "backlash": 90.0})
+    # Coulomb friction promises nothing beside the winner; gravity and cogging promise what they did.
+    after = ({"gravity": 90.0, "coulomb": -3.0}, {"coulomb": 2.0, "cogging": 480.0, "backlash": -4.0})
+    assert replaced(before, after) == ["coulomb"]
+    assert replaced(before, after, tried=("coulomb",)) == []
+    assert replaced(before, ({"coulomb": 12.0}, {"coulomb": 300.0, "cogging": 480.0})) == ["gravity"]
+    # A part of it that is left may be an effect of its own; what contains the winner is asked again later.
+    assert "coulomb" not in replaced(before, (after[0] | {"coulomb": 9.0}, after[1] | {"coulomb": 90.0}))
+    rich = ({"lugre": 100.0}, {"lugre": 100.0})
+    assert replaced(rich, ({}, {}), winner="coulomb") == []
+    assert replaced(rich, ({}, {}), winner="cogging") == ["lugre"]
+    # Two at most, those that promised most over both horizons.
+    gone = ({}, {})
+    assert replaced(before, gone) == ["gravity", "cogging"]
 
 
 def test_errors_name_the_data_they_are_on():

@@ -127,9 +127,25 @@ def _silverbox(_: list[rf.Recording]) -> list[Direction]:
     return [learnt("official", [train], list(official.tests.values())), halves(train)]
 
 
+def by_itself(name: str, run: rf.Recording) -> Direction:
+    """Learnt from the first half of a run, decided on what follows and judged on its end."""
+    train, rest = run.split(0.5)
+    decides, judges = rest.split(2 * SHARE - 1)
+    return Direction(f"{name}, first half to its end", (train,), (decides,), (judges,))
+
+
 def _link(stage: int) -> Callable[[list[rf.Recording]], list[Direction]]:
-    """Two runs of either stage: by LQR and by full state feedback."""
-    return lambda runs: crossed(dict(zip(("lqr", "feedback"), runs[stage - 1 :: 2], strict=True)))
+    """Two runs of either stage, by LQR and by full state feedback: each by itself, and across.
+
+    They are fifteen years apart, with other friction and amplifiers: a run by itself says what a model can
+    do, and across the runs the machine is another one too.
+    """
+
+    def ways(runs: list[rf.Recording]) -> list[Direction]:
+        named: dict[str, rf.Recording] = dict(zip(("lqr", "feedback"), runs[stage - 1 :: 2], strict=True))
+        return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
+
+    return ways
 
 
 def _by_gain(runs: list[rf.Recording]) -> list[Direction]:

@@ -58,6 +58,7 @@ from rotflex_jax.discover.selection import (
     describe,
     helps,
     horizon_gains,
+    replaced_by,
     runs_clearly_better,
     validate_from_best_states,
 )
@@ -121,7 +122,8 @@ class SearchState:
         merged: The final model with one effect in the place of several, where it has one.
         in_place_of: That effect -> the one of several whose place in the order it took.
         machine: Calibrations that belong to the machine.
-        tests: Score tests of the current model, of predictions and of free runs.
+        tests: Score tests of the model of `tested`, of predictions and of free runs.
+        tested: The model whose score tests were made last.
         resumed: After how many rounds of a search that was stopped this one went on.
         digest: Of all that the models depend on.
     """
@@ -150,6 +152,7 @@ class SearchState:
     in_place_of: dict[EffectLocation, EffectLocation] = dataclasses.field(default_factory=dict)
     machine: list[EffectLocation] = dataclasses.field(default_factory=list)
     tests: tuple[ScoreTest, ScoreTest] | None = None
+    tested: Hypothesis | None = None
 
     @functools.cached_property
     def reach(self) -> Reach:
@@ -385,17 +388,23 @@ def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, pat
 
 def _rank(state: SearchState) -> tuple[list[Score], list[Score]]:
     """Scores of all candidates beside the current model, of predictions and of free runs."""
-    current = state.current
-    assert current.free_run
-    state.tests = (
-        score_test(state.problem, current.hypothesis),
-        score_test(state.horizons.free_run.problem, current.free_run.hypothesis),
-    )
-    listed, runs = (test.listed for test in state.tests)
+    listed, runs = (test.listed for test in _score_tests(state, state.current))
     if not state.ranking:
         by_runs = {x.location: x.nats for x in runs}
         state.ranking = [(x, by_runs[x.location]) for x in listed]
     return listed, runs
+
+
+def _score_tests(state: SearchState, beside: ValidatedHypothesis) -> tuple[ScoreTest, ScoreTest]:
+    """Score tests of predictions and of free runs beside a model; those made last are kept."""
+    assert beside.free_run
+    if state.tests is None or state.tested is not beside.hypothesis:
+        state.tested = beside.hypothesis
+        state.tests = (
+            score_test(state.problem, beside.hypothesis),
+            score_test(state.horizons.free_run.problem, beside.free_run.hypothesis),
+        )
+    return state.tests
 
 
 def _score_candidates(
@@ -451,11 +460,35 @@ def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: l
     winner, rivals = choose(candidates, current, data, state.problem.noise)
     if winner is None or winner.location is None:
         return False
+    if more := _refit_replaced(state, winner, [c.location for c in candidates if c.location]):
+        scored = [*scored, *(s for s, _ in more)]
+        winner, rivals = choose([*candidates, *(c for _, c in more)], current, data, state.problem.noise)
+        assert winner and winner.location
     nats = next((s.nats for s in scored if s.location == winner.location), 0.0)
     not_distinguished = tuple(r.location for r in rivals if r.location)
     added = AddedEffect(winner.location, nats, not_distinguished, horizon_gains(winner, current))
     _add(state, winner, [added])
     return True
+
+
+def _refit_replaced(
+    state: SearchState, winner: ValidatedHypothesis, tried: Sequence[EffectLocation]
+) -> list[tuple[Score, ValidatedHypothesis]]:
+    """Candidates in whose place the winner may stand, refitted without it, where it leaves something."""
+    if not is_unexplained(state.horizons, winner):
+        return []
+    before = tuple(t.listed for t in _score_tests(state, state.current))
+    after = tuple(t.listed for t in _score_tests(state, winner))
+    assert winner.location
+    locations = replaced_by(winner.location, before, after, tried)
+    if not locations:
+        return []
+    state.say("refitting what it may stand for: " + ", ".join(map(str, locations)))
+    first, second = ({x.location: x for x in listed} for listed in before)
+    more = _refit(state, [first[p].start for p in locations], [second[p].start for p in locations])
+    for candidate in more:
+        state.say("  " + describe(candidate, state.current))
+    return [(first[c.location], c) for c in more if c.location]
 
 
 def _add_pair(state: SearchState) -> bool:

@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.discover.result import HorizonGain
+from rotflex_jax.discover.score_test import Score, promising
+from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.dataset import StackedRecordings
@@ -29,12 +31,18 @@ WINDOWS_WORSE, WINDOWS_BETTER = 0.02, 0.01
 # Two effects are distinguished by this many standard deviations of their paired block differences, or by free
 # runs over short windows whose errors differ by more than this (mean log ratio).
 SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
+# Where the winner leaves errors far from the noise, likelihood distinguishes only what gains this share less:
+# what is missing besides suits one of two that do nearly the same better by as much.
+GAIN_APART = 0.1
 # What predictions do not want, free runs must want by so many standard deviations of their block gains, on
 # validation and on training data, with an error that falls by so much (mean log ratio).
 FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
 # What predictions want by so many standard deviations, on validation and on training data, need not show in
 # free runs whose error something else makes, if these get no worse.
 PREDICTION_Z = 3.5
+# Candidates in whose place a winner may stand: so many at most, each with so much of the best score of its
+# round (shares of both horizons added up), of which no more than the last share is left beside the winner.
+REPLACED, REPLACED_SHARE, REPLACED_LEFT = 2, 0.25, 0.1
 
 
 def paired_gain(a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"]) -> tuple[float, float]:
@@ -161,6 +169,7 @@ def choose(
 ) -> tuple[ValidatedHypothesis | None, list[ValidatedHypothesis]]:
     """The best admissible candidate and those not distinguished from it; arguments as in `admissible`.
 
+    Of admissible ones that nothing distinguishes from the best, the one with the fewest parameters is chosen.
     A rival need not pass every test that the winner passed: where the effect is small, which of the two
     passes is chance. It is enough that it gains something and that nothing distinguishes it from the winner.
     """
@@ -172,13 +181,51 @@ def choose(
     simpler = [t for t in able if _contained(t, winner) and not _clearly_better(winner, t, current)]
     if simpler:
         winner = max(simpler, key=lambda t: shares[t.location])
-    rivals = [
-        t for t in candidates if t is not winner and not _contained(winner, t) and not _contained(t, winner)
-    ]
+    # Which of two that nothing distinguishes leads is chance; the one with fewer parameters goes first.
+    fewer = [t for t in able if t.parameter_count < winner.parameter_count and not _related(t, winner)]
+    if alike := [t for t in fewer if _alike(winner, t, current, noise)]:
+        winner = min(alike, key=lambda t: (t.parameter_count, -shares[t.location]))
+    rivals = [t for t in candidates if t is not winner and not _related(t, winner)]
     gains = [
         t for t in rivals if t.log_likelihood > current.log_likelihood and _training_gain(t, current)[0] > 0
     ]
-    return winner, [t for t in gains if not distinguished(winner, t)]
+    return winner, [t for t in gains if _alike(winner, t, current, noise)]
+
+
+def replaced_by(
+    winner: EffectLocation,
+    before: Sequence[list[Score]],
+    after: Sequence[list[Score]],
+    tried: Sequence[EffectLocation],
+) -> list[EffectLocation]:
+    """Candidates that promised much and promise nothing beside the winner: it may stand in their place.
+
+    Effects that do nearly the same at the motion of a recording (a dead zone of the input and friction at
+    the hub, where the hub stops at every reversal) take each other's score. Which of them is refitted first
+    is decided by slopes beside a model that lacks all of them, so those that lost theirs are refitted too.
+
+    Args:
+        winner: Effect that is going to be added; what contains it can still be added later.
+        before: Scores beside the model without it, of predictions and of free runs, best first.
+        after: The same beside the model with it.
+        tried: Effects that were refitted beside the model without it.
+
+    Returns:
+        At most `REPLACED` locations, those first that promised most.
+    """
+    share: dict[EffectLocation, float] = {}
+    for listed, later in zip(before, after, strict=True):
+        worth = promising(listed, len(listed))
+        left = {s.location: s.nats for s in later}
+        for s in worth:
+            if left.get(s.location, 0.0) < REPLACED_LEFT * s.nats:
+                share[s.location] = share.get(s.location, 0.0) + s.nats / worth[0].nats
+    lost = [
+        p
+        for p in share
+        if share[p] >= REPLACED_SHARE and p not in tried and not _is_in(winner, p) and p != winner
+    ]
+    return sorted(lost, key=lambda p: -share[p])[:REPLACED]
 
 
 def validate_from_best_states(
@@ -205,7 +252,7 @@ def validate_from_best_states(
 
 def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
     """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
-    if float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART:
+    if _free_runs_apart(winner, rival):
         return True
     # Where runs validate each other, the blocks of training are the same samples once more.
     both = [(t.blocks,) if t.folds else (t.blocks, t.hypothesis.blocks) for t in (winner, rival)]
@@ -213,11 +260,41 @@ def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bo
     return paired_gain(a, b)[1] >= SEPARATE_Z
 
 
+def _alike(
+    winner: ValidatedHypothesis,
+    rival: ValidatedHypothesis,
+    current: ValidatedHypothesis,
+    noise: Float[np.ndarray, " C"],
+) -> bool:
+    """Whether a rival does what the winner does, as far as a model that leaves so much can tell."""
+    if not distinguished(winner, rival):
+        return True
+    if _free_runs_apart(winner, rival) or not np.any(best_window_rmse(winner) > 2 * noise):
+        return False
+    gains = [
+        paired_gain(t.blocks, current.blocks)[0] + _training_gain(t, current)[0] for t in (winner, rival)
+    ]
+    return gains[1] > (1 - GAIN_APART) * gains[0] > 0
+
+
+def _related(a: ValidatedHypothesis, b: ValidatedHypothesis) -> bool:
+    """Whether one of two effects is a special case of the other."""
+    return _contained(a, b) or _contained(b, a)
+
+
+def _free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
+    return float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART
+
+
 def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
     """Whether `large` has the effect of `small` as a special case."""
     a, b = small.location, large.location
     assert a and b
-    return a.port == b.port and a.effect in CATALOG[b.effect].contains
+    return _is_in(a, b)
+
+
+def _is_in(small: EffectLocation, large: EffectLocation) -> bool:
+    return small.port == large.port and small.effect in CATALOG[large.effect].contains
 
 
 def _clearly_better(
