@@ -41,7 +41,17 @@ class Whitener:
         if self.a.shape[1] > 1:
             channels = [scipy.signal.lfilter(a, 1.0, e[..., c], axis=-1) for c, a in enumerate(self.a)]
             filtered = np.stack(channels, axis=-1)
-        return (filtered @ self.L.T) * self._counted(seen)[..., None]
+        # Channel by channel: there are few of them, and a product of matrices this thin takes several times as
+        # long for many signals.
+        w = np.empty(filtered.shape)
+        for i, row in enumerate(self.L):
+            first, *others = [j for j in range(len(row)) if row[j] != 0]
+            np.multiply(filtered[..., first], row[first], out=w[..., i])
+            for j in others:
+                w[..., i] += row[j] * filtered[..., j]
+        if (left_out := self._counted(seen) == 0).any():
+            w[..., left_out, :] = 0.0
+        return w
 
     def log_densities(
         self, e: Float[np.ndarray, "R N C"], seen: Float[np.ndarray, "R N"]
