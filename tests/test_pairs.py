@@ -272,3 +272,7 @@ def test_a_pair_must_be_better_than_each_of_its_members(spring: float):
     assert found.found.hypothesis.mean_values(s)[i] == pytest.approx(spring, rel=0.2)
     assert "looking one step further" in lines[0]
     assert not is_unexplained(at, found.found)
+    # Models without a member that were fitted before are not fitted again.
+    again, more = find_pair(at, current, tests, lambda h, p: True, lines.append, tried)
+    assert again and all(again.members[p] is less for p, less in found.members.items())
+    assert len(more) == len(tried) - 2

@@ -130,6 +130,7 @@ def find_pair(
     tests: tuple[ScoreTest, ScoreTest],
     is_plausible: Callable[[Hypothesis, EffectLocation], bool],
     say: Callable[[str], None],
+    known: Sequence[ValidatedHypothesis] = (),
 ) -> tuple[FoundPair | None, list[ValidatedHypothesis]]:
     """The best pair that passes, if there is one, and all that was fitted and validated.
 
@@ -139,6 +140,8 @@ def find_pair(
         tests: Its score tests of predictions and of free runs.
         is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
         say: Called with lines of progress.
+        known: Models that were fitted and validated at both horizons before; where one is a pair without a
+            member, it is not fitted again.
     """
     pairs = promising_pairs(*tests)
     if not pairs:
@@ -163,11 +166,15 @@ def find_pair(
     if not able:
         return None, everyone
     shares = dict(zip(able, shares_of_gain(list(able.values()), current), strict=True))
+    fitted = {frozenset(v.hypothesis.locations): v for v in known if v.free_run}
     for pair in sorted(able, key=lambda p: -shares[p]):
         found, members = able[pair], {}
         for p in pair:
-            less = _without(horizons, found, p, current)
-            everyone.append(less)
+            left = frozenset(found.hypothesis.locations) - {p}
+            if left not in fitted:
+                fitted[left] = _without(horizons, found, p, current)
+                everyone.append(fitted[left])
+            less = fitted[left]
             count = parameter_count(s, found.hypothesis, p)
             if not admissible(dataclasses.replace(found, parameter_count=count), less, data, noise):
                 say(f"  {_named(pair)}: no better than without {p}")

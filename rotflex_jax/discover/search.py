@@ -496,7 +496,9 @@ def _add_pair(state: SearchState) -> bool:
     if state.tests is None or not is_unexplained(state.horizons, state.current):
         return False
     state.say(beginning("pairs", "scoring pairs of candidates"))
-    pair, tried = find_pair(state.horizons, state.current, state.tests, state.is_plausible, state.say)
+    pair, tried = find_pair(
+        state.horizons, state.current, state.tests, state.is_plausible, state.say, state.tried
+    )
     state.tried += tried
     if pair is None:
         return False
