@@ -57,9 +57,9 @@ from rotflex_jax.text.files import write_file
 def one(job: Job) -> dict[str, Any]:
     """A rival on a record; imports late, after the settings of the process."""
     import rotflex_jax as rf
-    from arena.rivals import RIVALS
-    from arena.scoring import scored, visible
     from arena.trial import SPLIT, recording, windows_error
+    from rotflex_jax.arena.marking import scored, visible
+    from rotflex_jax.arena.rivals import RIVALS
     from rotflex_jax.effects import CATALOG
     from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 

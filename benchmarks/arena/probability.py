@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arena.hidden import EQUIVALENT
-from arena.laws import Place
 from arena.marks import good
-from arena.scoring import alike, exact
+from rotflex_jax.arena.marking import alike, exact
+from rotflex_jax.arena.simulator.hidden import EQUIVALENT
+from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.text.colours import BASELINE, FINAL, INK
 from rotflex_jax.text.plotting import blank, styled
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import rotflex_jax as rf
 from judged import errors, named, searched
-from measured_machines.machines import MACHINES, Direction
 from public_machines.rounds import estimates
+from rotflex_jax.arena.measured import MACHINES, Direction
 
 
 def main() -> None:

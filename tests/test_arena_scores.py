@@ -1,0 +1,343 @@
+"""Scores of methods: answers made by hand, a stranger's file, failures, what a method is given."""
+
+import json
+import math
+import pickle
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rotflex_jax as rf
+from rotflex_jax.arena import problems as of, scores as scoring
+from rotflex_jax.arena.method import Answer, Apart, ArenaFailure, Here, understood
+from rotflex_jax.arena.problems import MEASURED, NOTHING, ONE, OUT, TWO, WORLD, Problem, drawn
+from rotflex_jax.arena.scores import Score, Scores, calibration_error, failed, marked, run_error, score
+from rotflex_jax.cli import app
+from rotflex_jax.errors import InputError
+from rotflex_jax.models.model import Model
+
+MODEL = Model(rf.joints.paper())
+COULOMB, DELAY, GRAVITY = ("coulomb", "hub"), ("delay", "input"), ("gravity", "arm")
+
+
+def problem(kind, hidden=(), forgiven=()):
+    return Problem(kind, (), (), MODEL, (), tuple(hidden), tuple(forgiven), {}, {})
+
+
+EVERY = [
+    problem(ONE, [COULOMB]),
+    problem(TWO, [COULOMB, DELAY]),
+    problem(NOTHING),
+    problem(NOTHING),
+    problem(OUT, [("worm", "hub")]),
+    problem(WORLD, [GRAVITY], [("viscous", "hub")]),
+]
+
+
+def scored(answers):
+    return Score("m", tuple(marked(p, a, k) for k, (p, a) in enumerate(zip(EVERY, answers, strict=True))))
+
+
+def said(*effects, unexplained=False, **chances):
+    return Answer(tuple(effects), unexplained, chances.get("p", {}), False, 1.0)
+
+
+def test_a_perfect_answer_is_right_everywhere():
+    perfect = [
+        said(COULOMB, p={COULOMB: 1.0, DELAY: 0.0}),
+        said(DELAY, COULOMB),
+        said(),
+        said(),
+        said(unexplained=True),
+        said(("viscous", "hub"), GRAVITY),
+    ]
+    s = scored(perfect)
+    assert (s.right, s.named, s.withheld, s.worlds) == ((6, 6), (3, 3), (1, 1), (1, 1))
+    assert (s.alarms, s.wrong, s.worlds_wrong, s.failures) == ((0, 2), 0, 0, 0)
+    assert s.calibration == 0.0 and s.brier == 0.0
+
+
+def test_silence_raises_no_alarm_and_names_nothing():
+    s = scored([said()] * 6)
+    assert (s.right, s.named, s.withheld, s.worlds) == ((2, 6), (0, 3), (0, 1), (0, 1))
+    assert (s.alarms, s.wrong) == ((0, 2), 0)
+    assert s.calibration is None and s.brier is None
+
+
+def test_one_name_always_is_an_alarm_wherever_it_is_not_true():
+    s = scored([said(COULOMB, p={COULOMB: 0.9})] * 6)
+    # Right on the record that hides it alone; of two effects it names one.
+    assert (s.right, s.named, s.worlds) == ((1, 6), (2, 3), (0, 1))
+    assert (s.alarms, s.withheld, s.wrong, s.worlds_wrong) == ((2, 2), (0, 1), 3, 1)
+    # Claimed 0.9 six times, held twice.
+    assert s.calibration == pytest.approx(0.9 - 2 / 6)
+    assert s.brier == pytest.approx((2 * 0.1**2 + 4 * 0.9**2) / 6)
+
+
+def test_unexplained_always_is_right_outside_the_catalogue_only():
+    s = scored([said(unexplained=True)] * 6)
+    assert (s.right, s.named, s.withheld, s.alarms) == ((1, 6), (0, 3), (1, 1), (2, 2))
+    assert scored([*[said()] * 4, said(COULOMB, unexplained=True), said()]).wrong == 1
+
+
+def test_look_alikes_count_and_failures_count_as_wrong():
+    row = marked(problem(ONE, [("sensor_gain", "theta")]), said(("sensor_gain", "alpha")), 1)
+    assert row.right and row.hits == 1 and not row.wrong
+    s = Score("m", tuple(failed(p, "The method raised.", k, 2.0) for k, p in enumerate(EVERY)))
+    assert (s.right, s.alarms, s.withheld, s.failures, s.seconds) == ((0, 6), (0, 2), (0, 1), 6, None)
+
+
+def test_calibration_is_the_mean_distance_of_claim_and_share():
+    events = [scoring.Event(0.25, k < 1) for k in range(4)] + [scoring.Event(0.95, True)] * 4
+    assert calibration_error(events) == pytest.approx((4 * 0 + 4 * 0.05) / 8)
+    assert math.isnan(calibration_error([]))
+
+
+def test_what_is_no_answer_is_refused_in_a_sentence():
+    for given, phrase in [
+        (None, "None"),
+        ("coulomb", "'nothing missing'"),
+        (3.0, "3.0"),
+        (["coulomb"], "'coulomb@hub'"),
+        (["glue@hub"], "no such effect"),
+        (["coulomb@knee"], "'hub'"),
+        ({"effect": []}, "'effect'"),
+        ({"probabilities": {"coulomb@hub": 1.5}}, "between 0 and 1"),
+        ({"unexplained": "yes"}, "True or False"),
+        ({"model": "mine"}, "simulate"),
+    ]:
+        with pytest.raises(InputError, match=phrase):
+            understood(given, MODEL)
+    found, model = understood({"effects": ["coulomb@hub", COULOMB], "model": rf.joints.paper()}, MODEL)
+    assert found.effects == (COULOMB,) and isinstance(model, Model)
+    for nothing in ("nothing missing", [], (), {"effects": None}):
+        assert understood(nothing, MODEL)[0] == Answer()
+    assert understood("unexplained", MODEL)[0].unexplained
+
+
+@pytest.fixture(scope="module")
+def three() -> list[Problem]:
+    """Three short records of one seed."""
+    return drawn(3, 11, 4.0)
+
+
+def test_records_are_those_of_their_seed(three):
+    again, other = drawn(3, 11, 4.0), drawn(3, 12, 4.0)
+    assert [p.given() for p in again] == [p.given() for p in three]
+    assert [p.truth for p in again] == [p.truth for p in three]
+    assert [p.given() for p in other] != [p.given() for p in three]
+    kinds = [p.kind for p in drawn_kinds(24, 5)]
+    shares = {ONE: 12, NOTHING: 4, OUT: 4, TWO: 2, WORLD: 2}
+    assert {k: kinds.count(k) for k in shares} == shares
+    assert kinds != [p.kind for p in drawn_kinds(24, 6)]
+
+
+def drawn_kinds(records, seed):
+    """The kinds of records, none of them simulated."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(of, "_record", lambda kind, places, *_: problem(kind, places))
+        patch.setattr(of, "_world", lambda _: problem(WORLD))
+        return drawn(records, seed)
+
+
+def reachable(value, seen):
+    """All that can be reached from an object by attributes, items and the arrays behind arrays."""
+    if id(value) in seen or callable(value) or isinstance(value, type(sys) | type):
+        return
+    seen[id(value)] = value
+    inner = list(value.items()) if isinstance(value, dict) else []
+    inner += list(value) if isinstance(value, list | tuple | set | frozenset) else []
+    inner += list(getattr(value, "__dict__", {}).items())
+    if isinstance(value, np.ndarray) and value.base is not None:
+        inner.append(value.base)
+    for x in inner:
+        reachable(x, seen)
+
+
+def test_a_method_cannot_reach_the_truth(three):
+    for p in three:
+        given, asked = pickle.loads(p.given()), pickle.loads(p.asked())
+        seen: dict = {}
+        reachable((given, asked), seen)
+        # Of the test recordings only voltage and first samples, not even behind an array.
+        arrays = [v for v in seen.values() if isinstance(v, np.ndarray) and v.dtype == float]
+        for r in p.runs():
+            last = set(r.y[-20:, 0].tolist()) - {0.0}
+            assert len(last) > 3
+            for a in (x for x in arrays if x.ndim == 2):
+                assert not any(np.array_equal(x, r.y[-20:, 0]) for x in windows(a[:, 0], 20))
+        for r in asked:
+            assert np.all(r.y[r.n_init - 1 :] == r.y[r.n_init - 1])
+        floats = {v for v in seen.values() if isinstance(v, float)}
+        drawn_ones = set(p.truth["plant"].values()) - set(p.model.mechanism.values.tolist())
+        assert len(drawn_ones) > 4 and not drawn_ones & floats
+        assert p.truth["seed"] not in {v for v in seen.values() if isinstance(v, int)}
+        sources = {v for v in seen.values() if isinstance(v, str) and "arena" in v}
+        assert sources == {"arena"}
+
+
+def windows(x, width):
+    return np.lib.stride_tricks.sliding_window_view(x, width) if len(x) >= width else []
+
+
+def test_a_world_does_not_tell_its_number():
+    from rotflex_jax.arena.wrong_worlds import world
+
+    seen: dict = {}
+    w = world(3001)
+    alone = [of._alone(r) for r in (w.train, w.validation, w.test)]
+    reachable(pickle.loads(pickle.dumps(alone)), seen)
+    assert any("3001" in r.source for r in (w.train, w.validation))
+    assert not any("3001" in v for v in seen.values() if isinstance(v, str))
+
+
+class Truth:
+    """A model that is the sensor's own record, off by a known number of deviations."""
+
+    def __init__(self, problem, off):
+        self.known = {
+            r.u.tobytes(): r.y + off * np.array(list(problem.noise.values())) for r in problem.runs()
+        }
+
+    def simulate(self, recording):
+        return self.known[recording.u.tobytes()]
+
+
+def test_the_error_is_counted_in_deviations_of_the_sensors(three):
+    p = three[0]
+    for off in (1.0, 4.0):
+        here = Here(lambda train, validation, p=p, off=off: {"model": Truth(p, off)})
+        assert here.answer(p.given(), 60.0).has_model
+        assert run_error(p, here.simulate(p.asked())) == pytest.approx(off)
+    wrong = Here(lambda train, validation: {"model": Short()})
+    wrong.answer(p.given(), 60.0)
+    with pytest.raises(ArenaFailure, match="shape"):
+        wrong.simulate(p.asked())
+
+
+class Short:
+    def simulate(self, recording):
+        return recording.y[:-1]
+
+
+STRANGER = """
+    import os, sys, time
+
+    print("a method may print")
+
+    def answer(train, validation):
+        assert sys.stdin.read() == ""
+        assert {r.source for r in train + validation} == {"arena"}
+        return ["coulomb@hub"]
+
+    def fails(train, validation, model):
+        raise RuntimeError("no idea")
+
+    def nonsense(train, validation, model):
+        return ["glue@knee"]
+
+    def slow(train, validation, model):
+        time.sleep(60)
+
+    def dies(train, validation, model):
+        os._exit(7)
+
+    def leaves(train, validation, model):
+        sys.exit(3)
+
+    number = 5
+"""
+
+
+@pytest.fixture(scope="module")
+def stranger(tmp_path_factory) -> Path:
+    file = tmp_path_factory.mktemp("stranger") / "my_method.py"
+    file.write_text(textwrap.dedent(STRANGER))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "phrase"),
+    [
+        ("fails", 60.0, "raised RuntimeError: no idea"),
+        ("nonsense", 60.0, "no such effect"),
+        ("slow", 0.3, "longer than 0.3 s"),
+        ("dies", 60.0, "status 7"),
+        ("leaves", 60.0, "SystemExit"),
+    ],
+)
+def test_a_method_that_fails_is_scored_so(stranger, three, name, limit, phrase):
+    with Apart(f"{stranger}:{name}") as method, pytest.raises(ArenaFailure, match=phrase):
+        method.answer(three[0].given(), limit)
+
+
+def test_a_stranger_is_scored_by_one_command(stranger, tmp_path, monkeypatch, capsys, three):
+    monkeypatch.setattr(scoring, "drawn", lambda *_: three)
+    page, file = tmp_path / "arena.html", tmp_path / "arena.json"
+    command = ["arena", f"{stranger}:answer", "--records", "3", "--seed", "11", "--seconds", "4"]
+    with pytest.raises(SystemExit) as left:
+        app.main([*command, "--report", str(page), "--json", str(file)])
+    assert left.value.code == 0
+    row = json.loads(file.read_text())["methods"][f"{stranger}:answer"]
+    assert [r["answered"] for r in row["rows"]] == [["coulomb@hub"]] * 3
+    empty = sum(p.kind == NOTHING for p in three)
+    assert row["summary"]["alarms"] == [empty, empty] and row["summary"]["failures"] == 0
+    text = page.read_text()
+    assert "seed 11" in text and all(name in text for p in three for name, _ in p.hidden)
+    assert "seed 11" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "phrase"),
+    [
+        ([], "No method was given"),
+        (["nowhere.py:f"], "does not exist"),
+        (["{file}:number"], "no function"),
+        (["{file}:missing"], "no function"),
+        (["{file}"], "FILE.py:NAME"),
+        (["--entrants", "nobody"], "search"),
+        (["{file}:answer", "--records", "0"], "records"),
+        (["{file}:answer", "--limit", "0"], "limit"),
+        (["{file}:answer", "--seconds", "1"], "seconds"),
+        (["{file}:answer", "{file}:answer"], "twice"),
+    ],
+)
+def test_bad_arguments_are_refused_before_any_record(stranger, arguments, phrase, capsys, monkeypatch):
+    monkeypatch.setattr(scoring, "drawn", lambda *_: pytest.fail("records were drawn"))
+    with pytest.raises(SystemExit) as left:
+        app.main(["arena", *(a.format(file=stranger) for a in arguments)])
+    assert left.value.code == 2
+    said = capsys.readouterr().err
+    assert phrase in said and "Traceback" not in said
+
+
+def test_several_methods_meet_the_same_records(monkeypatch, three):
+    monkeypatch.setattr(scoring, "drawn", lambda *_: three)
+
+    def spoils(train, validation, model):
+        train[0].y[:] = 0.0
+        return "nothing missing"
+
+    def looks(train, validation, model):
+        assert np.any(train[0].y)
+        return "nothing missing"
+
+    found = score([spoils, looks], records=3, seed=11, seconds=4.0)
+    assert isinstance(found, Scores) and found.seed == 11
+    assert [s.failures for s in found.methods] == [0, 0]
+    assert found.methods[0].right == found.methods[1].right
+    assert found.to_markdown().count("\n") == 3
+
+
+def test_measured_machines_count_by_the_error_of_free_runs(measured):
+    measured("emps")
+    ways = [p for p in of.measured() if p.truth["machine"] == "emps"]
+    assert ways and all(p.kind == MEASURED and not p.hidden for p in ways)
+    p = ways[0]
+    runs = [r.y + 0.002 for r in p.runs()]
+    assert run_error(p, runs) == pytest.approx(0.002)
+    row = marked(p, Answer(has_model=True), 1, 0.002)
+    assert row.error == 0.002 and not row.wrong
