@@ -1,10 +1,10 @@
 """B14: the methods that come with the arena, each as a stranger's would be, on one small set of records.
 
-    python benchmarks/B14_arena.py --seed 20261 --records 12 --seconds 10
-    python benchmarks/B14_arena.py --entrants refit_bic --records 12 --seconds 10
+    python benchmarks/B14_arena.py --seed 20261
+    python benchmarks/B14_arena.py --entrants refit_bic --fresh
 
-Each entrant runs in a process of its own, on records drawn anew from the seed, and is written as soon as it is
-done; one that is in the file already is left as it is unless `--fresh` is given.
+Each entrant runs in a process of its own, on records drawn anew from the seed, and is written as soon as it
+is done; one that is in the file already is left as it is unless `--fresh` is given.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from typing import Any
 
 import B0_discovery as B0
 from rotflex_jax.arena.entrants import ENTRANTS
-from rotflex_jax.arena.scores import COLUMNS, Scores, cells, score
+from rotflex_jax.arena.method import Apart
+from rotflex_jax.arena.problems import drawn
+from rotflex_jax.arena.scores import COLUMNS, Scores, cells, on_problems
 from rotflex_jax.text.files import write_file
 
 PATH = Path(__file__).resolve().parent / "results" / "B14.json"
-SEED, RECORDS, SECONDS, LIMIT = 20261, 12, 10.0, 600.0
+SEED, RECORDS, SECONDS, LIMIT = 20261, 8, 8.0, 1500.0
 
 
 def page(results: dict[str, Any]) -> str:
@@ -45,8 +47,8 @@ def page(results: dict[str, Any]) -> str:
         [
             "# B14: the arena",
             "",
-            f"{own['records']} records of {own['seconds']:g} s, seed {own['seed']}, at most {own['limit']:g} s for "
-            "an answer.",
+            f"{own['records']} records of {own['seconds']:g} s, seed {own['seed']}, at most "
+            f"{own['limit']:g} s for an answer.",
             "",
             *lines,
             "",
@@ -79,18 +81,14 @@ def main() -> int:
         if a.fresh:
             results |= {"settings": settings, "methods": {}}
     results["runs"].append({**B0.provenance(), "arguments": sys.argv[1:]})
+    say = lambda line: print(line, flush=True)  # noqa: E731
+    problems = drawn(a.records, a.seed, a.seconds, say)
     for name in a.entrants.split(","):
         if name in results["methods"]:
             continue
-        found: Scores = score(
-            name,
-            a.records,
-            a.seed,
-            seconds=a.seconds,
-            limit=a.limit,
-            progress=lambda line: print(line, flush=True),
-        )
-        own = found.methods[0]
+        with Apart(name) as method:
+            own = on_problems(name, method, problems, a.limit, say)
+        found = Scores(a.seed, a.seconds, a.limit, (own,))
         told = found.to_dict()["methods"][name]
         results["methods"][name] = {**told, "cells": cells(own), "code": results["runs"][-1]["code"]}
         order = [n for n in ENTRANTS if n in results["methods"]]

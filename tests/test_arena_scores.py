@@ -14,7 +14,7 @@ import rotflex_jax as rf
 from rotflex_jax.arena import problems as of, scores as scoring
 from rotflex_jax.arena.method import Answer, Apart, ArenaFailure, Here, understood
 from rotflex_jax.arena.problems import MEASURED, NOTHING, ONE, OUT, TWO, WORLD, Problem, drawn
-from rotflex_jax.arena.scores import Score, Scores, calibration_error, failed, marked, run_error, score
+from rotflex_jax.arena.scores import MethodScore, Scores, calibration_error, failed, marked, run_error, score
 from rotflex_jax.cli import app
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
@@ -38,7 +38,9 @@ EVERY = [
 
 
 def scored(answers):
-    return Score("m", tuple(marked(p, a, k) for k, (p, a) in enumerate(zip(EVERY, answers, strict=True))))
+    return MethodScore(
+        "m", tuple(marked(p, a, k) for k, (p, a) in enumerate(zip(EVERY, answers, strict=True)))
+    )
 
 
 def said(*effects, unexplained=False, **chances):
@@ -86,7 +88,7 @@ def test_unexplained_always_is_right_outside_the_catalogue_only():
 def test_look_alikes_count_and_failures_count_as_wrong():
     row = marked(problem(ONE, [("sensor_gain", "theta")]), said(("sensor_gain", "alpha")), 1)
     assert row.right and row.hits == 1 and not row.wrong
-    s = Score("m", tuple(failed(p, "The method raised.", k, 2.0) for k, p in enumerate(EVERY)))
+    s = MethodScore("m", tuple(failed(p, "The method raised.", k, 2.0) for k, p in enumerate(EVERY)))
     assert (s.right, s.alarms, s.withheld, s.failures, s.seconds) == ((0, 6), (0, 2), (0, 1), 6, None)
 
 

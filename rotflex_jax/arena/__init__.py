@@ -21,6 +21,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "entrants": ["ENTRANTS", "Entrant"],
         "problems": ["Problem"],
-        "scores": ["Marks", "Score", "Scores", "score"],
+        "scores": ["Marks", "MethodScore", "Scores", "score"],
     },
 )

@@ -20,7 +20,7 @@ SILVERBOX_SAMPLES = 16_000
 
 
 @dataclass(frozen=True)
-class Direction:
+class Way:
     """What is learnt from what, and judged on what.
 
     Args:
@@ -52,7 +52,7 @@ class Machine:
 
     dataset: str
     preset: str
-    directions: Callable[[list[rf.Recording]], list[Direction]]
+    directions: Callable[[list[rf.Recording]], list[Way]]
     options: Mapping[str, Any] = field(default_factory=dict)
     unit: str = "deg"
     factor: float = math.degrees(1.0)
@@ -66,53 +66,51 @@ class Machine:
         mechanism = preset(**self.options)
         return rf.Model(mechanism) if self.solver is None else rf.Model(mechanism, self.solver)
 
-    def ways(self) -> list[Direction]:
+    def ways(self) -> list[Way]:
         """All directions; needs the recordings."""
         return self.directions(rf.data.load_dataset(self.dataset))
 
 
-def learnt(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Direction:
+def learnt(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Way:
     """Learnt from runs, whose ends decide, and judged on other recordings."""
     parts = [r.split(SHARE) for r in runs]
-    return Direction(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
+    return Way(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
 
 
-def halves(run: rf.Recording) -> Direction:
+def halves(run: rf.Recording) -> Way:
     """Learnt from the first half of a run and judged on the second."""
     first, second = run.split(0.5)
     return learnt("first half to second half", [first], [second])
 
 
-def together(runs: Sequence[rf.Recording]) -> Direction:
+def together(runs: Sequence[rf.Recording]) -> Way:
     """Learnt from the beginnings of all runs and judged on their ends."""
     parts = [r.split(SHARE) for r in runs]
     return learnt(f"first {100 * SHARE:g} % of all to the rest", [a for a, _ in parts], [b for _, b in parts])
 
 
-def crossed(runs: Mapping[str, rf.Recording]) -> list[Direction]:
+def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
     """From each run to the others, then all together.
 
     Of two runs, the end of the one that is learnt from decides, or else the first half of the other one,
     whose second half judges. Of three, the next one decides and the third judges.
     """
-    names, ways = list(runs), list[Direction]()
+    names, ways = list(runs), list[Way]()
     for k, name in enumerate(names):
         run, following = runs[name], names[(k + 1) % len(names)]
         if len(names) == 2:
             other = runs[following]
             ways.append(learnt(f"{name} to {following}", [run], [other]))
             decides, judges = other.split(0.5)
-            ways.append(
-                Direction(f"{name} and half of {following} to the rest", (run,), (decides,), (judges,))
-            )
+            ways.append(Way(f"{name} and half of {following} to the rest", (run,), (decides,), (judges,)))
         else:
             last = {n: r for n, r in runs.items() if n not in (name, following)}
             title = f"{name}, decided on {following}, to {' and '.join(last)}"
-            ways.append(Direction(title, (run,), (runs[following],), tuple(last.values())))
+            ways.append(Way(title, (run,), (runs[following],), tuple(last.values())))
     return [*ways, together(list(runs.values()))]
 
 
-def _emps(_: list[rf.Recording]) -> list[Direction]:
+def _emps(_: list[rf.Recording]) -> list[Way]:
     # The pulses of the test record were not measured, so that nothing is learnt from it.
     official = rf.data.benchmark("emps")
     return [
@@ -121,18 +119,18 @@ def _emps(_: list[rf.Recording]) -> list[Direction]:
     ]
 
 
-def _silverbox(_: list[rf.Recording]) -> list[Direction]:
+def _silverbox(_: list[rf.Recording]) -> list[Way]:
     official = rf.data.benchmark("silverbox")
     train = official.train.slice(0, SILVERBOX_SAMPLES)
     return [learnt("official", [train], list(official.tests.values())), halves(train)]
 
 
-def _link(stage: int) -> Callable[[list[rf.Recording]], list[Direction]]:
+def _link(stage: int) -> Callable[[list[rf.Recording]], list[Way]]:
     """Two runs of either stage: by LQR and by full state feedback."""
     return lambda runs: crossed(dict(zip(("lqr", "feedback"), runs[stage - 1 :: 2], strict=True)))
 
 
-def _by_gain(runs: list[rf.Recording]) -> list[Direction]:
+def _by_gain(runs: list[rf.Recording]) -> list[Way]:
     """Servo with four gains, three motions each: the lower gains to the highest, and back."""
     low, high = runs[:9], runs[9:]
     return [
@@ -141,7 +139,7 @@ def _by_gain(runs: list[rf.Recording]) -> list[Direction]:
     ]
 
 
-def _elbow(runs: list[rf.Recording]) -> list[Direction]:
+def _elbow(runs: list[rf.Recording]) -> list[Way]:
     """One servo of the arm: random motion to steps, and back."""
     own = {r.source.split(",")[0]: r for r in runs if ", Elbow" in r.source}
     random = [own["multisine"], own["prbs_excitation"]]

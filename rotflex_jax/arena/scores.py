@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.arena.marking import alike, exact
 from rotflex_jax.arena.method import (
@@ -221,7 +222,7 @@ def failed(problem: Problem, reason: str, record: int, seconds: float) -> Marks:
 
 
 @dataclass(frozen=True)
-class Score:
+class MethodScore:
     """What a method reached on a set of records.
 
     Attributes:
@@ -331,7 +332,7 @@ COLUMNS = {
 """Columns of the table: what of a score, and its heading."""
 
 
-def cells(score: Score) -> list[str]:
+def cells(score: MethodScore) -> list[str]:
     """A row of the table as text."""
     found = [getattr(score, name) for name in COLUMNS]
     return [
@@ -354,7 +355,7 @@ class Scores:
     seed: int
     seconds: float
     limit: float
-    methods: tuple[Score, ...]
+    methods: tuple[MethodScore, ...]
 
     def __str__(self) -> str:
         return self.to_markdown()
@@ -396,7 +397,7 @@ def score(
     with_measured: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Scores:
-    """Score methods that look for missing effects on records whose truth they cannot see.
+    """MethodScore methods that look for missing effects on records whose truth they cannot see.
 
     A method is a function `method(train, validation, model)` of lists of recordings and the textbook model;
     it returns `"nothing missing"`, `"unexplained"`, a list of effects such as `["coulomb@hub"]`, or a mapping
@@ -411,8 +412,8 @@ def score(
         seconds: Length of a record, training and validation together [s].
         limit: Most time for an answer [s]. A process is stopped then; a function of this process fails
             when it returns.
-        with_measured: Score free runs on public recordings of measured machines as well, where they are on
-            this machine.
+        with_measured: Score free runs on public recordings of measured machines as well, where these are
+            here.
         progress: Called with a line of text now and then.
 
     Returns:
@@ -451,13 +452,32 @@ def score(
         problems += measured(say) if with_measured else []
         found = []
         for name, method in zip(names, running, strict=True):
-            rows = []
-            for k, problem in enumerate(problems, 1):
-                say(f"{name}: record {k} of {len(problems)}")
-                rows.append(_row(method, problem, k, limit))
-            found.append(Score(name, tuple(rows)))
+            found.append(on_problems(name, method, problems, limit, say))
             method.__exit__()
         return Scores(seed, seconds, limit, tuple(found))
+
+
+def on_problems(
+    name: str,
+    method: Here | Apart,
+    problems: Sequence[Problem],
+    limit: float,
+    say: Callable[[str], None] = lambda _: None,
+) -> MethodScore:
+    """Score one method on records that were drawn before.
+
+    Args:
+        name: Under which it is listed.
+        method: In this process or in one of its own.
+        problems: The records.
+        limit: Most time for an answer [s].
+        say: Called with a line of progress.
+    """
+    rows = []
+    for k, problem in enumerate(problems, 1):
+        say(f"{name}: record {k} of {len(problems)}")
+        rows.append(_row(method, problem, k, limit))
+    return MethodScore(name, tuple(rows))
 
 
 def _row(method: Here | Apart, problem: Problem, record: int, limit: float) -> Marks:
@@ -477,7 +497,7 @@ def _row(method: Here | Apart, problem: Problem, record: int, limit: float) -> M
     return marked(problem, answer, record, error, "" if error is not None else "Its model diverges.")
 
 
-def run_error(problem: Problem, runs: Sequence[np.ndarray]) -> float | None:
+def run_error(problem: Problem, runs: Sequence[Float[np.ndarray, "_ C"]]) -> float | None:
     r"""Error of free runs, geometric mean over the channels; None if they diverge.
 
     .. math::

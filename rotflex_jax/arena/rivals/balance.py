@@ -6,7 +6,7 @@ import numpy as np
 
 import rotflex_jax as rf
 from rotflex_jax.arena.rivals.answer import NamedEffects
-from rotflex_jax.arena.rivals.motion import Array, Motion, motions
+from rotflex_jax.arena.rivals.motion import Motion, Values, motions
 from rotflex_jax.arena.rivals.selection import Regression, rows, select
 from rotflex_jax.arena.rivals.terms import linear_columns, terms
 
@@ -24,7 +24,7 @@ def balance(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
     return answer._replace(note=f"window {m.window}; {answer.note}")
 
 
-def weights(m: Motion) -> Array:
+def weights(m: Motion) -> Values:
     """(2, 2) turns generalised torques into the two independent ones, each in units of its scatter."""
     # On the hub: what acts on theta less what acts on alpha; on the arm: what acts on alpha.
     split = np.array([[1.0, -1.0], [0.0, 1.0]])

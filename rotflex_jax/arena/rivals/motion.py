@@ -17,7 +17,7 @@ from scipy.signal import savgol_filter
 import rotflex_jax as rf
 from rotflex_jax.mechanism.linear import StateSpace, inverse_mass
 
-Array = Float[np.ndarray, "..."]
+Values = Float[np.ndarray, "..."]
 """Numbers whose shape the docstring tells."""
 
 WINDOWS = (11, 21, 31, 41, 61)
@@ -40,19 +40,19 @@ class Motion:
         back_emf: voltage that the motor makes per speed of the hub [V s/rad].
     """
 
-    u: Array
-    q: Array
-    v: Array
-    a: Array
+    u: Values
+    q: Values
+    v: Values
+    a: Values
     Ts: float
     joint: StateSpace
-    mass: Array
-    missing: Array
+    mass: Values
+    missing: Values
     window: int
     start: int
     back_emf: float
 
-    def at(self, port: str) -> tuple[Array, Array]:
+    def at(self, port: str) -> tuple[Values, Values]:
         """Position [rad] and speed [rad/s] of a port."""
         return self.q @ PORTS[port], self.v @ PORTS[port]
 
@@ -94,7 +94,7 @@ def motions(
     return m, _smoothed(validation, m.joint, m.mass, m.window, m.back_emf)
 
 
-def _smoothed(train: rf.Recording, joint: StateSpace, mass: Array, window: int, back_emf: float) -> Motion:
+def _smoothed(train: rf.Recording, joint: StateSpace, mass: Values, window: int, back_emf: float) -> Motion:
     y, u, Ts = np.asarray(train.y), np.asarray(train.u).ravel(), train.Ts
     q, v, a = (
         savgol_filter(y, window, 3, deriv=order, delta=Ts, axis=0, mode="interp") for order in range(3)

@@ -17,7 +17,7 @@ import numpy as np
 
 import rotflex_jax as rf
 from rotflex_jax.arena.rivals.answer import NamedEffects
-from rotflex_jax.arena.rivals.motion import Array, Motion, motions
+from rotflex_jax.arena.rivals.motion import Motion, Values, motions
 from rotflex_jax.arena.rivals.selection import Regression, rows, select
 from rotflex_jax.arena.rivals.terms import linear_columns, terms
 from rotflex_jax.mechanism.linear import zero_order_hold
@@ -34,7 +34,7 @@ def neural(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
     thin = slice(None, None, 5)
     unit = np.diag(1 / (np.std(torque, axis=0) + 1e-12))
 
-    def regression(m: Motion, torque: Array) -> Regression:
+    def regression(m: Motion, torque: Values) -> Regression:
         flat = [rows(t.columns[thin], unit) for t in terms(m)]
         return Regression(rows(torque[thin, :, None], unit)[:, 0], rows(linear_columns(m)[thin], unit), flat)
 
@@ -42,7 +42,7 @@ def neural(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
     return answer._replace(note=f"runs left with {left:.2g} of the error; {answer.note}")
 
 
-def learn(m: Motion) -> tuple[Array, float]:
+def learn(m: Motion) -> tuple[Values, float]:
     """The network's generalised torque (N, 2) along the motion, and the share of the error left."""
     n = len(m.joint.A)
     push = np.zeros((n, 2))

@@ -7,7 +7,7 @@ from scipy.signal import dlsim
 
 import rotflex_jax as rf
 from rotflex_jax.arena.rivals.answer import NamedEffects
-from rotflex_jax.arena.rivals.motion import Array, Motion, linear_joint, motions
+from rotflex_jax.arena.rivals.motion import Motion, Values, linear_joint, motions
 from rotflex_jax.arena.rivals.selection import Regression, rows, select
 from rotflex_jax.arena.rivals.terms import linear_columns, terms
 from rotflex_jax.mechanism.linear import zero_order_hold
@@ -26,7 +26,7 @@ def residual(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
     ]
     unit = np.diag(1 / np.std(errors[0], axis=0))
 
-    def regression(m: Motion, error: Array) -> Regression:
+    def regression(m: Motion, error: Values) -> Regression:
         answers = lambda columns: np.stack(  # noqa: E731
             [_answer(m, columns[:, :, k]) for k in range(columns.shape[2])], axis=2
         )
@@ -40,7 +40,7 @@ def residual(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
     return select(regression(m, errors[0]), regression(after, errors[1]), terms(m))
 
 
-def _answer(m: Motion, torque: Array) -> Array:
+def _answer(m: Motion, torque: Values) -> Values:
     """Angles (N, 2) that a generalised torque (N, 2) makes of the linear joint, from rest."""
     push = np.zeros((len(m.joint.A), 2))
     push[2:4] = np.linalg.inv(m.mass)
@@ -49,7 +49,7 @@ def _answer(m: Motion, torque: Array) -> Array:
     return dlsim((A, B, m.joint.C, np.zeros((2, 2)), m.Ts), held)[1]
 
 
-def _free(m: Motion, k: int) -> Array:
+def _free(m: Motion, k: int) -> Values:
     """Angles (N, 2) after a unit of one first state."""
     A, _ = m.joint.discretise(m.Ts)
     x, out = np.eye(len(A))[:, k], np.empty((len(m.u), 2))

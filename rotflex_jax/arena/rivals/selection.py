@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rotflex_jax.arena.rivals.answer import NamedEffects
-from rotflex_jax.arena.rivals.motion import Array
+from rotflex_jax.arena.rivals.motion import Values
 from rotflex_jax.arena.rivals.terms import TorqueTerm
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.effects import CATALOG
@@ -18,7 +18,7 @@ from rotflex_jax.effects import CATALOG
 ROUNDS, MARGIN, PARSIMONY = 3, 30.0, 0.9
 
 
-def rows(signal: Array, scale: Array) -> Array:
+def rows(signal: Values, scale: Values) -> Values:
     """(N, 2, k) as rows (2 N, k), the two channels turned and scaled by a matrix (2, 2) first."""
     return np.einsum("ij,njk->ink", scale, signal).reshape(-1, signal.shape[2])
 
@@ -32,16 +32,16 @@ class Regression(NamedTuple):
         columns: those of each candidate, each (rows, k).
     """
 
-    target: Array
-    base: Array
-    columns: Sequence[Array]
+    target: Values
+    base: Values
+    columns: Sequence[Values]
 
-    def left(self, chosen: Sequence[int], numbers: Array) -> float:
+    def left(self, chosen: Sequence[int], numbers: Values) -> float:
         """Mean square of what is left with the numbers of a fit to other rows."""
         X = np.hstack([self.base, *(self.columns[i] for i in chosen)])
         return float(np.mean((self.target - X @ numbers) ** 2))
 
-    def fitted(self, chosen: Sequence[int]) -> Array:
+    def fitted(self, chosen: Sequence[int]) -> Values:
         """Numbers of the base and of some candidates by least squares."""
         X = np.hstack([self.base, *(self.columns[i] for i in chosen)])
         size = np.maximum(np.linalg.norm(X, axis=0), 1e-30)
@@ -66,7 +66,7 @@ def select(train: Regression, validation: Regression, candidates: Sequence[Torqu
     notes: list[str] = []
     for _ in range(ROUNDS):
         samples = _independent(left)
-        trials: list[tuple[float, TorqueTerm, Array]] = []
+        trials: list[tuple[float, TorqueTerm, Values]] = []
         for term, c in zip(candidates, columns, strict=True):
             if term.place in rounds:
                 continue
@@ -106,7 +106,7 @@ def select(train: Regression, validation: Regression, candidates: Sequence[Torqu
     return NamedEffects(rounds, "; ".join(notes))
 
 
-def _independent(e: Array) -> float:
+def _independent(e: Values) -> float:
     """How many independent samples a correlated sequence is worth, from its correlation time."""
     e = e - e.mean()
     n = len(e)

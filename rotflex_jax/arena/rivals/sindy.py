@@ -16,7 +16,7 @@ import numpy as np
 import rotflex_jax as rf
 from rotflex_jax.arena.rivals.answer import NamedEffects
 from rotflex_jax.arena.rivals.balance import weights
-from rotflex_jax.arena.rivals.motion import Array, Motion, motions
+from rotflex_jax.arena.rivals.motion import Motion, Values, motions
 from rotflex_jax.arena.rivals.terms import TorqueTerm, terms
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.errors import optional
@@ -26,7 +26,7 @@ THRESHOLDS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 INCLUDED, SHARE = 0.9, 0.02
 WEAK_SECONDS = 0.25
 
-Solve = Callable[[Array, Array, float], Array]
+Solve = Callable[[Values, Values, float], Values]
 
 
 def plain(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
@@ -45,7 +45,7 @@ def weak(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
 
 
 def _search(
-    train: rf.Recording, validation: rf.Recording, solve: Solve, view: Callable[[Array, Motion], Array]
+    train: rf.Recording, validation: rf.Recording, solve: Solve, view: Callable[[Values, Motion], Values]
 ) -> NamedEffects:
     m, after = motions(train, validation)
     scale = weights(m)
@@ -87,7 +87,7 @@ def _listed(m: Motion) -> list[TorqueTerm]:
     return [t for t in terms(m, accelerations=False) if t.place[0] not in _LEFT_OUT]
 
 
-def _normalised(features: Array) -> tuple[Array, Callable[[Array], Array]]:
+def _normalised(features: Values) -> tuple[Values, Callable[[Values], Values]]:
     """Columns of unit deviation, the others without what the linear ones can say in their place.
 
     The span is the same; a sine of small angles is no longer a second name for the angle.
@@ -102,19 +102,19 @@ def _normalised(features: Array) -> tuple[Array, Callable[[Array], Array]]:
     size = np.std(rest - padded(features) @ said, axis=0)
     size[size <= 1e-4 * whole] = np.inf
 
-    def normal(x: Array) -> Array:
+    def normal(x: Values) -> Values:
         return np.column_stack([x[:, :_LINEAR] / unit, (x[:, _LINEAR:] - padded(x) @ said) / size])
 
     return normal(features), normal
 
 
-def _lstsq(features: Array, target: Array) -> Array:
+def _lstsq(features: Values, target: Values) -> Values:
     return np.linalg.lstsq(features[:, :_LINEAR], target, rcond=None)[0].T
 
 
 def _features(
     m: Motion, listed: list[TorqueTerm], kept: list[tuple[int, int, int]] | None = None
-) -> tuple[list[Place | None], Array, list[tuple[int, int, int]]]:
+) -> tuple[list[Place | None], Values, list[tuple[int, int, int]]]:
     """Names (None for a linear term) and values (N, F), each shape once.
 
     Args:
@@ -143,13 +143,13 @@ def _features(
     return names, np.column_stack(columns), found
 
 
-def _thresholded(features: Array, target: Array, threshold: float) -> Array:
+def _thresholded(features: Values, target: Values, threshold: float) -> Values:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return np.asarray(_stlsq(threshold).fit(features, target).coef_)
 
 
-def _bagged(features: Array, target: Array, threshold: float) -> Array:
+def _bagged(features: Values, target: Values, threshold: float) -> Values:
     optimizer = optional("pysindy", "Sparse identification").EnsembleOptimizer(
         _stlsq(threshold), bagging=True, n_models=20, n_subset=len(target) // 2
     )
@@ -166,7 +166,7 @@ def _stlsq(threshold: float) -> Any:
     return optional("pysindy", "Sparse identification").STLSQ(threshold=threshold, alpha=1e-4, max_iter=30)
 
 
-def _against_bumps(signal: Array, m: Motion) -> Array:
+def _against_bumps(signal: Values, m: Motion) -> Values:
     """Integrals against overlapping bumps `(1 - s^2)^4`, the test functions of weak SINDy."""
     half = max(2, round(WEAK_SECONDS / 2 / m.Ts))
     s = np.arange(-half, half + 1) / half

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import cont2discrete, dlsim, lfilter
 
-from rotflex_jax.arena.rivals.motion import PORTS, Array, Motion
+from rotflex_jax.arena.rivals.motion import PORTS, Motion, Values
 from rotflex_jax.arena.simulator.laws import Place
 
 SPEEDS = (0.05, 0.15, 0.4, 1.0)
@@ -43,7 +43,7 @@ class TorqueTerm(NamedTuple):
     """
 
     place: Place
-    columns: Array
+    columns: Values
     shape: str = ""
 
 
@@ -57,7 +57,7 @@ def terms(m: Motion, accelerations: bool = True) -> list[TorqueTerm]:
     return [*_at_ports(m), *_of_modes(m), *_of_voltage(m), *_of_sensors(m, accelerations)]
 
 
-def linear_columns(m: Motion) -> Array:
+def linear_columns(m: Motion) -> Values:
     """(N, 2, k) torques of the joint's own linear terms, for their share of what is missing."""
     hub, joint = PORTS["hub"], PORTS["joint"]
     own = [
@@ -70,7 +70,7 @@ def linear_columns(m: Motion) -> Array:
     return np.stack(own, axis=2)
 
 
-def _term(place: Place, port: str, *shapes: Array, note: str = "") -> TorqueTerm:
+def _term(place: Place, port: str, *shapes: Values, note: str = "") -> TorqueTerm:
     columns = np.stack([np.outer(s, PORTS[port]) for s in shapes], axis=2)
     return TorqueTerm(place, columns, note)
 
@@ -151,7 +151,7 @@ def _of_voltage(m: Motion) -> Iterator[TorqueTerm]:
 def _of_sensors(m: Motion, accelerations: bool) -> Iterator[TorqueTerm]:
     """Errors of a reading: what the joint would have to feel for the wrong angle to be the true one."""
 
-    def term(name: str, channel: int, *errors: tuple[Array, Array, Array]) -> TorqueTerm:
+    def term(name: str, channel: int, *errors: tuple[Values, Values, Values]) -> TorqueTerm:
         unit = np.eye(2)[channel]
         columns = []
         for d, rate, acceleration in errors:
@@ -177,7 +177,7 @@ def _of_sensors(m: Motion, accelerations: bool) -> Iterator[TorqueTerm]:
         yield term("cross_talk", c, (m.q[:, 0], m.v[:, 0], m.a[:, 0]))
 
 
-def _hysteresis(v: Array, level: Array, width: float, release: float, Ts: float) -> Array:
+def _hysteresis(v: Values, level: Values, width: float, release: float, Ts: float) -> Values:
     """State along a measured motion of ``x' = v / width - part |v| / (width level) x``.
 
     `part` is one while the torque builds up and `release` while it goes back: one for Dahl's law, whose level

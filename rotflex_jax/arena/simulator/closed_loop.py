@@ -22,7 +22,7 @@ from rotflex_jax.arena.simulator.plant import (
     working_space,
 )
 from rotflex_jax.arena.simulator.sensors import read
-from rotflex_jax.arena.simulator.tables import Array, Laws
+from rotflex_jax.arena.simulator.tables import Laws, Values
 from rotflex_jax.arena.simulator.voltage import Path
 
 COUNT = 2 * np.pi / 4096
@@ -47,11 +47,11 @@ class Sensors:
     crosstalk: float = 0.0
     late: int = 0
 
-    def deviation(self) -> Array:
+    def deviation(self) -> Values:
         """Standard deviation of noise and counting together [rad], ``(2,)``."""
         return np.sqrt(np.square(self.noise) + np.square(self.resolution) / 12)
 
-    def clean(self, states: Array, table: Array) -> Array:
+    def clean(self, states: Values, table: Values) -> Values:
         """Readings without noise and counting [rad], ``(N, 2)``.
 
         Args:
@@ -72,7 +72,7 @@ class Sensors:
             y[:, 1] = np.concatenate([np.full(self.late, y[0, 1]), y[: -self.late, 1]])
         return y
 
-    def measured(self, clean: Array, noise: Array) -> Array:
+    def measured(self, clean: Values, noise: Values) -> Values:
         """What is recorded [rad]; `noise` is standard normal and of the same shape."""
         step = np.asarray(self.resolution)
         return step * (np.round((clean + np.asarray(self.noise) * noise) / step) + 0.0)
@@ -92,12 +92,12 @@ class Loop:
         first: samples that went before, since the plant was at rest at zero.
     """
 
-    u: Array
-    y: Array
-    clean: Array
-    states: Array
-    torque: Array
-    reference: Array
+    u: Values
+    y: Values
+    clean: Values
+    states: Values
+    torque: Values
+    reference: Values
     first: int = 0
 
     @property
@@ -117,10 +117,10 @@ class _Filter:
 
     keep: float
     Ts: float
-    last: Array = field(default_factory=lambda: np.zeros(2))
-    rate: Array = field(default_factory=lambda: np.zeros(2))
+    last: Values = field(default_factory=lambda: np.zeros(2))
+    rate: Values = field(default_factory=lambda: np.zeros(2))
 
-    def __call__(self, y: Array) -> Array:
+    def __call__(self, y: Values) -> Values:
         self.rate = self.keep * self.rate + (1 - self.keep) * (y - self.last) / self.Ts
         self.last = y
         return self.rate
@@ -131,10 +131,10 @@ def recorded(
     laws: Laws,
     sensors: Sensors,
     controller: Controller,
-    reference: Array,
+    reference: Values,
     Ts: float,
     rng: np.random.Generator,
-    torque: Array | None = None,
+    torque: Values | None = None,
     step: float = STEP,
 ) -> Loop:
     """A run from rest at zero under feedback.

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from rotflex_jax.arena.simulator.plant import Plant
-from rotflex_jax.arena.simulator.tables import Array
+from rotflex_jax.arena.simulator.tables import Values
 
 LIMIT = 10.0
 """Largest voltage that a controller may ask for [V]."""
@@ -38,7 +38,7 @@ class Controller:
     corner: float
 
 
-def textbook(plant: Plant) -> tuple[Array, Array]:
+def textbook(plant: Plant) -> tuple[Values, Values]:
     """Matrices of ``x' = A x + b v`` with ``x = (theta, alpha, theta', alpha')``, no other law."""
     g = plant.torque_per_volt
     damper = plant.B_hub + g * plant.k_m * plant.K_g
@@ -90,14 +90,14 @@ def designed(kind: str, plant: Plant, rng: np.random.Generator) -> Controller:
             return made
 
 
-def square(N: int, Ts: float, rng: np.random.Generator) -> Array:
+def square(N: int, Ts: float, rng: np.random.Generator) -> Values:
     """A square wave of 15 to 45 degrees and 1.6 to 4 s about zero, at a random phase [rad]."""
     size, period = np.deg2rad(rng.uniform(15, 45)), rng.uniform(1.6, 4.0)
     t = Ts * np.arange(N) + period * rng.random()
     return size * np.where((t / period) % 1 < 0.5, 1.0, -1.0)
 
 
-def levels(N: int, Ts: float, rng: np.random.Generator) -> Array:
+def levels(N: int, Ts: float, rng: np.random.Generator) -> Values:
     """Steps to random levels within 50 degrees, each held for 0.6 to 2 s [rad]."""
     r, k = np.empty(N), 0
     while k < N:

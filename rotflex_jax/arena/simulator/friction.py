@@ -18,14 +18,14 @@ from rotflex_jax.arena.simulator.tables import (
     PATCHY_SHARE,
     STRIBECK,
     STRIBECK_SPEED,
-    Array,
+    Values,
 )
 
 # Sweeps of the contact solver; the slowest case (all three ports stuck) needs about 100.
 SWEEPS = 1000
 
 
-def rough(c: Array) -> bool:
+def rough(c: Values) -> bool:
     """Whether any port has dry friction."""
     return bool(c[:, [*range(FRICTION_PLUS, STRIBECK + 1), PATCHY]].any())
 

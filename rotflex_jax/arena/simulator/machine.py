@@ -11,7 +11,7 @@ from rotflex_jax.arena.simulator.laws import Place, laws
 from rotflex_jax.arena.simulator.plant import STEP, Plant, sample, state_of, tables_of, working_space
 from rotflex_jax.arena.simulator.records import COUNT, JITTER
 from rotflex_jax.arena.simulator.sensors import read
-from rotflex_jax.arena.simulator.tables import Array
+from rotflex_jax.arena.simulator.tables import Values
 from rotflex_jax.arena.simulator.voltage import Path
 
 
@@ -34,7 +34,7 @@ class Machine:
         self.x = state_of(found)
         self.new, self.side, self.samples = self.x.copy(), 0, 0
         self.noise = np.random.default_rng(seed)
-        self.states: list[Array] = []
+        self.states: list[Values] = []
 
     @classmethod
     def of(cls, record: Mapping[str, Any], seed: int = 0) -> Machine:
@@ -43,7 +43,7 @@ class Machine:
         hidden = {(e["effect"], e["port"]): e["parameters"] for e in truth["effects"]}
         return cls(Plant(**truth["plant"]), hidden, record["Ts"], seed)
 
-    def read(self) -> Array:
+    def read(self) -> Values:
         """Angles as the encoders report them [rad], ``(2,)``."""
         clean = read(self.x[None, :2], self.errors)[0]
         return COUNT * (np.round((clean + JITTER * self.noise.standard_normal(2)) / COUNT) + 0.0)

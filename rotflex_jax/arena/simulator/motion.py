@@ -19,7 +19,7 @@ from rotflex_jax.arena.simulator.tables import (
     MASS,
     WEAKENING,
     WEAKENING_SPEED,
-    Array,
+    Values,
 )
 from rotflex_jax.arena.simulator.torques import build_up, of_the_moment, oscillate
 
@@ -43,12 +43,12 @@ class Space(NamedTuple):
         impulse: friction impulse of the last step, where the next one begins to search.
     """
 
-    z: Array
-    s: Array
-    f: Array
-    low: Array
-    high: Array
-    impulse: Array
+    z: Values
+    s: Values
+    f: Values
+    low: Values
+    high: Values
+    impulse: Values
 
 
 @compiled

@@ -35,7 +35,7 @@ from rotflex_jax.arena.simulator.motion import (
     Space,
     step,
 )
-from rotflex_jax.arena.simulator.tables import GEAR_PLAY, HUB, JOINT, STIFFNESS, VISCOUS, Array, Laws, Tables
+from rotflex_jax.arena.simulator.tables import GEAR_PLAY, HUB, JOINT, STIFFNESS, VISCOUS, Laws, Tables, Values
 from rotflex_jax.arena.simulator.voltage import supply
 
 STEP = 20e-6
@@ -87,11 +87,11 @@ class Course(NamedTuple):
         memory: normalised hysteretic torques in the order of their rows, ``(N, rows)``.
     """
 
-    motion: Array
-    rotor: Array
-    heat: Array
-    modes: Array
-    memory: Array
+    motion: Values
+    rotor: Values
+    heat: Values
+    modes: Values
+    memory: Values
 
 
 @compiled
@@ -162,7 +162,7 @@ def tables_of(plant: Plant, laws: Laws) -> Tables:
     return Tables(J, emf, engaged, free, rough(free), laws.hysteresis, laws.modes, laws.motor)
 
 
-def state_of(laws: Laws, start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)) -> Array:
+def state_of(laws: Laws, start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)) -> Values:
     """Whole state with these angles and speeds, everything else as `course` says."""
     x = np.zeros(MEMORY + len(laws.hysteresis))
     theta, alpha, hub, joint = start
@@ -173,7 +173,7 @@ def state_of(laws: Laws, start: tuple[float, float, float, float] = (0.0, 0.0, 0
     return x
 
 
-def course_of(states: Array) -> Course:
+def course_of(states: Values) -> Course:
     """States of `run` by name."""
     motion = states[:, [THETA, ALPHA, W_HUB, W_ARM]]
     motion[:, 3] -= motion[:, 2]
@@ -189,7 +189,7 @@ def course_of(states: Array) -> Course:
 def course(
     plant: Plant,
     laws: Laws,
-    u: Array,
+    u: Values,
     Ts: float,
     start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     step: float = STEP,
@@ -216,10 +216,10 @@ def course(
 def simulate(
     plant: Plant,
     laws: Laws,
-    u: Array,
+    u: Values,
     Ts: float,
     start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     step: float = STEP,
-) -> Array:
+) -> Values:
     """``theta, alpha, theta', alpha'`` at the samples, ``(N, 4)``; arguments as in `course`."""
     return course(plant, laws, u, Ts, start, step).motion

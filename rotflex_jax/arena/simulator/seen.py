@@ -20,7 +20,7 @@ import numpy as np
 from rotflex_jax.arena.simulator.closed_loop import Loop, Sensors
 from rotflex_jax.arena.simulator.motion import MEMORY
 from rotflex_jax.arena.simulator.plant import Plant, run, tables_of
-from rotflex_jax.arena.simulator.tables import OFFSET, Array, Laws
+from rotflex_jax.arena.simulator.tables import OFFSET, Laws, Values
 from rotflex_jax.arena.simulator.voltage import supply
 
 STEP = 50e-6
@@ -34,7 +34,7 @@ _DAMPERS = {"B_hub": 2e-4, "B_joint": 1e-4}
 _OFFSET = 0.01
 
 
-def free_runs(plant: Plant, laws: Laws, sensors: Sensors, loop: Loop, Ts: float) -> Array:
+def free_runs(plant: Plant, laws: Laws, sensors: Sensors, loop: Loop, Ts: float) -> Values:
     """Clean readings of the plant under the recorded voltage, each window begun with the true state.
 
     Args:

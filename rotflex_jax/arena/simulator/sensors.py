@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rotflex_jax.arena.simulator.tables import BACKWARD_LOSS, BIAS, CUBIC_ERROR, GAIN_ERROR, Array
+from rotflex_jax.arena.simulator.tables import BACKWARD_LOSS, BIAS, CUBIC_ERROR, GAIN_ERROR, Values
 
 
-def read(angles: Array, sensors: Array) -> Array:
+def read(angles: Values, sensors: Values) -> Values:
     """Readings: gain and cubic error, then weaker on the negative side, then a constant.
 
     Args:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-Array = Float[np.ndarray, "..."]
+Values = Float[np.ndarray, "..."]
 """Numbers whose shape the docstring tells."""
 
 HUB, ARM, JOINT = 0, 1, 2
@@ -55,7 +55,7 @@ BIAS, GAIN_ERROR, CUBIC_ERROR, BACKWARD_LOSS = 0, 1, 2, 3
 CHANNELS = {"theta": 0, "alpha": 1}
 
 
-def _no_limits() -> Array:
+def _no_limits() -> Values:
     volts = np.zeros(VOLTAGES)
     volts[LIMIT] = np.inf
     return volts
@@ -74,12 +74,12 @@ class Laws:
         sensors: errors of the two sensors, ``(2, 4)``.
     """
 
-    torque: Array = field(default_factory=lambda: np.zeros((3, LAWS)))
-    volts: Array = field(default_factory=_no_limits)
-    hysteresis: Array = field(default_factory=lambda: np.zeros((0, HYSTERESIS)))
-    modes: Array = field(default_factory=lambda: np.zeros((2, 3)))
-    motor: Array = field(default_factory=lambda: np.zeros(MOTOR))
-    sensors: Array = field(default_factory=lambda: np.zeros((2, 4)))
+    torque: Values = field(default_factory=lambda: np.zeros((3, LAWS)))
+    volts: Values = field(default_factory=_no_limits)
+    hysteresis: Values = field(default_factory=lambda: np.zeros((0, HYSTERESIS)))
+    modes: Values = field(default_factory=lambda: np.zeros((2, 3)))
+    motor: Values = field(default_factory=lambda: np.zeros(MOTOR))
+    sensors: Values = field(default_factory=lambda: np.zeros((2, 4)))
 
 
 class Tables(NamedTuple):
@@ -96,11 +96,11 @@ class Tables(NamedTuple):
         motor: as in `Laws`.
     """
 
-    J: Array
+    J: Values
     emf: float
-    engaged: Array
-    free: Array
+    engaged: Values
+    free: Values
     dry: bool
-    hysteresis: Array
-    modes: Array
-    motor: Array
+    hysteresis: Values
+    modes: Values
+    motor: Values

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from rotflex_jax.arena.simulator.compiled import compiled
-from rotflex_jax.arena.simulator.tables import DEAD_MINUS, DEAD_PLUS, DELAY, LAG, LIMIT, OFFSET, Array
+from rotflex_jax.arena.simulator.tables import DEAD_MINUS, DEAD_PLUS, DELAY, LAG, LIMIT, OFFSET, Values
 
 
-def amplified(u: Array, volts: Array) -> Array:
+def amplified(u: Values, volts: Values) -> Values:
     """Voltages behind limiter, offset and dead zone [V]."""
     v = np.minimum(np.maximum(u, -volts[LIMIT]), volts[LIMIT]) + volts[OFFSET]
     return np.where(
@@ -25,7 +25,7 @@ def _split(steps: float) -> tuple[int, float]:
     return whole, rest if rest > 1e-9 else 0.0
 
 
-def delayed(v: Array, steps: float, before: float) -> Array:
+def delayed(v: Values, steps: float, before: float) -> Values:
     """Mean over each step of a voltage that comes `steps` steps late, `before` until then."""
     whole, rest = _split(steps)
     # A change inside a step counts for the part of the step that it is there.
@@ -44,12 +44,12 @@ def _lagged(v, ratio, state):
     return out, state
 
 
-def lagged(v: Array, ratio: float, before: float) -> Array:
+def lagged(v: Values, ratio: float, before: float) -> Values:
     """Mean over each step of ``dx/dt = (v - x) / time``, `ratio` being step over time."""
     return _lagged(v, ratio, before)[0]
 
 
-def supply(u: Array, volts: Array, substeps: int, h: float) -> Array:
+def supply(u: Values, volts: Values, substeps: int, h: float) -> Values:
     """Mean voltage at the motor in every integration step.
 
     Ahead of the record the input is zero, and delay and lag have settled on what that gives.
@@ -81,14 +81,14 @@ class Path:
         h: length of a step [s].
     """
 
-    def __init__(self, volts: Array, substeps: int, h: float):
+    def __init__(self, volts: Values, substeps: int, h: float):
         self.volts, self.substeps, self.h = volts, substeps, h
         before = float(amplified(np.zeros(1), volts)[0])
         self.late = volts[DELAY] / h
         self.past = np.full(_split(self.late)[0] + 1, before)
         self.lagging = before
 
-    def __call__(self, u: float) -> Array:
+    def __call__(self, u: float) -> Values:
         """Voltage at the motor in every step of the next sample [V], ``(substeps,)``."""
         v = np.repeat(amplified(np.array([u]), self.volts), self.substeps)
         if self.volts[DELAY] > 0:
