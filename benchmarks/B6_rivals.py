@@ -152,14 +152,15 @@ def page(summary: dict[str, dict[str, Any]], earlier: list[str]) -> str:
     rows = ["| " + " | ".join(cells(name, s)) + " |" for name, s in summary.items()]
     notes = [
         "Each method gets training and validation part of the same records, as the search does, and",
-        "answers with names; the structure that it names is then fitted by the same grey box, and its error on",
-        "the validation part compared with that of the true structure. `failed`: it raised an error, or its",
-        "answer could not be fitted. The regressions have columns for all of the catalogue but play in the gear",
-        "and a drift of the voltage: hysteresis, lag, modes and warmth by their states along the measured",
-        "motion, errors of sensors by what the balance makes of them. No regression can answer 'unexplained',",
-        "for it has no measure of what it leaves: `outside flagged` can only be zero. `refit + BIC` fits the",
-        "whole catalogue one by one, then the best of it again beside the first; where it is not in the table,",
-        "it was not run. `s` is by the clock on a busy machine, compiling included.",
+        "answers with names; the structure that it names is then fitted by the same grey box, and its error",
+        "on the validation part compared with that of the true structure. `failed`: it raised an error, or",
+        "its answer could not be fitted. The regressions have columns for all of the catalogue but play in",
+        "the gear and a drift of the voltage: hysteresis, lag, modes and warmth by their states along the",
+        "measured motion, errors of sensors by what the balance makes of them. No regression can answer",
+        "'unexplained', for it has no measure of what it leaves: `outside flagged` can only be zero.",
+        "`refit + BIC` fits the whole catalogue one by one, then the best of it again beside the first;",
+        "where it is not in the table, it was not run. `s` is by the clock on a busy machine, compiling",
+        "included.",
         *earlier,
     ]
     return "\n".join(["# B6: one hidden effect, every method", "", head, *rows, "", *notes]) + "\n"
