@@ -14,9 +14,13 @@ import rotflex_jax as rf
 from rotflex_jax.arena import problems as of, scores as scoring
 from rotflex_jax.arena.method import Answer, Apart, ArenaFailure, Here, understood
 from rotflex_jax.arena.problems import MEASURED, NOTHING, ONE, OUT, TWO, WORLD, Problem, drawn
+from rotflex_jax.arena.rivals.motion import Motion
+from rotflex_jax.arena.rivals.terms import _hysteresis, terms
 from rotflex_jax.arena.scores import MethodScore, Scores, calibration_error, failed, marked, run_error, score
 from rotflex_jax.cli import app
 from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.linear import StateSpace
+from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model
 
 MODEL = Model(rf.joints.paper())
@@ -343,3 +347,76 @@ def test_measured_machines_count_by_the_error_of_free_runs(measured):
     assert run_error(p, runs) == pytest.approx(0.002)
     row = marked(p, Answer(has_model=True), 1, 0.002)
     assert row.error == 0.002 and not row.wrong
+
+
+def moving(q, v, a, Ts=0.002) -> Motion:
+    """A motion of a joint with some linear balance."""
+    rng = np.random.default_rng(4)
+    A = np.vstack([np.hstack([np.zeros((2, 2)), np.eye(2)]), -np.abs(rng.normal(size=(2, 4)))])
+    mass = np.array([[3.0, 1.0], [1.0, 2.0]])
+    joint = StateSpace(A, np.zeros(4), np.eye(2, 4))
+    u = np.cos(7 * Ts * np.arange(len(q)))
+    missing = (a - np.hstack([q, v]) @ A[2:].T) @ mass.T
+    return Motion(u, q, v, a, Ts, joint, mass, missing, 11, 0, 0.5)
+
+
+t = 0.002 * np.arange(1500)
+ANGLES = np.stack([0.8 * np.sin(2 * t), 0.1 * np.sin(5 * t + 1)], 1)
+SPEEDS = np.stack([1.6 * np.cos(2 * t), 0.5 * np.cos(5 * t + 1)], 1)
+ACCELERATIONS = np.stack([-3.2 * np.sin(2 * t), -2.5 * np.sin(5 * t + 1)], 1)
+
+
+def column(m: Motion, place, which=0):
+    """The first term of an effect."""
+    return next(x for x in terms(m) if x.place == place).columns[:, :, which]
+
+
+def test_regressions_have_a_column_for_the_catalogue():
+    named = {x.place for x in terms(moving(ANGLES, SPEEDS, ACCELERATIONS))}
+    wanted = {(kind.name, port) for kind, port in search_places(rf.joints.paper())}
+    own = {("viscous", "hub"), ("viscous", "joint")}  # which the joint has
+    assert wanted - named == own | {("backlash", "hub"), ("voltage_drift", "input")}
+
+
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [
+        (("sensor_gain", "alpha"), lambda q: q[:, 1]),
+        (("sensor_cubic", "theta"), lambda q: q[:, 0] ** 3),
+        (("cross_talk", "alpha"), lambda q: q[:, 0]),
+        (("eccentric_encoder", "theta"), lambda q: np.sin(q[:, 0])),
+    ],
+)
+def test_an_error_of_a_sensor_is_what_the_balance_makes_of_it(place, error):
+    true = moving(ANGLES, SPEEDS, ACCELERATIONS)
+    channel = ("theta", "alpha").index(place[1])
+    d, Ts = 0.01 * error(ANGLES), true.Ts
+    rate = np.gradient(d, Ts, edge_order=2)
+    read = [x.copy() for x in (ANGLES, SPEEDS, ACCELERATIONS)]
+    for x, more in zip(read, (d, rate, np.gradient(rate, Ts, edge_order=2)), strict=True):
+        x[:, channel] += more
+    wrong = moving(*read)
+    inner = slice(5, -5)
+    np.testing.assert_allclose(
+        (wrong.missing - true.missing)[inner], 0.01 * column(true, place)[inner], atol=2e-5
+    )
+
+
+def test_states_along_a_motion_are_those_of_their_laws():
+    s, Ts = 0.3, 0.002
+    steady = np.full(400, s)
+    built = _hysteresis(steady, np.ones(400), 0.02, 1.0, Ts)
+    way = s * Ts * np.arange(1, 401)
+    np.testing.assert_allclose(built, 1 - np.exp(-way / 0.02), rtol=1e-12)
+    # With beta = 1/2 the torque goes back along a straight line.
+    there = _hysteresis(np.concatenate([steady, -steady[:20]]), np.ones(420), 0.02, 0.0, Ts)
+    np.testing.assert_allclose(np.diff(there[399:]), -s * Ts / 0.02, rtol=1e-9)
+    # A shaken mass far below its resonance follows its port.
+    m = moving(ANGLES, SPEEDS, ACCELERATIONS)
+    torque = column(m, ("second_mode", "hub"))
+    late = slice(1000, None)
+    np.testing.assert_allclose(torque[late, 0], ACCELERATIONS[late, 0], atol=0.05 * 3.2)
+    assert not np.any(torque[:, 1])
+    # Of a slow input a lag takes away time times slope: the next term is 2 % of that.
+    lag = column(m, ("lag", "input"))[late, 0]
+    np.testing.assert_allclose(lag, 0.003 * 7 * np.sin(7 * t[late]), atol=6e-4)

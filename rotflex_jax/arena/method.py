@@ -362,6 +362,21 @@ def _listen(pipe: BinaryIO, replies: "queue.Queue[tuple[str, Any]]") -> None:
     replies.put(("ended", None))
 
 
+def check_name(name: str) -> None:
+    """Refuse a name that is neither an entrant nor that of a function of a file.
+
+    Raises:
+        InputError: It is neither.
+    """
+    from rotflex_jax.arena.entrants import ENTRANTS  # on request: it names methods
+
+    if name not in ENTRANTS and not name.rpartition(":")[0]:
+        raise InputError(
+            f"The method {shown(name)} is neither FILE.py:NAME nor one of {', '.join(ENTRANTS)}; name the "
+            "function behind a colon."
+        )
+
+
 def loaded(name: str) -> Method:
     """The method meant by `FILE.py:NAME`, `package.module:NAME` or the name of an entrant.
 
@@ -371,14 +386,10 @@ def loaded(name: str) -> Method:
     from rotflex_jax.arena.entrants import ENTRANTS
     from rotflex_jax.joints.by_name import imported
 
+    check_name(name)
     if name in ENTRANTS:
         return ENTRANTS[name].method
     place, _, attribute = name.rpartition(":")
-    if not place:
-        raise InputError(
-            f"The method {shown(name)} is neither FILE.py:NAME nor one of {', '.join(ENTRANTS)}; name the "
-            "function behind a colon."
-        )
     method = getattr(imported(place), attribute, None)
     if not callable(method):
         raise InputError(f"{place} has no function {shown(attribute)}; name one that it has.")

@@ -22,10 +22,11 @@ from rotflex_jax.arena.method import (
     ArenaFailure,
     Here,
     Method,
+    check_name,
 )
 from rotflex_jax.arena.problems import MEASURED, NOTHING, ONE, OUT, TWO, WORLD, Problem, drawn, measured
 from rotflex_jax.arena.simulator.laws import Place
-from rotflex_jax.checks import number, shown, whole
+from rotflex_jax.checks import number, progress as checked_progress, shown, whole
 from rotflex_jax.errors import InputError
 
 BINS, LEAST = 10, 0.01
@@ -434,6 +435,8 @@ def score(
                 f"Argument `methods` must have functions or names, but has {shown(method)}; give "
                 "for instance 'search'."
             )
+        if isinstance(method, str):
+            check_name(method)
     names = [m if isinstance(m, str) else getattr(m, "__name__", type(m).__name__) for m in listed]
     twice = [n for k, n in enumerate(names) if n in names[:k]]
     if twice:
@@ -442,7 +445,7 @@ def score(
     seed = secrets.randbits(31) if seed is None else whole(seed, "seed", 0)
     seconds = number(seconds, "seconds", least=4.0, unit="s", example="20.0")
     limit = number(limit, "limit", above=0, unit="s", example="600.0")
-    say = progress or (lambda _: None)
+    say = checked_progress(progress)
     with contextlib.ExitStack() as stack:
         running = [stack.enter_context(Apart(m) if isinstance(m, str) else Here(m)) for m in listed]
         for method in running:

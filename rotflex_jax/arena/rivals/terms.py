@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import cont2discrete, dlsim, lfilter
+from scipy.signal import cont2discrete, dlsim, lfilter, lfilter_zi
 
 from rotflex_jax.arena.rivals.motion import PORTS, Motion, Values
 from rotflex_jax.arena.simulator.laws import Place
@@ -111,19 +111,21 @@ def _at_ports(m: Motion) -> Iterator[TorqueTerm]:
 
 
 def _of_modes(m: Motion) -> Iterator[TorqueTerm]:
-    """A mass on a spring at a port, which shakes it with its acceleration."""
+    """A mass on a spring at a port, which its own acceleration shakes: ``e'' + d e' + k e = -z''``.
+
+    The torque on the port is the mass times its acceleration ``z'' + e'' = -d e' - k e``.
+    """
     for port, frequencies in MODES.items():
-        z, v = m.at(port)
+        shaking = (m.a @ PORTS[port])[:, None]
         for frequency in frequencies:
             w = 2 * np.pi * frequency
             k, d = w**2, 2 * DAMPING * w
-            A, B = np.array([[0.0, 1.0], [-k, -d]]), np.array([[0.0, 0.0], [k, d]])
-            output, feed = np.array([[-k, -d]]), np.array([[k, d]])
-            discrete = cont2discrete((A, B, output, feed), m.Ts, "zoh")
-            # At first the mass moves with the port; only angles relative to that place count.
-            from_there = np.column_stack([z - z[0], v])
-            shaken = dlsim(discrete, from_there, x0=np.array([0.0, v[0]]))[1][:, 0]
-            yield _term(("second_mode", port), port, shaken, note=f"{frequency:g} Hz")
+            A, B = np.array([[0.0, 1.0], [-k, -d]]), np.array([[0.0], [-1.0]])
+            mass = (A, B, A[1:], np.zeros((1, 1)))
+            # At first it hangs behind as far as its spring gives under that acceleration.
+            start = np.array([-shaking[0, 0] / k, 0.0])
+            answer = dlsim(cont2discrete(mass, m.Ts, "zoh"), shaking, x0=start)[1]
+            yield _term(("second_mode", port), port, answer[:, 0], note=f"{frequency:g} Hz")
 
 
 def _of_voltage(m: Motion) -> Iterator[TorqueTerm]:
@@ -133,8 +135,11 @@ def _of_voltage(m: Motion) -> Iterator[TorqueTerm]:
         late = np.interp(t - time, t, u) - u
         yield _term(("delay", "input"), "hub", late, note=f"{1e3 * time:g} ms")
     for time in LAGS:
+        # Exact for a voltage that runs straight from sample to sample.
         keep = np.exp(-m.Ts / time)
-        behind = lfilter([1 - keep], [1, -keep], u, zi=[keep * u[0]])[0] - u
+        slope = (1 - keep) * time / m.Ts
+        b, a = np.array([1 - slope, slope - keep]), np.array([1.0, -keep])
+        behind = lfilter(b, a, u, zi=u[0] * lfilter_zi(b, a))[0] - u
         yield _term(("lag", "input"), "hub", behind, note=f"{1e3 * time:g} ms")
     # Torque of the cold motor per volt at rest; warmth takes a share of it.
     cold = u - m.back_emf * m.v[:, 0]
