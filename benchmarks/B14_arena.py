@@ -3,13 +3,14 @@
     python benchmarks/B14_arena.py --seed 20261
     python benchmarks/B14_arena.py --entrants refit_bic --fresh
 
-Each entrant runs in a process of its own, on records drawn anew from the seed, and is written as soon as it
-is done; one that is in the file already is left as it is unless `--fresh` is given.
+Each entrant runs in a process of its own, and every answer is written as soon as it is there; the same
+command goes on with those that are missing, unless `--fresh` is given.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -19,11 +20,19 @@ import B0_discovery as B0
 from rotflex_jax.arena.entrants import ENTRANTS
 from rotflex_jax.arena.method import Apart
 from rotflex_jax.arena.problems import drawn
-from rotflex_jax.arena.scores import COLUMNS, Scores, cells, on_problems
+from rotflex_jax.arena.scores import COLUMNS, Marks, MethodScore, answered, cells
 from rotflex_jax.text.files import write_file
 
 PATH = Path(__file__).resolve().parent / "results" / "B14.json"
 SEED, RECORDS, SECONDS, LIMIT = 20261, 8, 8.0, 1500.0
+
+
+def keep(results: dict[str, Any], name: str, rows: list[dict[str, Any]]) -> None:
+    """The rows of a method, with what they say together."""
+    marks = tuple(Marks.of({k: v for k, v in r.items() if k != "code"}) for r in rows)
+    own = MethodScore(name, marks)
+    results["methods"][name] = {"summary": own.summary(), "cells": cells(own), "rows": rows}
+    results["methods"] = {n: results["methods"][n] for n in ENTRANTS if n in results["methods"]}
 
 
 def page(results: dict[str, Any]) -> str:
@@ -33,9 +42,13 @@ def page(results: dict[str, Any]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * len(COLUMNS)]
     lines += ["| " + " | ".join(results["methods"][n]["cells"]) + " |" for n in names]
     rows = ["| record | kind | hidden | " + " | ".join(names) + " |", "|---:|---|---|" + "---|" * len(names)]
-    for k, first in enumerate(results["methods"][names[0]]["rows"]):
+    longest = max((results["methods"][n]["rows"] for n in names), key=len)
+    for k, first in enumerate(longest):
         answers = []
         for name in names:
+            if k >= len(results["methods"][name]["rows"]):
+                answers.append("not run")
+                continue
             r = results["methods"][name]["rows"][k]
             text = " + ".join(r["answered"]) if r["verdict"] == "found" else r["verdict"]
             answers.append(f"**{text}**" if r["right"] else text)
@@ -83,19 +96,20 @@ def main() -> int:
     results["runs"].append({**B0.provenance(), "arguments": sys.argv[1:]})
     say = lambda line: print(line, flush=True)  # noqa: E731
     problems = drawn(a.records, a.seed, a.seconds, say)
-    for name in a.entrants.split(","):
-        if name in results["methods"]:
-            continue
-        with Apart(name) as method:
-            own = on_problems(name, method, problems, a.limit, say)
-        found = Scores(a.seed, a.seconds, a.limit, (own,))
-        told = found.to_dict()["methods"][name]
-        results["methods"][name] = {**told, "cells": cells(own), "code": results["runs"][-1]["code"]}
-        order = [n for n in ENTRANTS if n in results["methods"]]
-        results["methods"] = {n: results["methods"][n] for n in order}
-        B0.save(a.out, results)
-        write_file(a.out.with_suffix(".md"), page(results))
-        print(found, flush=True)
+    rows = {n: results["methods"].get(n, {"rows": []})["rows"] for n in a.entrants.split(",")}
+    with contextlib.ExitStack() as stack:
+        methods = {name: stack.enter_context(Apart(name)) for name in rows}
+        for k, problem in enumerate(problems, 1):
+            for name, method in methods.items():
+                if len(rows[name]) >= k:
+                    continue
+                say(f"{name}: record {k} of {len(problems)}")
+                row = answered(method, problem, k, a.limit).to_dict()
+                rows[name].append({**row, "code": results["runs"][-1]["code"]})
+                keep(results, name, rows[name])
+                B0.save(a.out, results)
+                write_file(a.out.with_suffix(".md"), page(results))
+    print(page(results), flush=True)
     return 0
 
 

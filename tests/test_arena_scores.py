@@ -420,3 +420,8 @@ def test_states_along_a_motion_are_those_of_their_laws():
     # Of a slow input a lag takes away time times slope: the next term is 2 % of that.
     lag = column(m, ("lag", "input"))[late, 0]
     np.testing.assert_allclose(lag, 0.003 * 7 * np.sin(7 * t[late]), atol=6e-4)
+
+
+def test_marks_are_read_back_from_their_json():
+    row = marked(EVERY[1], said(COULOMB, GRAVITY, p={COULOMB: 0.7}), 2, 1.5, "a note")
+    assert scoring.Marks.of(json.loads(json.dumps(row.to_dict()))) == row

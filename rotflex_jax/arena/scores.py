@@ -133,6 +133,15 @@ class Marks:
     error: float | None
     truth: dict[str, Any]
 
+    @classmethod
+    def of(cls, row: dict[str, Any]) -> "Marks":
+        """Marks of what `to_dict` has made."""
+        place = lambda name: tuple(name.split("@"))  # noqa: E731
+        own = {n: tuple(map(place, row[n])) for n in ("hidden", "answered", "wrong")}
+        events = tuple(Event(p, true) for p, true in row["probabilities"])
+        rest = {k: v for k, v in row.items() if k != "probabilities"}
+        return cls(**{**rest, **own, "events": events})
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
         return {
@@ -455,36 +464,24 @@ def score(
         problems += measured(say) if with_measured else []
         found = []
         for name, method in zip(names, running, strict=True):
-            found.append(on_problems(name, method, problems, limit, say))
+            rows = []
+            for k, problem in enumerate(problems, 1):
+                say(f"{name}: record {k} of {len(problems)}")
+                rows.append(answered(method, problem, k, limit))
+            found.append(MethodScore(name, tuple(rows)))
             method.__exit__()
         return Scores(seed, seconds, limit, tuple(found))
 
 
-def on_problems(
-    name: str,
-    method: Here | Apart,
-    problems: Sequence[Problem],
-    limit: float,
-    say: Callable[[str], None] = lambda _: None,
-) -> MethodScore:
-    """Score one method on records that were drawn before.
+def answered(method: Here | Apart, problem: Problem, record: int, limit: float) -> Marks:
+    """The marks of a method on one record; whatever goes wrong is part of them.
 
     Args:
-        name: Under which it is listed.
         method: In this process or in one of its own.
-        problems: The records.
+        problem: The record.
+        record: Its number.
         limit: Most time for an answer [s].
-        say: Called with a line of progress.
     """
-    rows = []
-    for k, problem in enumerate(problems, 1):
-        say(f"{name}: record {k} of {len(problems)}")
-        rows.append(_row(method, problem, k, limit))
-    return MethodScore(name, tuple(rows))
-
-
-def _row(method: Here | Apart, problem: Problem, record: int, limit: float) -> Marks:
-    """One record."""
     began = time.perf_counter()
     try:
         answer = method.answer(problem.given(), limit)
