@@ -122,6 +122,8 @@ def test_what_is_no_answer_is_refused_in_a_sentence():
     for nothing in ("nothing missing", [], (), {"effects": None}):
         assert understood(nothing, MODEL)[0] == Answer()
     assert understood("unexplained", MODEL)[0].unexplained
+    sums = understood({"probabilities": {COULOMB: 1 + 2e-15}}, MODEL)[0]
+    assert sums.probabilities == {COULOMB: 1.0}
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,8 @@ Method = Callable[..., Any]
 
 NOTHING_MISSING, UNEXPLAINED = "nothing missing", "unexplained"
 _KEYS = ("effects", "unexplained", "probabilities", "model")
+# By so much a sum of probabilities may exceed one.
+_ROUNDING = 1e-9
 # What a process may take to start, to import and to run a model [s].
 _STARTING = 300.0
 
@@ -134,9 +136,9 @@ def understood(given: Any, model: Model) -> tuple[Answer, Any]:
             "for instance {'coulomb@hub': 0.9}."
         )
     for value in chances.values():
-        if not 0 <= real(value) <= 1:
+        if not 0 <= real(value) <= 1 + _ROUNDING:
             raise InputError(f"A probability is {shown(value)}, but must lie between 0 and 1; correct it.")
-    found, answered = {place_of(k, model): float(v) for k, v in chances.items()}, given.get("model")
+    found, answered = {place_of(k, model): min(float(v), 1.0) for k, v in chances.items()}, given.get("model")
     if answered is not None and not callable(getattr(answered, "simulate", None)):
         try:
             answered = Model.of(answered)
