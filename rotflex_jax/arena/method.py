@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import IO, Any, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -340,13 +340,13 @@ class Apart:
         return self._ask(("simulate", asked), _STARTING)
 
 
-def _send(pipe: BinaryIO, value: Any) -> None:
+def _send(pipe: IO[bytes], value: Any) -> None:
     data = pickle.dumps(value)
     pipe.write(struct.pack("<Q", len(data)) + data)
     pipe.flush()
 
 
-def _receive(pipe: BinaryIO) -> Any:
+def _receive(pipe: IO[bytes]) -> Any:
     """The next message; None at the end."""
     head = pipe.read(8)
     if len(head) < 8:
@@ -356,7 +356,7 @@ def _receive(pipe: BinaryIO) -> Any:
     return pickle.loads(data) if len(data) == size else None
 
 
-def _listen(pipe: BinaryIO, replies: "queue.Queue[tuple[str, Any]]") -> None:
+def _listen(pipe: IO[bytes], replies: "queue.Queue[tuple[str, Any]]") -> None:
     """Passes on what a process says until it ends."""
     with contextlib.suppress(OSError, ValueError, EOFError, pickle.UnpicklingError):
         while (message := _receive(pipe)) is not None:

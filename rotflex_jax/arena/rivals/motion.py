@@ -97,12 +97,13 @@ def motions(
 def _smoothed(train: rf.Recording, joint: StateSpace, mass: Values, window: int, back_emf: float) -> Motion:
     y, u, Ts = np.asarray(train.y), np.asarray(train.u).ravel(), train.Ts
     q, v, a = (
-        savgol_filter(y, window, 3, deriv=order, delta=Ts, axis=0, mode="interp") for order in range(3)
+        np.asarray(savgol_filter(y, window, 3, deriv=order, delta=Ts, axis=0, mode="interp"), float)
+        for order in range(3)
     )
     # The voltage is held over a sample; at the sample itself it is the mean of before and after. It
     # goes through the same filter, so that both sides of the balance are smoothed alike.
     held = 0.5 * (u + np.concatenate([u[:1], u[:-1]]))
-    smooth = savgol_filter(held, window, 3)
+    smooth = np.asarray(savgol_filter(held, window, 3), float)
     x = np.hstack([q, v])
     explained = x @ joint.A[2:4, :4].T + np.outer(smooth, joint.B[2:4])
     missing = (a - explained) @ mass.T

@@ -85,7 +85,8 @@ def designed(kind: str, plant: Plant, rng: np.random.Generator) -> Controller:
             kd = kp * draw(0.01, 0.2)
             tip = float(kind == "pd_tip")
             gains = np.array([kp, tip * kp, kd, tip * kd])
-        made = Controller(kind, (*map(float, gains),), corner)
+        of_theta, of_alpha, of_hub, of_joint = map(float, gains)
+        made = Controller(kind, (of_theta, of_alpha, of_hub, of_joint), corner)
         if _accepted(plant, made):
             return made
 
