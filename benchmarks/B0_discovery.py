@@ -17,8 +17,8 @@ report seeds.
     python benchmarks/B0_discovery.py --wrong-worlds 96 --workers 16
     python benchmarks/B0_discovery.py --wrong-worlds 24 --tuning
 
-Wrong worlds (`arena.wrong_worlds`) are what laboratories record, of machines whose model is wrong in more
-than one way. They have seeds, results and a page of their own (`results/B0_wrong_worlds.json`).
+Wrong worlds (`rotflex_jax.arena.wrong_worlds`) are what laboratories record, of machines whose model is
+wrong in more than one way. They have seeds, results and a page of their own (`results/B0_wrong_worlds.json`).
 
 Records that the file has already are skipped unless `--fresh` is given; every run adds to the file, and
 the tables and figures beside it are of all its records.
@@ -50,14 +50,14 @@ for folder in (HERE, HERE.parent):
 
 from rich.console import Console
 
-from arena.draws import drawn
-from arena.hidden import DEFAULTS, OUTSIDE
 from arena.pages import publish
 from arena.probability import drawn_probabilities, summary
-from arena.records import INPUTS
 from arena.table import answer, label, show
 from arena.wrong_seeds import REPORT as WORLDS_REPORT, TUNING as WORLDS_TUNING
 from arena.wrong_table import publish_worlds, show_worlds
+from rotflex_jax.arena.simulator.draws import drawn
+from rotflex_jax.arena.simulator.hidden import DEFAULTS, OUTSIDE
+from rotflex_jax.arena.simulator.records import INPUTS
 
 TUNING, REPORT = tuple(range(100, 120)), tuple(range(1000, 1020))
 Job = dict[str, Any]
@@ -169,7 +169,8 @@ def provenance() -> dict[str, Any]:
     code, arena = hashlib.sha256(), hashlib.sha256()
     for file in sorted((HERE.parent / "rotflex_jax").rglob("*.py")):
         code.update(file.read_bytes())
-    for file in sorted((HERE / "arena").glob("*.py")):
+    simulator = HERE.parent / "rotflex_jax" / "arena" / "simulator"
+    for file in sorted([*(HERE / "arena").glob("*.py"), *simulator.glob("*.py")]):
         arena.update(file.read_bytes())
     git = lambda *a: subprocess.run(  # noqa: E731
         ["git", "-C", str(HERE), *a], capture_output=True, text=True, check=False

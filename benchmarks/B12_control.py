@@ -23,9 +23,9 @@ import rotflex_jax as rf
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
 
-from arena.machine import Machine
-from arena.records import make_record
 from rotflex_jax import effects as fx
+from rotflex_jax.arena.simulator.machine import Machine
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.control import close_loop
 from rotflex_jax.text.files import write_file
 

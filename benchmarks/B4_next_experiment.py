@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 import rotflex_jax as rf
-from arena.records import make_record
-from arena.scoring import renamed
+from rotflex_jax.arena.marking import renamed
+from rotflex_jax.arena.simulator.records import make_record
 
 rf.enable_fast_loops()
 rf.enable_compilation_cache()

@@ -58,7 +58,7 @@ def arm() -> tuple:
 
 def arena() -> tuple:
     """A simulated joint with dry friction at the hub, from the independent simulator, tuning seed 101."""
-    from arena.records import make_record
+    from rotflex_jax.arena.simulator.records import make_record
 
     made = make_record([("coulomb", "hub")], seconds=20.0, seed=101)
     train, test = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"], source="arena 101").split(0.7)

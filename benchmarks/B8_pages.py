@@ -27,8 +27,8 @@ import rotflex_jax as rf
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
 
-from arena.records import make_record
 from rotflex_jax import effects as fx
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.basis import Delays, Orthonormal, Volterra
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import least_squares

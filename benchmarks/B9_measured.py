@@ -36,8 +36,8 @@ if str(HERE) not in sys.path:
 
 import rotflex_jax as rf
 from B0_discovery import provenance, save
-from measured_machines.machines import MACHINES
 from measured_machines.page import page
+from rotflex_jax.arena.measured import MACHINES
 from rotflex_jax.compare import QUICK
 from rotflex_jax.text.files import write_file
 from speed.processes import process

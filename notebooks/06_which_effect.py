@@ -22,7 +22,7 @@ import numpy as np
 sys.path.insert(0, "../benchmarks")  # the independent simulator
 
 import rotflex_jax as rf
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.errors import InputError
 from rotflex_jax.report import figures
 

@@ -26,8 +26,8 @@ import numpy as np
 sys.path.insert(0, "../benchmarks")  # the independent simulator
 
 import rotflex_jax as rf
-from arena.records import make_record
 from rotflex_jax import effects as fx
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.parameters import parameter
 

@@ -23,8 +23,8 @@ import numpy as np
 sys.path.insert(0, "../benchmarks")  # the independent simulator
 
 import rotflex_jax as rf
-from arena.records import make_record
 from rotflex_jax import effects as fx
+from rotflex_jax.arena.simulator.records import make_record
 
 HIDDEN = {("delay", "input"): {"time": 0.0012}}
 

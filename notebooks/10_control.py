@@ -24,9 +24,9 @@ import numpy as np
 sys.path.insert(0, "../benchmarks")  # the independent simulator
 
 import rotflex_jax as rf
-from arena.machine import Machine
-from arena.records import make_record
 from rotflex_jax import effects as fx
+from rotflex_jax.arena.simulator.machine import Machine
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.control import close_loop, controller_to_c
 
 record = make_record({("coulomb", "hub"): {"level": 0.1}}, seed=40, seconds=5.0, rms=2.0)

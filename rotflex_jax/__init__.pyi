@@ -1,5 +1,6 @@
 from . import (
     adaptive as adaptive,
+    arena as arena,
     basis as basis,
     control as control,
     data as data,

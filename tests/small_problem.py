@@ -6,7 +6,7 @@ import functools
 import numpy as np
 
 import rotflex_jax.effects as fx
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.refit import levenberg_marquardt

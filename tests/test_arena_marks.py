@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from arena.draws import apart, drawn
-from arena.hidden import ABSORBED, EQUIVALENT
 from arena.marks import confusion, group, grouped, intervals, mean_set, sets
 from arena.pages import publish
-from arena.scoring import parameter_errors, scored, visible
+from rotflex_jax.arena.marking import parameter_errors, scored, visible
+from rotflex_jax.arena.simulator.draws import apart, drawn
+from rotflex_jax.arena.simulator.hidden import ABSORBED, EQUIVALENT
 from rotflex_jax.parameters import Estimate, Specification
 
 

@@ -10,17 +10,17 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 import rotflex_jax as rf
-from arena.closed_loop import COUNT, Sensors, recorded
-from arena.control import KINDS, LIMIT, Controller, designed, square, textbook
-from arena.laws import laws
-from arena.plant import Plant, simulate
-from arena.records import make_record
-from arena.seen import distinctness
-from arena.voltage import Path, supply
 from arena.wrong_seeds import REPORT, TUNING
 from arena.wrong_table import publish_worlds, summary
 from arena.wrong_trial import marks, told
-from arena.wrong_worlds import HIDDEN, VISIBLE, _hides, world
+from rotflex_jax.arena.simulator.closed_loop import COUNT, Sensors, recorded
+from rotflex_jax.arena.simulator.control import KINDS, LIMIT, Controller, designed, square, textbook
+from rotflex_jax.arena.simulator.laws import laws
+from rotflex_jax.arena.simulator.plant import Plant, simulate
+from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.arena.simulator.seen import distinctness
+from rotflex_jax.arena.simulator.voltage import Path, supply
+from rotflex_jax.arena.wrong_worlds import HIDDEN, VISIBLE, _hides, world
 
 Ts = 0.002
 PD = Controller("pd_theta", (8.0, 0.0, 0.4, 0.0), 40.0)

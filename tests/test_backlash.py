@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import rotflex_jax.effects as fx
-from arena import plant as arena
-from arena.laws import laws
-from arena.records import make_record
+from rotflex_jax.arena.simulator import plant as arena
+from rotflex_jax.arena.simulator.laws import laws
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.score_test import scores

@@ -9,7 +9,7 @@ import pytest
 import scipy
 
 import rotflex_jax as rf
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.effects import Inertia, Motor
 from rotflex_jax.fit import Fit
 from rotflex_jax.fit.result import FitOptions

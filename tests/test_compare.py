@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.cli import app
 from rotflex_jax.compare import ARX, METHODS, QUICK, Comparison, Fitted, Method, physics, register
 from rotflex_jax.compare.arx import DifferenceEquation, fit_difference_equation

@@ -317,8 +317,8 @@ def test_the_command_line_writes_it(capsys, options, prefix):
 
 def test_a_machine_that_was_identified_is_held_and_the_found_friction_is_compensated():
     """Fitted to a recording of the simulator in `benchmarks/arena`; the truth enters nowhere."""
-    from arena.machine import Machine
-    from arena.records import make_record
+    from rotflex_jax.arena.simulator.machine import Machine
+    from rotflex_jax.arena.simulator.records import make_record
 
     record = make_record({("coulomb", "hub"): {"level": 0.1}}, seed=40, seconds=4.0, rms=2.0)
     fit = rf.fit(

@@ -4,9 +4,9 @@ import pytest
 
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
-from arena.hidden import Place
-from arena.records import make_record
-from arena.scoring import alike, parameter_errors, scored
+from rotflex_jax.arena.marking import alike, parameter_errors, scored
+from rotflex_jax.arena.simulator.hidden import Place
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import Discovery
 
 pytestmark = pytest.mark.slow

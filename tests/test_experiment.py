@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.data.excitation import multisine, noise, prbs
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import rival_fit

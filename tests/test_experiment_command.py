@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.cli.app import main
 from rotflex_jax.data.files import save_csv
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import rotflex_jax.effects as fx
-from arena.records import COUNT, JITTER, make_record
+from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import fit
 from rotflex_jax.joints import paper, single_inertia

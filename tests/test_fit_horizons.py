@@ -8,7 +8,7 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.signal import lfilter
 
 import rotflex_jax.effects as fx
-from arena.records import COUNT, JITTER, make_record
+from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.discover.hypothesis import is_physical
 from rotflex_jax.discover.search import SearchState
 from rotflex_jax.discover.supermodel import EffectLocation

@@ -4,7 +4,7 @@ import optimistix as optx
 import pytest
 
 import rotflex_jax as rf
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 
 
 @pytest.fixture(scope="module")

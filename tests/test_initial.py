@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import rotflex_jax.effects as fx
-from arena.plant import Plant
-from arena.records import make_record
+from rotflex_jax.arena.simulator.plant import Plant
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate, simulate_states
 from rotflex_jax.mechanism.initial_state import initial_states, rough_state

@@ -8,9 +8,9 @@ import pytest
 
 import judged
 import rotflex_jax as rf
-from arena.records import make_record
-from measured_machines.machines import MACHINES, halves
 from measured_machines.page import best, held_out, judged as errors_of, page
+from rotflex_jax.arena.measured import MACHINES, halves
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.data.registry import DATASETS
 
 JOINT = rf.joints.paper(hub_damping=0.004, joint_damping=0.003)

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.latent_comparison import calibrated, with_effects_of
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.effects import Coulomb, CubicSpring, Gravity, SensorBias

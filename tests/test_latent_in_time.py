@@ -7,7 +7,7 @@ import pytest
 import scipy
 
 import rotflex_jax as rf
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.data import excitation
 from rotflex_jax.latent.in_time import drift, periodic_torques
 from rotflex_jax.latent.result import ASKED_FOR, LatentTorque

@@ -11,7 +11,7 @@ import pytest
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.formula import FUNCTIONS, Formula, Term, candidates, read_formula
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.spline_map import FittedMap, MapEquations, _smoother, penalties

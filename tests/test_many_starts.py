@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import rotflex_jax.effects as fx
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import first_states, sensor_noise
 from rotflex_jax.fit.many_starts import many_starts, minimise_starts

@@ -8,7 +8,7 @@ import small_problem as sp
 from scipy.optimize import lsq_linear
 
 import rotflex_jax.effects as fx
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.horizon import Horizons, as_free_run
 from rotflex_jax.discover.hypothesis import CandidateStart
 from rotflex_jax.discover.likelihood import LikelihoodProblem

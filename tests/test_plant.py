@@ -8,11 +8,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from arena import plant as p
 from arena.demo_record import EFFECTS, FOLDER, HEADER, demo
-from arena.hidden import ABSORBED, DEFAULTS, EQUIVALENT, UNSEEN, parameters
-from arena.laws import laws
-from arena.records import COUNT, INPUTS, JITTER, make_record
+from rotflex_jax.arena.simulator import plant as p
+from rotflex_jax.arena.simulator.hidden import ABSORBED, DEFAULTS, EQUIVALENT, UNSEEN, parameters
+from rotflex_jax.arena.simulator.laws import laws
+from rotflex_jax.arena.simulator.records import COUNT, INPUTS, JITTER, make_record
 
 BARE = p.Plant(B_hub=0.0, B_joint=0.0)
 HUB, JOINT = 0.03, 0.003

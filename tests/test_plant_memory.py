@@ -8,14 +8,14 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.signal import lsim
 
-from arena import plant as p
-from arena.gear import ROTOR_SHARE
-from arena.hidden import DEFAULTS, EQUIVALENT, OUTSIDE, SHAPES, parameters
-from arena.laws import Place, laws
-from arena.records import make_record
-from arena.scoring import renamed, scored
-from arena.tables import Laws
-from arena.torques import build_up
+from rotflex_jax.arena.marking import renamed, scored
+from rotflex_jax.arena.simulator import plant as p
+from rotflex_jax.arena.simulator.gear import ROTOR_SHARE
+from rotflex_jax.arena.simulator.hidden import DEFAULTS, EQUIVALENT, OUTSIDE, SHAPES, parameters
+from rotflex_jax.arena.simulator.laws import Place, laws
+from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.arena.simulator.tables import Laws
+from rotflex_jax.arena.simulator.torques import build_up
 from rotflex_jax.effects import CATALOG
 
 TS = 2e-3

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import StateSpace, lsim
 
 import rotflex_jax as rf
-from arena.records import INPUTS, make_record
+from rotflex_jax.arena.simulator.records import INPUTS, make_record
 from rotflex_jax.recording.quality import is_absolute
 
 # Effects that could look like it: they hold the arm, pull it, bend an angle, or act while nothing moves.

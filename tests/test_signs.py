@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rotflex_jax as rf
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.fit.signs import check_signs
 
 JOINT = rf.Model(rf.joints.paper())

@@ -7,7 +7,7 @@ import pytest
 
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import Discovery
 from rotflex_jax.runtime.persistent_jit import program_counts, release_programs
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 import rotflex_jax as rf
-from arena.hidden import DEFAULTS, SHAPES
-from arena.laws import Place
-from arena.records import make_record
-from arena.scoring import renamed
 from arena.trial import textbook
+from rotflex_jax.arena.marking import renamed
+from rotflex_jax.arena.simulator.hidden import DEFAULTS, SHAPES
+from rotflex_jax.arena.simulator.laws import Place
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.models.model import Model

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 
 FOLDER = Path(__file__).parents[2] / "rotflex_jax" / "data"
 HEADER = "t,voltage,theta,alpha"

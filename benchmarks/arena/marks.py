@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from scipy.stats import norm
 
-from arena.hidden import DEFAULTS, OUTSIDE
 from arena.table import label
+from rotflex_jax.arena.simulator.hidden import DEFAULTS, OUTSIDE
 
 Row = dict[str, Any]
 

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arena.hidden import EQUIVALENT
-from arena.laws import Place
 from arena.marks import good
-from arena.scoring import alike, exact
+from rotflex_jax.arena.marking import alike, exact
+from rotflex_jax.arena.scores import Event, calibration_error, reliability
+from rotflex_jax.arena.simulator.hidden import EQUIVALENT
+from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.text.colours import BASELINE, FINAL, INK
 from rotflex_jax.text.plotting import blank, styled
 
@@ -24,8 +25,8 @@ if TYPE_CHECKING:  # a process makes its settings ahead of JAX
 
 Row = dict[str, Any]
 
-BINS, LEAST, CREDIBLE = 10, 0.01, 0.9
-"""Bins of equal width; sets less probable than this are not counted; mass of a credible set."""
+CREDIBLE = 0.9
+"""Mass of a credible set."""
 
 
 def told(result: Discovery, evidence: bool = False) -> Row:
@@ -94,13 +95,6 @@ def reduced(names: Iterable[str], row: Row) -> frozenset[Place] | None:
     return None if right else left
 
 
-class Event(NamedTuple):
-    """A probability, and whether what it speaks of was so."""
-
-    probability: float
-    true: bool
-
-
 def classes(row: Row) -> list[Event]:
     """The sets of a row, those that are one answer together, most probable first."""
     mass: dict[frozenset[Place] | None, float] = {}
@@ -127,43 +121,6 @@ def effect_events(row: Row) -> list[Event]:
 def usable(records: Iterable[Row]) -> list[Row]:
     """Rows with probabilities, of machines for whose effects the catalogue has names."""
     return [r for r in good(list(records)) if "probabilities" in r and not r.get("outside")]
-
-
-class Bin(NamedTuple):
-    """Events of about one probability.
-
-    Attributes:
-        claimed: Their mean probability.
-        held: Share of them that were so.
-        cases: How many.
-    """
-
-    claimed: float
-    held: float
-    cases: int
-
-
-def reliability(events: Iterable[Event]) -> list[Bin]:
-    """Events in `BINS` bins of equal width; empty ones left out."""
-    listed = [e for e in events if e.probability >= LEAST]
-    place = [min(int(BINS * e.probability), BINS - 1) for e in listed]
-    groups = [[e for e, k in zip(listed, place, strict=True) if k == i] for i in range(BINS)]
-    return [
-        Bin(float(np.mean([e.probability for e in g])), float(np.mean([e.true for e in g])), len(g))
-        for g in groups
-        if g
-    ]
-
-
-def calibration_error(events: Iterable[Event]) -> float:
-    """Expected calibration error: mean of |claimed - held| over bins, weighted by cases.
-
-    >>> round(calibration_error([Event(0.8, held) for held in (True, True, False, True)]), 6)
-    0.05
-    """
-    bins = reliability(events)
-    cases = sum(b.cases for b in bins)
-    return sum(b.cases * abs(b.claimed - b.held) for b in bins) / cases if cases else math.nan
 
 
 class CredibleSets(NamedTuple):

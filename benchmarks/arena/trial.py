@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import rotflex_jax as rf
-from arena.hidden import ABSORBED, DEFAULTS, SHAPES
-from arena.laws import Place
 from arena.probability import told
-from arena.records import make_record
-from arena.scoring import parameter_errors, renamed, scored, visible
+from rotflex_jax.arena.marking import parameter_errors, renamed, scored, visible
+from rotflex_jax.arena.simulator.hidden import ABSORBED, DEFAULTS, SHAPES
+from rotflex_jax.arena.simulator.laws import Place
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from arena.laws import Place
 from arena.probability import told as probabilities_told
-from arena.scoring import alike
-from arena.wrong_worlds import World, world
 from judged import ESTABLISHED, PROVISIONAL, errors, named, searched
+from rotflex_jax.arena.marking import alike
+from rotflex_jax.arena.simulator.laws import Place
+from rotflex_jax.arena.wrong_worlds import World, world
 
 
 def marks(

@@ -14,8 +14,8 @@ from typing import Any
 
 import rotflex_jax as rf
 from judged import errors, named, searched
-from measured_machines.machines import MACHINES, Direction
 from public_machines.rounds import estimates
+from rotflex_jax.arena.measured import MACHINES, Way
 
 
 def main() -> None:
@@ -80,9 +80,7 @@ def reported(stage: dict[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in stage.items() if k.startswith(("held_out_rmse", "test_rmse"))}
 
 
-def compared(
-    model: rf.Model, way: Direction, methods: Sequence[str], say: Callable[[str], None]
-) -> dict[str, Any]:
+def compared(model: rf.Model, way: Way, methods: Sequence[str], say: Callable[[str], None]) -> dict[str, Any]:
     """Other methods on the same data, best first; they learn from all that has a say in the search."""
     began = time.perf_counter()
     table = rf.compare(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from measured_machines.machines import MACHINES
+from rotflex_jax.arena.measured import MACHINES
 
 Row = dict[str, Any]
 KINDS = ("whole", "windows", "whole_calibrated", "windows_calibrated")

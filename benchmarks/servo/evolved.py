@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rotflex_jax.arena.evolution import minimise
 from servo import friction_models
-from servo.evolution import minimise
 from servo.recordings import Split, errors, logs
 
 
@@ -26,7 +26,8 @@ def evolved(name: str, split: Split, rollouts: int, seed: int) -> dict[str, Any]
     named = lambda x: dict(zip(box, x.tolist(), strict=True))  # noqa: E731
     friction_models.mean_error(named((lower + upper) / 2), train)  # compiled once, not counted
     began = time.perf_counter()
-    found = minimise(lambda x: friction_models.mean_error(named(x), train), lower, upper, rollouts, seed)
+    cost = lambda X: np.array([friction_models.mean_error(named(x), train) for x in X])  # noqa: E731
+    found = minimise(cost, lower, upper, rollouts, seed)
     seconds = time.perf_counter() - began
     runs = lambda of: list(friction_models.rollouts(named(found.x), logs(of)))  # noqa: E731
     return {

@@ -45,7 +45,7 @@ COMMAND = "import sys; from rotflex_jax.cli import main; sys.argv[0] = 'rotflex'
 
 def fleet(seconds: float, each: int) -> dict[str, float]:
     """`rotflex discover FILES --each`, in the processes of this machine: nothing compiled, then all [s]."""
-    from arena.records import make_record
+    from rotflex_jax.arena.simulator.records import make_record
 
     with tempfile.TemporaryDirectory() as folder:
         files = []
@@ -68,7 +68,7 @@ def fleet(seconds: float, each: int) -> dict[str, float]:
 
 def searches(seconds: float) -> dict[str, float]:
     """Times by the clock and of the processor [s], and memory [MB]."""
-    from arena.records import make_record
+    from rotflex_jax.arena.simulator.records import make_record
 
     with tempfile.TemporaryDirectory() as folder:
         paths = []

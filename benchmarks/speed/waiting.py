@@ -55,7 +55,7 @@ def waiting(seconds: float) -> dict[str, float]:
     Args:
         seconds: Length of the recordings [s]; below 20 s the measured joint is left out.
     """
-    from arena.records import make_record
+    from rotflex_jax.arena.simulator.records import make_record
 
     facts: dict[str, float] = {}
 

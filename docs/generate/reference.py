@@ -24,6 +24,7 @@ PACKAGES = {
     "rotflex_jax.experiment": "The next experiment",
     "rotflex_jax.control": "Controllers",
     "rotflex_jax.compare": "Every method on the same recording",
+    "rotflex_jax.arena": "The arena",
     "rotflex_jax.batch": "Many recordings",
     "rotflex_jax.notebook": "In a notebook",
     "rotflex_jax.basis": "Bases",

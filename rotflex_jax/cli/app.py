@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.cli.arena import arena
 from rotflex_jax.cli.batch import check_each, search_each
 from rotflex_jax.cli.data import check, data_app
 from rotflex_jax.cli.experiment import experiment
@@ -269,6 +270,6 @@ def _report(result: Any, folder: Path | None, json_file: Path | None) -> None:
 
 
 # In the order in which a newcomer needs them.
-for _command in (demo, check, discover, compare, simulate, experiment, export, effects, reproduce):
+for _command in (demo, check, discover, compare, simulate, experiment, export, effects, reproduce, arena):
     app.command()(_command)
 app.add_typer(data_app, name="data")

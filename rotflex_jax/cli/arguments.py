@@ -269,6 +269,30 @@ GreyBox = Annotated[
 ]
 
 
+# rotflex arena
+ArenaMethods = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="FILE.py:FUNCTION...", help="Your methods: function(train, validation, model)."),
+]
+Entrants = Annotated[
+    str | None,
+    typer.Option(metavar="A,B", help="Methods that come with the arena, as search,refit_bic; all for all."),
+]
+Records = Annotated[int, typer.Option(metavar="COUNT", help="How many simulated records.")]
+ArenaSeed = Annotated[
+    int | None,
+    typer.Option("--seed", metavar="NUMBER", help="What the records are drawn from; drawn unless given."),
+]
+RecordSeconds = Annotated[float, typer.Option("--seconds", metavar="SECONDS", help="Length of a record.")]
+AnswerLimit = Annotated[float, typer.Option("--limit", metavar="SECONDS", help="Most time for an answer.")]
+WithMeasured = Annotated[
+    bool, typer.Option("--measured", help="Free runs on public recordings too, where they are here.")
+]
+ReportFile = Annotated[
+    Path | None, typer.Option("--report", metavar="FILE", help="Write a self-contained HTML page here.")
+]
+
+
 # Joints that can have one sensor alone.
 ONE_SENSOR = ("paper", "quanser_2002", "quanser_2010")
 

@@ -299,3 +299,13 @@ def print_effects(descriptions: Sequence[Mapping[str, Any]]) -> None:
         cells = (effect["name"], effect["kind"], ", ".join(effect["ports"]), effect["equation"])
         rows.append((*cells, ", ".join(parameters)))
     print_rows(("effect", "kind", "ports", "equation", "parameters"), rows)
+
+
+def print_arena(seed: int, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Scores of methods, one row each."""
+    table = Table(title=f"Arena, seed {seed}", title_justify="left")
+    for heading in ("method", *headings):
+        table.add_column(heading, justify="left" if heading == "method" else "right")
+    for row in rows:
+        table.add_row(*map(cell, row))
+    output().print(table)

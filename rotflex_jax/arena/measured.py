@@ -1,0 +1,190 @@
+"""Every measured machine: its model, and all ways to learn from some recordings and judge on others.
+
+A machine without a model in `rotflex_jax.joints` is listed too and left out with that reason; it takes part
+as soon as there is a mechanism of its name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import rotflex_jax as rf
+
+# Of what is learnt from, the rest is for validation.
+SHARE = 0.7
+# A quarter of the Silverbox's training record is plenty for three or four effects, as in B3.
+SILVERBOX_SAMPLES = 16_000
+
+
+@dataclass(frozen=True)
+class Way:
+    """What is learnt from what, and judged on what.
+
+    Args:
+        name: of the direction.
+        train: recordings to fit.
+        validation: recordings that decide.
+        test: recordings that have no say.
+    """
+
+    name: str
+    train: tuple[rf.Recording, ...]
+    validation: tuple[rf.Recording, ...]
+    test: tuple[rf.Recording, ...]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A measured machine.
+
+    Args:
+        dataset: name in the registry.
+        preset: name of its mechanism in `rotflex_jax.joints`.
+        directions: recordings of the data set to all directions.
+        options: of the preset.
+        unit: that errors are told in.
+        factor: errors in that unit per unit of the channel.
+        solver: integration rule, where it is not the usual one.
+    """
+
+    dataset: str
+    preset: str
+    directions: Callable[[list[rf.Recording]], list[Way]]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    unit: str = "deg"
+    factor: float = math.degrees(1.0)
+    solver: rf.Exponential | None = None
+
+    def model(self) -> rf.Model | None:
+        """The textbook model; None where there is none yet."""
+        preset = getattr(rf.joints, self.preset, None)
+        if preset is None:
+            return None
+        mechanism = preset(**self.options)
+        return rf.Model(mechanism) if self.solver is None else rf.Model(mechanism, self.solver)
+
+    def ways(self) -> list[Way]:
+        """All directions; needs the recordings."""
+        return self.directions(rf.data.load_dataset(self.dataset))
+
+
+def learnt(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Way:
+    """Learnt from runs, whose ends decide, and judged on other recordings."""
+    parts = [r.split(SHARE) for r in runs]
+    return Way(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
+
+
+def halves(run: rf.Recording) -> Way:
+    """Learnt from the first half of a run and judged on the second."""
+    first, second = run.split(0.5)
+    return learnt("first half to second half", [first], [second])
+
+
+def together(runs: Sequence[rf.Recording]) -> Way:
+    """Learnt from the beginnings of all runs and judged on their ends."""
+    parts = [r.split(SHARE) for r in runs]
+    return learnt(f"first {100 * SHARE:g} % of all to the rest", [a for a, _ in parts], [b for _, b in parts])
+
+
+def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
+    """From each run to the others, then all together.
+
+    Of two runs, the end of the one that is learnt from decides, or else the first half of the other one,
+    whose second half judges. Of three, the next one decides and the third judges.
+    """
+    names, ways = list(runs), list[Way]()
+    for k, name in enumerate(names):
+        run, following = runs[name], names[(k + 1) % len(names)]
+        if len(names) == 2:
+            other = runs[following]
+            ways.append(learnt(f"{name} to {following}", [run], [other]))
+            decides, judges = other.split(0.5)
+            ways.append(Way(f"{name} and half of {following} to the rest", (run,), (decides,), (judges,)))
+        else:
+            last = {n: r for n, r in runs.items() if n not in (name, following)}
+            title = f"{name}, decided on {following}, to {' and '.join(last)}"
+            ways.append(Way(title, (run,), (runs[following],), tuple(last.values())))
+    return [*ways, together(list(runs.values()))]
+
+
+def _emps(_: list[rf.Recording]) -> list[Way]:
+    # The pulses of the test record were not measured, so that nothing is learnt from it.
+    official = rf.data.benchmark("emps")
+    return [
+        learnt("official", [official.train], list(official.tests.values())),
+        halves(official.train),
+    ]
+
+
+def _silverbox(_: list[rf.Recording]) -> list[Way]:
+    official = rf.data.benchmark("silverbox")
+    train = official.train.slice(0, SILVERBOX_SAMPLES)
+    return [learnt("official", [train], list(official.tests.values())), halves(train)]
+
+
+def by_itself(name: str, run: rf.Recording) -> Way:
+    """Learnt from the first half of a run, decided on what follows and judged on its end."""
+    train, rest = run.split(0.5)
+    decides, judges = rest.split(2 * SHARE - 1)
+    return Way(f"{name}, first half to its end", (train,), (decides,), (judges,))
+
+
+def _link(stage: int) -> Callable[[list[rf.Recording]], list[Way]]:
+    """Two runs of either stage, by LQR and by full state feedback: each by itself, and across.
+
+    They are fifteen years apart, with other friction and amplifiers: a run by itself says what a model can
+    do, and across the runs the machine is another one too.
+    """
+
+    def ways(runs: list[rf.Recording]) -> list[Way]:
+        named: dict[str, rf.Recording] = dict(zip(("lqr", "feedback"), runs[stage - 1 :: 2], strict=True))
+        return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
+
+    return ways
+
+
+def _by_gain(runs: list[rf.Recording]) -> list[Way]:
+    """Servo with four gains, three motions each: the lower gains to the highest, and back."""
+    low, high = runs[:9], runs[9:]
+    return [
+        learnt("gains 100 to 400 to gain 800", low, high),
+        learnt("gain 800 to gains 100 to 400", high, low),
+    ]
+
+
+def _elbow(runs: list[rf.Recording]) -> list[Way]:
+    """One servo of the arm: random motion to steps, and back."""
+    own = {r.source.split(",")[0]: r for r in runs if ", Elbow" in r.source}
+    random = [own["multisine"], own["prbs_excitation"]]
+    return [
+        learnt("random motion to steps", random, [own["step_response"]]),
+        learnt("steps to random motion", [own["step_response"]], random),
+    ]
+
+
+MACHINES: dict[str, Machine] = {
+    "rotflex": Machine("rotflex", "quanser_2010", lambda r: crossed(dict(zip("AB", r, strict=True)))),
+    "emps": Machine("emps", "emps", _emps, unit="mm", factor=1e3),
+    "silverbox": Machine(
+        "silverbox",
+        "silverbox",
+        _silverbox,
+        unit="mV",
+        factor=1e3,
+        solver=rf.Exponential(order=4, substeps=2, between="smooth"),
+    ),
+    "rigid_arm": Machine(
+        "rotary_arm",
+        "rotary_arm",
+        lambda r: crossed(dict(zip(("gain 6", "gain 8", "gains 1 and 3"), r[1:], strict=True))),
+    ),
+    "flexible_arm": Machine("rotary_arm", "rotary_arm", lambda r: [halves(r[0])], {"flexible": True}),
+    "two_dof_link_1": Machine("two_dof_link", "two_dof_link", _link(1), {"stage": 1}),
+    "two_dof_link_2": Machine("two_dof_link", "two_dof_link", _link(2), {"stage": 2}),
+    # Position servos: no model of their firmware yet, see the head of this file.
+    "bam_xl330": Machine("bam_xl330", "bam_xl330", _by_gain),
+    "so101": Machine("so101", "so101", _elbow),
+}
