@@ -1,4 +1,4 @@
-"""For effects that a recording cannot distinguish: the input that would, and experiments that stop by themselves."""
+"""Which effect is true: the input that would tell, and experiments that stop by themselves."""
 
 from rotflex_jax.experiment.design import next_experiment
 from rotflex_jax.experiment.result import Experiment, Rated, Segment, SequentialResult

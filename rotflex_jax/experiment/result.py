@@ -45,7 +45,7 @@ def voltage_file(
     return write_file(path, text.getvalue())
 
 
-def _plain(limits: Limits) -> dict[str, float | None]:
+def plain_limits(limits: Limits) -> dict[str, float | None]:
     """Limits as plain JSON, None where there is none."""
     return {k: v if math.isfinite(v) else None for k, v in dataclasses.asdict(limits).items()}
 
@@ -163,7 +163,7 @@ class Experiment:
             "expected": self.chosen.to_dict(),
             "table": [r.to_dict() for r in self.table],
             "effects": self.numbers,
-            "limits": _plain(self.limits),
+            "limits": plain_limits(self.limits),
             "noise": self.noise,
             "notes": list(self.notes),
         }
@@ -255,14 +255,16 @@ class Segment:
             "peaks": dict(self.peaks),
             "table": [{"input": k, "setting": s, "nats": n} for k, s, n in self.table],
             "tried": self.tried,
-            "limits": _plain(self.limits),
+            "limits": plain_limits(self.limits),
         }
 
     def __str__(self) -> str:
         peaks = ", ".join(f"{n} to {v:.3g}" for n, v in self.peaks.items())
         return (
-            f"To tell {', '.join(self.rivals)} apart: {self.input}, {self.setting}, {len(self.u) * self.Ts:g} s\n"
-            f"  after {self.repeats:g} of it a wrong answer has at most the probability {self.expected_error:.2g}\n"
+            f"To tell {', '.join(self.rivals)} apart: {self.input}, {self.setting}, "
+            f"{len(self.u) * self.Ts:g} s\n"
+            f"  after {self.repeats:g} of it a wrong answer has at most the probability "
+            f"{self.expected_error:.2g}\n"
             f"  voltage to {np.max(np.abs(self.u)):.3g} V, {peaks} predicted; best of {self.tried} inputs"
         )
 
@@ -344,8 +346,8 @@ class SequentialResult:
         if self.verdict == "decided":
             others = " or ".join(n for n in self.rivals if n != self.best)
             return (
-                f"It is {self.best} rather than {others}: probability {100 * self.probabilities[self.best]:.4g} % "
-                f"after {self.seconds:g} s on the rig."
+                f"It is {self.best} rather than {others}: probability "
+                f"{100 * self.probabilities[self.best]:.4g} % after {self.seconds:g} s on the rig."
             )
         if self.verdict == "not distinguishable":
             return self.reason
@@ -366,7 +368,7 @@ class SequentialResult:
             "seconds": self.seconds,
             "max_seconds": self.max_seconds,
             "history": [s.to_dict() for s in self.history],
-            "limits": _plain(self.limits),
+            "limits": plain_limits(self.limits),
             "notes": list(self.notes),
         }
 
@@ -379,8 +381,12 @@ class SequentialResult:
     def _repr_html_(self) -> str:
         """Verdict, and the probabilities after each segment."""
         rows = [
-            (f"{s.seconds:g}", f"{s.input}, {s.setting}", f"{s.voltage:.3g}")
-            + tuple(f"{100 * s.probabilities[n]:.3g}" for n in self.rivals)
+            (
+                f"{s.seconds:g}",
+                f"{s.input}, {s.setting}",
+                f"{s.voltage:.3g}",
+                *(f"{100 * s.probabilities[n]:.3g}" for n in self.rivals),
+            )
             for s in self.history
         ]
         return card(

@@ -160,6 +160,11 @@ class FileRig(Rig):
 
 
 def checked_limits(limits: Any) -> Limits:
+    """Limits as they are.
+
+    Raises:
+        InputError: Something else.
+    """
     if not isinstance(limits, Limits):
         raise InputError(
             f"Argument `limits` must be Limits(voltage=...), but is {checks.shown(limits)}; give what the "

@@ -43,6 +43,9 @@ CALIBRATION_SPREAD, STATE_SPREAD = 5.0, 10.0
 SHAPE_FACTORS = (0.6, 1.6)
 # Rows of one call of a batched program; more are run in turn, fewer are filled up, so nothing compiles again.
 BATCH = 16
+# Runs are filled up to at least so many samples: slopes of batches of shorter ones, which are not run in blocks
+# (`mechanism.scan`), make the compiler of JAX 0.10 write a program that crashes.
+SHORTEST_RUN = 256
 # Recordings are filled up to lengths that grow by this factor from the first.
 LENGTH_FACTOR = 4
 
@@ -56,7 +59,9 @@ def _run_with_slopes(structure, solver, values, gates, x0, K, u, y, Ts, place, d
         X, y_hat = predictor_run(structure, solver, values, gates, x0, u, y, seen, K, Ts)
         return y_hat, X[place]
 
-    along = lambda v, x: jax.jvp(run, (values, x0), (v, x))  # noqa: E731
+    def along(v: Array, x: Array) -> Any:
+        return jax.jvp(run, (values, x0), (v, x))
+
     return jax.vmap(along, out_axes=((None, None), (-1, -1)))(dvalues, dx0)
 
 
@@ -70,7 +75,7 @@ def _outputs_with_slopes(structure, solver, values, gates, x0, u, dvalues, dx0, 
     def one(values, gates, x0, u, dvalues, dx0):  # noqa: ANN001, ANN202
         run = lambda v, x: free_run(structure, solver, v, gates, x, u, Ts)[1]  # noqa: E731
         along = lambda v, x: jax.jvp(run, (values, x0), (v, x))  # noqa: E731
-        return jax.vmap(along, out_axes=(None, -1))(dvalues, dx0)
+        return jax.vmap(along, out_axes=(None, 0))(dvalues, dx0)
 
     return jax.vmap(one)(values, gates, x0, u, dvalues, dx0)
 
@@ -384,7 +389,7 @@ class RivalSet:
         return self.posterior(h, best.x, runs, place, first)
 
     def first_unknowns(self, run: RunData) -> Float[np.ndarray, " r"]:
-        """What a run has for itself where its fit starts: no offset, the pose of its first sample, no speed."""
+        """What a run has for itself where its fit starts: no offset, the pose of its first sample."""
         n, rows = self.layout.n, np.array(self.layout.output_rows)
         q = np.linalg.lstsq(rows[:, :n], run.y[0], rcond=None)[0]
         return np.concatenate([np.zeros(len(self.own)), q, np.zeros(n)])
@@ -438,7 +443,8 @@ class RivalSet:
         dx0: Float[np.ndarray, "B D n"],
     ) -> tuple[Float[np.ndarray, "B M C"], Float[np.ndarray, "B M C D"]]:
         """The same, and their slopes along directions of values and first states."""
-        return self._batched(_outputs_with_slopes, (*start, u, dvalues, dx0))
+        y, J = self._batched(_outputs_with_slopes, (*start, u, dvalues, dx0))
+        return y, np.moveaxis(J, 1, -1)
 
     def input_slopes(
         self, start: Start, u: Float[np.ndarray, "B M"], weight: Float[np.ndarray, "B M C"]
@@ -448,12 +454,12 @@ class RivalSet:
 
 
 def padded_length(N: int, first: int) -> int:
-    """The length that a recording of N samples is filled up to.
+    """The length that a recording of N samples is filled up to, `SHORTEST_RUN` or more.
 
     >>> [padded_length(N, 500) for N in (500, 501, 2001)]
     [500, 2000, 8000]
     """
-    length = first
+    length = max(first, SHORTEST_RUN)
     while length < N:
         length *= LENGTH_FACTOR
     return length
@@ -497,8 +503,8 @@ def rival_set(
         )
         if not same:
             raise InputError(
-                f"{labels[0]!r} and {label!r} differ in coordinates, ports, outputs or solver, but rival models "
-                "of one machine may differ in their effects only; build them from the same mechanism."
+                f"{labels[0]!r} and {label!r} differ in coordinates, ports, outputs or solver, but models of "
+                "one machine may differ in effects only; build them from the same mechanism."
             )
     effects: dict[tuple[str, str], Effect] = {}
     complete = [with_calibrations(m.mechanism) for m in reduced]
@@ -583,10 +589,11 @@ def _labels(names: list[str | None], models: list[Model]) -> tuple[str, ...]:
     sets = [{f"{e.name}@{e.at}" for e in m.mechanism.effects} for m in models]
     common = set.intersection(*sets)
     labels = [n or " + ".join(sorted(s - common)) or "nothing more" for n, s in zip(names, sets, strict=True)]
-    if len(set(labels)) < len(labels):
+    twice = [n for n in labels if labels.count(n) > 1]
+    if twice:
         raise InputError(
-            f"Two of the models are both {next(n for n in labels if labels.count(n) > 1)!r}, but each needs a "
-            "name or effects of its own; give name -> model."
+            f"Two of the models are both {twice[0]!r}, but each needs a name or effects of its own; give "
+            "name -> model."
         )
     return tuple(labels)
 

@@ -5,14 +5,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.discrimination import SMOOTH_MAXIMUM_EXPONENT
 from rotflex_jax.experiment.input_optimisation import PENALTY_WEIGHT, PENALTY_WIDTH, SMALLEST_ASCENT_STEP
 from rotflex_jax.experiment.result import Segment
-from rotflex_jax.experiment.rival_set import BATCH, Start
+from rotflex_jax.experiment.rival_set import BATCH, SHORTEST_RUN, Start
 from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
 
 if TYPE_CHECKING:
@@ -28,6 +27,8 @@ BEFORE, AFTER = 0.3, 0.3
 LOOK_AHEAD = 4
 # Draws from what is known of each rival's parameters; the worst counts for an input, the best for giving up.
 DRAWS = 3
+# Share of a parameter's distance to its bound that a draw leaves.
+LEFT_TO_BOUND = 0.2
 # Levels at which each standard input is tried, as shares of what the limits allow.
 LEVELS = (1.0, 0.5, 0.2)
 # Inputs that are improved by gradient, evaluations of each, and shares of the voltage limit of its steps.
@@ -47,8 +48,8 @@ class SegmentChoice:
 
     def __init__(self, e: "SequentialExperiment") -> None:
         self.e, self.r, self.limits = e, e.rivals, e.settings.limits
-        self.M, self.before = e.samples, e._before  # noqa: SLF001 - its own class
-        self.after = round(AFTER / self.r.Ts)
+        self.M, self.before = e.samples, e._before
+        self.after = max(round(AFTER / self.r.Ts), SHORTEST_RUN - self.before - self.M)
         self.p = np.maximum(e.probabilities, 1e-12)
         self.rng = np.random.default_rng([e.settings.seed, len(e.history)])
         self._prepare()
@@ -81,10 +82,10 @@ class SegmentChoice:
                 D = m + o + q
                 cov = np.zeros((D, D))
                 cov[:m, :m] = prior
-                fresh = r._precision(h, 1)[m:, m:]  # noqa: SLF001 - its own module's set
+                fresh = r._precision(h, 1)[m:, m:]
                 cov[m:, m:] = np.linalg.inv(fresh)
             v, slope = r.values_and_slopes(h, machine, own)
-            seeds, _ = r._seeds(h, slope)  # noqa: SLF001
+            seeds, _ = r._seeds(h, slope)
             dx = np.zeros((len(seeds), n))
             dx[: m + o + q] = slope_x.T
             values.append(v)
@@ -97,17 +98,21 @@ class SegmentChoice:
             loose = cov if goes_on else cov * np.outer(1 - spread, 1 - spread)
             w, V = np.linalg.eigh((loose + loose.T) / 2)
             steps = (V * np.sqrt(np.maximum(w, 0))) @ self.rng.standard_normal((len(w), DRAWS))
-            drawn.append(
-                [
-                    (
-                        r.values_and_slopes(h, machine + d[:m], own + d[m : m + o])[0],
-                        state + slope_x @ d,
-                    )
-                    for d in steps.T
-                ]
-            )
+            drawn.append([(self._likely(h, v, seeds[: len(d)].T @ d), state + slope_x @ d) for d in steps.T])
         self.values, self.x0, self.drawn = np.array(values), np.array(x0), drawn
         self.machine_own = [len(r.free[h]) + o + q for h in range(r.count)]
+
+    def _likely(self, h: int, values: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Values of a draw: a change of physical values, of which some distance to a bound is left.
+
+        A logarithm that is hardly known would grow a small effect out of all proportion.
+        """
+        out, lower, upper = values + change, self.r.transform.lower, self.r.transform.upper
+        with np.errstate(invalid="ignore"):
+            out = np.where(np.isfinite(lower), np.maximum(out, lower + LEFT_TO_BOUND * (values - lower)), out)
+            return np.where(
+                np.isfinite(upper), np.minimum(out, upper - LEFT_TO_BOUND * (upper - values)), out
+            )
 
     # -- runs --------------------------------------------------------------------------------------
 
@@ -162,7 +167,10 @@ class SegmentChoice:
     ) -> tuple[np.ndarray, Any]:
         """Expected log-likelihood by which h wins over r if h is true, after repeats of each input [nat].
 
-            T = min over d of  n/2 |L (y_h - y_r - J_r d)|^2 + 1/2 d' I_r d
+            c_r = min over d of  n/2 |L (y - y_r - J_r d)|^2 + 1/2 d' I_r d,     T = c_r - c_h
+
+        with `y` the run of h with its most probable parameters or with drawn ones, which h too must be
+        fitted to.
 
         Args:
             U: Voltages.
@@ -193,7 +201,7 @@ class SegmentChoice:
         y = y[:, inside].reshape(B, H, 1, self.M, -1)
         J = J[:, inside].reshape(B, H, *J[:, inside].shape[1:])
         true = np.concatenate([y, self.outputs(U, drawn=True)[..., : self.M, :]], axis=2) if drawn else y
-        out, details = np.zeros((len(repeats), B, H, true.shape[2], H)), [dict() for _ in range(B)]
+        out, details = np.zeros((len(repeats), B, H, true.shape[2], H)), [{} for _ in range(B)]
         root = math.sqrt(self.e.scale)
         for b in range(B):
             for other in range(H):
@@ -202,17 +210,18 @@ class SegmentChoice:
                 A = A.reshape(D, -1).T
                 G = A.T @ A
                 for h in range(H):
-                    if h == other:
+                    if h == other and not drawn:
                         continue
                     e = r.whitened(other, true[b, h] - y[b, other]) / root
                     e = e.reshape(len(e), -1)
                     c, g = np.sum(e**2, axis=1), e @ A
                     for i, n in enumerate(repeats):
                         d = np.linalg.solve(self.information[other] + n * G, n * g.T)
-                        T = 0.5 * (n * c - n * np.sum(g * d.T, axis=1))
-                        out[i, b, h, :, other] = np.where(np.isfinite(T), np.maximum(T, 0.0), 0.0)
-                    if shift:
+                        out[i, b, h, :, other] = 0.5 * n * (c - np.sum(g * d.T, axis=1))
+                    if shift and h != other:
                         details[b][h, other] = ((e[0] - A @ d[:, 0]).reshape(self.M, -1), d[:, 0])
+        own = np.einsum("ibhdh->ibhd", out)
+        out = np.nan_to_num(out - own[..., None], nan=0.0, posinf=0.0, neginf=0.0)
         if shift:
             for b in range(B):
                 details[b]["outputs"] = y[b, :, 0]
@@ -274,8 +283,8 @@ class SegmentChoice:
         U, ok = self.within_limits(U)
         if not ok.any():
             raise InputError(
-                "The machine is predicted to leave the limits on travel or deflection under the smallest voltage, "
-                "which an offset or its present motion may do; widen the limits, or bring it to rest first."
+                "The machine is predicted to leave the limits on travel or deflection under the smallest "
+                "voltage, which an offset or its motion may do; widen the limits, or bring it to rest first."
             )
         named = [(k, s, level) for level in LEVELS for (k, s, _), good in zip(named, ok, strict=True) if good]
         U = np.concatenate([level * U[ok] for level in LEVELS])
@@ -300,7 +309,7 @@ class SegmentChoice:
         top = order[0]
         peaks = self.peaks(U[top : top + 1])[0]
         label = lambda i: (named[i][0], named[i][1] + (f", x {named[i][2]:g}" if named[i][2] != 1 else ""))  # noqa: E731
-        worst = T[0, top].min(axis=1)
+        worst = np.maximum(T[0, top].min(axis=1), 0.0)
         segment = Segment(
             rivals=self.r.labels,
             u=U[top],
@@ -339,7 +348,7 @@ class SegmentChoice:
         """
         p, error, H = self.p, self.e.settings.error, self.r.count
         alive = [h for h in range(H) if p[h] > error / (10 * H)]
-        reached = T.max(axis=(0, 2))
+        reached = np.maximum(T.max(axis=(0, 2)), 0.0)
         stuck = {}
         for h in alive:
             needs = math.log((1 - error) / error) - np.log(p[h] / p)
@@ -357,9 +366,9 @@ class SegmentChoice:
         need = max(0.0, math.log((1 - error) / error) - math.log(p[h] / p[r]))
         return (
             f"No experiment within these limits distinguishes {names[h]} from {names[r]}: after "
-            f"{self.e.seconds:g} s of experiment the best of {tried} inputs ({', '.join(best)}) would "
-            f"bring at most {gain:.2g} nats in the {left * s.segment_seconds:.3g} s that are left, and {need:.2g} "
-            "are needed."
+            f"{self.e.seconds:g} s on the rig the best of {tried} inputs ({', '.join(best)}) would bring at "
+            f"most {gain:.2g} nats in the {left * s.segment_seconds:.3g} s that are left, and {need:.2g} are "
+            "needed."
         )
 
     # -- improvement by gradient -------------------------------------------------------------------

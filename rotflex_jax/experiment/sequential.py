@@ -1,14 +1,16 @@
 """Experiments that stop by themselves: a few seconds are chosen, played and judged, until it is decided.
 
-Each segment is the one after which the expected probability of a wrong answer is least; after each, the rivals
-are fitted to everything recorded so far and their probabilities follow. It ends when one is probable enough
-(Wald's sequential test), when the time is up, or when no input within the limits would decide.
+Each segment is the one after which the expected probability of a wrong answer is least; after each the
+rivals are fitted to everything recorded so far and their probabilities follow. It ends when one is probable
+enough (Wald's sequential test), when the time is up, or when no input within the limits would decide.
 """
 
 import dataclasses
 import functools
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,18 +19,21 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep
+from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, plain_limits
 from rotflex_jax.experiment.rig import Rig, checked_limits
 from rotflex_jax.experiment.rival_set import UNKNOWN_SHARE, RivalPosterior, RivalSet, RunData, rival_set
 from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
 from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.fit.greybox import fit
+from rotflex_jax.models import model_json
 from rotflex_jax.recording import Recording
+from rotflex_jax.text.files import write_file
 
 Progress = Callable[[str], None]
 
 SEGMENT_SECONDS, MOST_SECONDS, ERROR = 1.0, 60.0, 0.01
 SHORTEST_SEGMENT = 0.4
+KIND = "rotflex_jax sequential experiment"
 # Segments that are played before giving up, and times in turn that the gain must be too small.
 TRIED, IN_TURN = 2, 2
 # Segments after which fits start from other shapes of an effect too.
@@ -138,6 +143,115 @@ class SequentialExperiment:
         weight = np.exp(logs - np.max(logs))
         return weight / weight.sum()
 
+    # -- state of an experiment on disk ------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types, from which `from_dict` makes the same again, bit for bit."""
+        r, planned = self.rivals, self.planned
+        return {
+            "kind": KIND,
+            "schema": 1,
+            "models": {
+                n: model_json.to_dict(model_json.Saved(m)) for n, m in zip(r.labels, r.models, strict=True)
+            },
+            "covariances": [c.tolist() for c in r.prior_covariance],
+            "Ts": r.Ts,
+            "noise": dict(zip(r.structure.channels, r.noise.tolist(), strict=True)),
+            "process_noise": dict(r.process_noise),
+            "settings": dataclasses.asdict(self.settings) | {"limits": plain_limits(self.settings.limits)},
+            "prior": self.prior.tolist(),
+            "runs": [{"u": x.u.tolist(), "y": x.y.tolist()} for x in self.runs],
+            "unknowns": [x.tolist() for x in self.unknowns],
+            "history": [s.to_dict() for s in self.history],
+            "too_small": self.too_small,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "planned": None
+            if planned is None
+            else {
+                f.name: v.tolist() if isinstance(v := getattr(planned, f.name), np.ndarray) else v
+                for f in dataclasses.fields(planned)
+                if f.name != "limits"
+            },
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "SequentialExperiment":
+        """The experiment that `to_dict` described.
+
+        Raises:
+            InputError: It is none, or one of a later version.
+        """
+        if not isinstance(data, Mapping) or data.get("kind") != KIND or data.get("schema") != 1:
+            raise InputError(
+                "The state of a sequential experiment is needed, but the file holds something else; give one "
+                "that `rotflex experiment --state` has written."
+            )
+        try:
+            models = {n: model_json.from_dict(m).model for n, m in data["models"].items()}
+            rivals = rival_set(
+                models, Ts=data["Ts"], noise=data["noise"], process_noise=data["process_noise"]
+            )
+            covariances = tuple(np.array(c, float) for c in data["covariances"])
+            rivals = dataclasses.replace(rivals, prior_covariance=covariances)
+            given = dict(data["settings"])
+            bounds = {k: math.inf if v is None else v for k, v in given.pop("limits").items()}
+            settings = SequentialSettings(Limits(**bounds), **given)
+            planned = data["planned"]
+            if planned is not None:
+                arrays = {k: np.array(planned[k], float) for k in ("u", "nats", "outputs")}
+                tuples = {k: tuple(planned[k]) for k in ("rivals", "probabilities", "channels")}
+                table = tuple(tuple(row) for row in planned["table"])
+                planned = Segment(**(planned | arrays | tuples | {"table": table, "limits": settings.limits}))
+            channels = len(rivals.noise)
+            return cls(
+                rivals,
+                settings,
+                np.array(data["prior"], float),
+                tuple(
+                    RunData(np.array(x["u"], float), np.array(x["y"], float).reshape(-1, channels))
+                    for x in data["runs"]
+                ),
+                tuple(np.array(x, float) for x in data["unknowns"]),
+                tuple(SequentialStep(**s) for s in data["history"]),
+                int(data["too_small"]),
+                str(data["verdict"]),
+                str(data["reason"]),
+                planned,
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"The state of the experiment is incomplete or was changed by hand ({type(error).__name__}); "
+                "begin the experiment again."
+            ) from None
+
+    def save(self, path: str | Path) -> Path:
+        """Write the state as JSON; `load` reads it.
+
+        Raises:
+            InputError: The file cannot be written; an old one stays.
+        """
+        return write_file(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> "SequentialExperiment":
+        """The state that `save` has written.
+
+        Raises:
+            InputError: No such file, or none of a sequential experiment.
+        """
+        try:
+            data = json.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(
+                f"{path} cannot be read ({error.strerror}); give one that `rotflex experiment --state` wrote."
+            ) from None
+        except (ValueError, RecursionError):
+            raise InputError(
+                f"{path} is not JSON; give a file that `rotflex experiment --state` has written."
+            ) from None
+        return cls.from_dict(data)
+
     # -- the next segment --------------------------------------------------------------------------
 
     def with_next_segment(self, progress: Progress | None = None) -> "SequentialExperiment":
@@ -204,8 +318,9 @@ class SequentialExperiment:
         notes = []
         if self.history and self.scale > 4:
             notes.append(
-                f"No rival explains the recordings: what the best one leaves counts as {math.sqrt(self.scale):.1f} "
-                "times the noise of the sensors, and probabilities are among these rivals only."
+                "No rival explains the recordings: what the best one leaves counts as "
+                f"{math.sqrt(self.scale):.1f} times the noise of the sensors, and probabilities are among "
+                "these rivals only."
             )
         return SequentialResult(
             rivals=r.labels,
@@ -274,9 +389,10 @@ def _checked(recording: Any, planned: Segment, rivals: RivalSet) -> RunData:
             )
         y = y.astype(float)
     if len(y) != N or not np.all(np.isfinite(y)):
+        flaw = "" if np.all(np.isfinite(y)) else ", some not finite"
         raise InputError(
-            f"The recording has {len(y)} samples{'' if np.all(np.isfinite(y)) else ', some not finite'}, but the "
-            f"segment has {N}; record every sample of it, from its first."
+            f"The recording has {len(y)} samples{flaw}, but the segment has {N}; record every sample of it, "
+            "from its first."
         )
     return RunData(u, y)
 
@@ -357,10 +473,10 @@ def experiment_until(
     .. math::
         p_h \propto p_h^0 \int p(y \mid \vartheta, h)\, p(\vartheta \mid h)\, d\vartheta .
 
-    It stops when one has at least the probability `1 - error`: if one of the models is true, a wrong one is then
-    named with at most that probability, averaged over the probabilities beforehand (Wald's test; for two
-    models of equal probability its thresholds are those of error rates `error` each way). It stops too when
-    the time is up, and when no input within the limits would decide in the time that is left.
+    It stops when one has at least the probability `1 - error`: if one of the models is true, a wrong one is
+    then named with at most the probability `error`, averaged over the probabilities beforehand (Wald's test;
+    for two models of equal probability its thresholds are those of error rates `error` each way). It stops
+    too when the time is up, and when no input within the limits would decide in the time that is left.
 
     Not where none of the models is near the machine: probabilities are among those given.
 
@@ -393,14 +509,14 @@ def experiment_until(
     say = checks.progress(progress)
     if not isinstance(rig, Rig):
         raise InputError(
-            f"Argument `rig` must be a Rig, but is {checks.shown(rig)}; derive a class from rotflex_jax.Rig, or "
-            "use CallbackRig, SimulatedRig or FileRig."
+            f"Argument `rig` must be a Rig, but is {checks.shown(rig)}; derive a class from rotflex_jax.Rig, "
+            "or use CallbackRig, SimulatedRig or FileRig."
         )
     models, found = models_of(models, say)
     e = sequential_experiment(
         models,
-        getattr(rig, "limits", None),
-        getattr(rig, "Ts", None),
+        checked_limits(getattr(rig, "limits", None)),
+        checks.positive(getattr(rig, "Ts", None), "Ts", "s", "0.002"),
         probabilities=found if probabilities is None else probabilities,
         error=error,
         max_seconds=max_seconds,
