@@ -40,8 +40,8 @@ def known(damping: float) -> rf.Mechanism:
 @pytest.fixture(scope="module")
 def pair() -> SequentialExperiment:
     """Two servos that differ in a known damping, and the segment that is played on them."""
-    limits = rf.Limits(voltage=0.12)
-    settings = {"noise": NOISE, "segment_seconds": 0.4, "error": 0.05, "improve": False}
+    limits = rf.Limits(voltage=1.2)
+    settings = {"noise": NOISE, "segment_seconds": 0.4, "error": 0.1, "improve": False}
     models = {"light": known(0.01), "heavy": known(0.02)}
     return sequential_experiment(models, limits, TS, **settings).with_next_segment()
 
@@ -69,7 +69,6 @@ def test_probabilities_are_those_of_gaussian_integrals(pair):
     rng = np.random.default_rng(3)
     y = linear_runs(0.02, u)[0] + 2e-3 * rng.standard_normal(len(u))
     e = pair.with_recording(y[:, None])
-    assert e.scale == 1.0 or e.scale > 1
     typical = fx.VoltageOffset.declared()["offset"].typical
     prior = np.diag(np.square([CALIBRATION_SPREAD * typical, STATE_SPREAD, STATE_SPREAD]))
     logs = []
@@ -84,10 +83,10 @@ def test_probabilities_are_those_of_gaussian_integrals(pair):
 
 def test_a_wrong_answer_is_no_more_probable_than_was_asked_for(pair):
     """Wald's bound over repetitions: one of two linear models is drawn, the noise is known."""
-    rng, wrong, decided, repetitions = np.random.default_rng(11), 0, 0, 120
+    rng, wrong, decided, repetitions = np.random.default_rng(11), 0, 0, 60
     for k in range(repetitions):
         true, e, u = k % 2, pair, np.zeros(0)
-        while not e.verdict and e.seconds < 4.0:
+        while not e.verdict and e.seconds < 2.0:
             u = np.concatenate([u, pair.planned.u])
             clean = linear_runs((0.01, 0.02)[true], u)[0][-len(pair.planned.u) :]
             e = dataclasses.replace(e, planned=pair.planned)
@@ -95,7 +94,7 @@ def test_a_wrong_answer_is_no_more_probable_than_was_asked_for(pair):
         decided += e.verdict == "decided"
         wrong += e.verdict == "decided" and int(np.argmax(e.probabilities)) != true
     assert decided > 0.8 * repetitions
-    # 5 % of 120 are 6; three standard deviations more are 13.
+    # 10 % of 60 are 6; three standard deviations more are 13.
     assert wrong <= 13
 
 
@@ -105,12 +104,12 @@ def test_expected_evidence_is_found_on_average(pair):
     T, _ = choice.evidence(pair.planned.u[None], (1.0,), drawn=False)
     clean, got = linear_runs(0.02, pair.planned.u)[0], []
     rng = np.random.default_rng(5)
-    for _ in range(30):
+    for _ in range(16):
         e = pair.with_recording((clean + 2e-3 * rng.standard_normal(len(clean)))[:, None])
         got.append(np.log(e.probabilities[1] / e.probabilities[0]) * e.scale)
     expected = T[0, 0, 1, 0, 0]
     assert expected > 0.3
-    assert np.mean(got) == pytest.approx(expected, abs=4 * np.sqrt(2 * expected / 30))
+    assert np.mean(got) == pytest.approx(expected, abs=4 * np.sqrt(2 * expected / 16))
 
 
 def friction_rivals() -> dict[str, rf.Mechanism]:
