@@ -1,4 +1,4 @@
-"""How many seconds on the rig until it is decided: experiments that stop by themselves beside standard inputs.
+"""Seconds on the rig until it is decided: experiments that stop by themselves beside standard inputs.
 
     python benchmarks/B4_sequential.py --seeds 2000 2001 2002
 
@@ -7,8 +7,9 @@ says which of two or three it is. Each rival is fitted to that recording, and al
 `experiment_until` plays on the simulator, half a second at a time, until one has the probability 99 %.
 
 Beside it the standard inputs, without a pause and judged by the same rule: of each kind (multisine, binary
-sequence, sweep, steps, noise) the setting and level that the fitted models expect most of, and of these five the one that turned out fastest. They are judged at fewer moments, and the earliest possible one
-counts. Last, cases that no input within the limits can tell: does the loop say so.
+sequence, sweep, steps, noise) the setting and level that the fitted models expect most of, and of these five
+the one that turned out fastest. They are judged at fewer moments, and the earliest possible one counts.
+Last, cases that no input within the limits can tell: does the loop say so.
 
 Writes results/B4_sequential.json and results/B4_sequential.md; rows that are there are kept.
 """
@@ -29,6 +30,7 @@ from arena.scoring import renamed
 from rotflex_jax.data import excitation
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.experiment import Rig, experiment_until
+from rotflex_jax.experiment.rival_set import RunData
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import SequentialExperiment, sequential_experiment
 from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
@@ -120,7 +122,7 @@ SMALL = {
     "delay": lambda at: CATALOG["delay"](at=at, time=5e-4),
     "backlash": lambda at: CATALOG["backlash"](at=at, gap=1e-3),
     "sensor_cubic": lambda at: CATALOG["sensor_cubic"](at=at, cubic=0.1),
-    "cubic_spring": lambda at: CATALOG["cubic_spring"](at=at, coefficient=0.1),
+    "cubic_spring": lambda at: CATALOG["cubic_spring"](at=at, stiffness=0.1),
     "quadratic_drag": lambda at: CATALOG["quadratic_drag"](at=at, coefficient=2e-4),
     "dahl": lambda at: CATALOG["dahl"](at=at, level=5e-4),
 }
@@ -146,7 +148,7 @@ def standard(N: int, seed: int) -> list[tuple[str, str, np.ndarray]]:
 
 
 def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str, np.ndarray]]:
-    """Of each kind the settings and levels that the models expect most of, within the limits over all of it."""
+    """Of each kind the setting and level that the models expect most of, within the limits all the time."""
     long = SequentialExperiment(
         start.rivals, type(start.settings)(LIMITS, segment_seconds=MOST, improve=False), start.prior
     )
@@ -163,7 +165,7 @@ def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str
     worth = choice.usefulness(T[0].min(axis=2))
     chosen, taken = [], {}
     for i in np.argsort(-worth):
-        k, s, level, u = offered[i]
+        k, s, _, u = offered[i]
         if taken.get(k, 0) < PLAYED:
             taken[k] = taken.get(k, 0) + 1
             chosen.append((k, f"{s}, {np.max(np.abs(u)):.2g} V", u))
@@ -178,7 +180,7 @@ def played_standard(start: SequentialExperiment, rig: ArenaRig, u: np.ndarray) -
     unknowns: tuple = ()
     for t in MOMENTS:
         n = round(t / TS)
-        run = start_run(u[:n], y[:n])
+        run = RunData(u[:n], y[:n])
         first = r.first_unknowns(run)
         new = []
         for h in range(r.count):
@@ -192,13 +194,6 @@ def played_standard(start: SequentialExperiment, rig: ArenaRig, u: np.ndarray) -
             return {"seconds": before + SEGMENT, "decided": True, "best": r.labels[int(np.argmax(p))]}
         before = t
     return {"seconds": MOST, "decided": False, "best": r.labels[int(np.argmax(p))]}
-
-
-def start_run(u: np.ndarray, y: np.ndarray):  # noqa: ANN201
-    """A run from its arrays."""
-    from rotflex_jax.experiment.rival_set import RunData
-
-    return RunData(u, y)
 
 
 def trial(name: str, seed: int, say, hopeless: bool = False, alone: bool = False) -> dict:
@@ -250,8 +245,8 @@ def summary(rows: list[dict]) -> str:
     lines = [
         "# Seconds on the rig until it is decided",
         "",
-        f"Error probability {ERROR:g}, at most {MOST:g} s, segments of {SEGMENT:g} s; the fastest of five standard "
-        "inputs that decided rightly stands beside, `>` where none did.",
+        f"Error probability {ERROR:g}, at most {MOST:g} s, segments of {SEGMENT:g} s; the fastest of five "
+        "standard inputs that decided rightly stands beside, `>` where none did.",
         "",
         "| case | seed | the loop | seconds | best standard input | seconds | ratio |",
         "|---|---|---|---|---|---|---|",
@@ -266,17 +261,18 @@ def summary(rows: list[dict]) -> str:
         good = r["verdict"] == "decided" and right
         ratio = s["seconds"] / r["seconds"] if good else (1.0 if not s["decided"] else s["seconds"] / MOST)
         ratios.append(ratio)
+        more = "" if s["decided"] else "> "
         lines.append(
             f"| {r['case']} | {r['seed']} | {verdict} | {r['seconds']:g} | {s['input']} {s['setting']} "
-            f"| {'' if s['decided'] else '> '}{s['seconds']:g} | {'' if s['decided'] else '> '}{ratio:.1f} |"
+            f"| {more}{s['seconds']:g} | {more}{ratio:.1f} |"
         )
     if told:
         decided = sum(r["verdict"] == "decided" for r in told)
         lines += [
             "",
-            f"{len(told)} cases of 40 wanted. The loop decided {decided}, {wrong} of them wrongly; of {played} "
-            f"standard inputs {wrong_standard} decided wrongly. Median of the ratios {np.median(ratios):.1f}; median "
-            f"seconds {np.median([r['seconds'] for r in told]):.1f} beside "
+            f"{len(told)} cases of 40 wanted. The loop decided {decided}, {wrong} of them wrongly; of "
+            f"{played} standard inputs {wrong_standard} decided wrongly. Median of the ratios "
+            f"{np.median(ratios):.1f}; median seconds {np.median([r['seconds'] for r in told]):.1f} beside "
             f"{np.median([fastest(r)['seconds'] for r in told]):.1f}.",
         ]
     if lost:
@@ -284,8 +280,8 @@ def summary(rows: list[dict]) -> str:
         took = np.median([r["seconds"] for r in lost])
         lines += [
             "",
-            f"Where the limits leave nothing to see ({NARROW.voltage:g} V): {said} of {len(lost)} times it said so, "
-            f"after {took:g} s in the median; "
+            f"Where the limits leave nothing to see ({NARROW.voltage:g} V): {said} of {len(lost)} times it said "
+            f"so, after {took:g} s in the median; "
             f"{sum(r['verdict'] == 'decided' for r in lost)} times it decided.",
         ]
     return "\n".join(lines) + "\n"

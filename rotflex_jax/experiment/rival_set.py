@@ -25,6 +25,7 @@ from rotflex_jax.experiment.rival_model import with_calibrations
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
+from rotflex_jax.mechanism.validation import process_noise_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, minimise
 from rotflex_jax.parameters import Transform
@@ -43,9 +44,6 @@ CALIBRATION_SPREAD, STATE_SPREAD = 5.0, 10.0
 SHAPE_FACTORS = (0.6, 1.6)
 # Rows of one call of a batched program; more are run in turn, fewer are filled up, so nothing compiles again.
 BATCH = 16
-# Runs are filled up to at least so many samples: slopes of batches of shorter ones, which are not run in blocks
-# (`mechanism.scan`), make the compiler of JAX 0.10 write a program that crashes.
-SHORTEST_RUN = 256
 # Recordings are filled up to lengths that grow by this factor from the first.
 LENGTH_FACTOR = 4
 
@@ -72,21 +70,20 @@ def _outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN2
 
 @persistent_jit(static=2)
 def _outputs_with_slopes(structure, solver, values, gates, x0, u, dvalues, dx0, Ts):  # noqa: ANN001, ANN202
-    def one(values, gates, x0, u, dvalues, dx0):  # noqa: ANN001, ANN202
-        run = lambda v, x: free_run(structure, solver, v, gates, x, u, Ts)[1]  # noqa: E731
-        along = lambda v, x: jax.jvp(run, (values, x0), (v, x))  # noqa: E731
-        return jax.vmap(along, out_axes=(None, 0))(dvalues, dx0)
+    """Outputs (N, C) of one run, and their slopes along the last axis."""
 
-    return jax.vmap(one)(values, gates, x0, u, dvalues, dx0)
+    def along(v: Array, x: Array) -> Any:
+        run = lambda v, x: free_run(structure, solver, v, gates, x, u, Ts)[1]  # noqa: E731
+        return jax.jvp(run, (values, x0), (v, x))
+
+    return jax.vmap(along, out_axes=(None, -1))(dvalues, dx0)
 
 
 @persistent_jit(static=2)
 def _input_slopes(structure, solver, values, gates, x0, u, weight, Ts):  # noqa: ANN001, ANN202
-    def one(values, gates, x0, u, weight):  # noqa: ANN001, ANN202
-        total = lambda u: jnp.sum(weight * free_run(structure, solver, values, gates, x0, u, Ts)[1])  # noqa: E731
-        return jax.grad(total)(u)
-
-    return jax.vmap(one)(values, gates, x0, u, weight)
+    """Slope of a weighted sum of the outputs of one run along its voltage (N,)."""
+    run = lambda u: free_run(structure, solver, values, gates, x0, u, Ts)[1]  # noqa: E731
+    return jax.grad(lambda u: jnp.sum(weight * run(u)))(u)
 
 
 class Start(NamedTuple):
@@ -431,6 +428,18 @@ class RivalSet:
                 parts.append(jax.tree.map(lambda a: np.asarray(a)[: BATCH - fill], out))  # noqa: B023
         return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
+    def _each(self, program: Any, rows: Sequence[np.ndarray]) -> Any:
+        """A program of one run over several, one after the other.
+
+        Batches of batches of slopes crash as compiled by JAX 0.10 for a machine of one coordinate.
+        """
+        with double_precision():
+            Ts, found = jnp.asarray(float(self.Ts)), []
+            for row in zip(*rows, strict=True):
+                out = program(self.structure.structure, self.solver, *map(jnp.asarray, row), Ts)
+                found.append(jax.tree.map(np.asarray, out))
+        return jax.tree.map(lambda *a: np.stack(a), *found)
+
     def outputs(self, start: Start, u: Float[np.ndarray, "B M"]) -> Float[np.ndarray, "B M C"]:
         """Outputs of free runs from given states."""
         return self._batched(_outputs, (*start, u))
@@ -443,23 +452,22 @@ class RivalSet:
         dx0: Float[np.ndarray, "B D n"],
     ) -> tuple[Float[np.ndarray, "B M C"], Float[np.ndarray, "B M C D"]]:
         """The same, and their slopes along directions of values and first states."""
-        y, J = self._batched(_outputs_with_slopes, (*start, u, dvalues, dx0))
-        return y, np.moveaxis(J, 1, -1)
+        return self._each(_outputs_with_slopes, (*start, u, dvalues, dx0))
 
     def input_slopes(
         self, start: Start, u: Float[np.ndarray, "B M"], weight: Float[np.ndarray, "B M C"]
     ) -> Float[np.ndarray, "B M"]:
         """Slope of the weighted sum of the outputs along each sample of the voltage [1/V]."""
-        return self._batched(_input_slopes, (*start, u, weight))
+        return self._each(_input_slopes, (*start, u, weight))
 
 
 def padded_length(N: int, first: int) -> int:
-    """The length that a recording of N samples is filled up to, `SHORTEST_RUN` or more.
+    """The length that a recording of N samples is filled up to.
 
     >>> [padded_length(N, 500) for N in (500, 501, 2001)]
     [500, 2000, 8000]
     """
-    length = max(first, SHORTEST_RUN)
+    length = first
     while length < N:
         length *= LENGTH_FACTOR
     return length
@@ -557,7 +565,7 @@ def rival_set(
         tuple(mean),
         tuple(covariance),
         sd,
-        {p: float(q) for p, q in (process_noise or {}).items()},
+        process_noise_of(first, process_noise),
         float(Ts),
     )
 

@@ -11,7 +11,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.discrimination import SMOOTH_MAXIMUM_EXPONENT
 from rotflex_jax.experiment.input_optimisation import PENALTY_WEIGHT, PENALTY_WIDTH, SMALLEST_ASCENT_STEP
 from rotflex_jax.experiment.result import Segment
-from rotflex_jax.experiment.rival_set import BATCH, SHORTEST_RUN, Start
+from rotflex_jax.experiment.rival_set import BATCH, Start
 from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class SegmentChoice:
     def __init__(self, e: "SequentialExperiment") -> None:
         self.e, self.r, self.limits = e, e.rivals, e.settings.limits
         self.M, self.before = e.samples, e._before
-        self.after = max(round(AFTER / self.r.Ts), SHORTEST_RUN - self.before - self.M)
+        self.after = round(AFTER / self.r.Ts)
         self.p = np.maximum(e.probabilities, 1e-12)
         self.rng = np.random.default_rng([e.settings.seed, len(e.history)])
         self._prepare()
