@@ -280,8 +280,8 @@ def summary(rows: list[dict]) -> str:
         took = np.median([r["seconds"] for r in lost])
         lines += [
             "",
-            f"Where the limits leave nothing to see ({NARROW.voltage:g} V): {said} of {len(lost)} times it said "
-            f"so, after {took:g} s in the median; "
+            f"Where the limits leave nothing to see ({NARROW.voltage:g} V): {said} of {len(lost)} times it "
+            f"said so, after {took:g} s in the median; "
             f"{sum(r['verdict'] == 'decided' for r in lost)} times it decided.",
         ]
     return "\n".join(lines) + "\n"

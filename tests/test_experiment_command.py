@@ -48,7 +48,7 @@ def test_bad_input_is_one_sentence(run, changes, match, capsys):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        (["--continue", "none.json"], "no recording of its voltage"),
+        (["--continue", "none.json"], "no recording of its"),
         (["--continue", "none.json", "run.csv"], "cannot be read"),
         (["--continue", "none.json", "run.csv", "--voltage", "5"], "leave them out"),
         (["run.csv"], "belongs to --continue"),

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
@@ -124,7 +125,7 @@ class SegmentChoice:
     def _start(self, h: np.ndarray) -> Start:
         return Start(self.values[h], self.r.gates[h], self.x0[h])
 
-    def outputs(self, U: np.ndarray, drawn: bool = False) -> np.ndarray:
+    def outputs(self, U: Float[np.ndarray, "B M"], drawn: bool = False) -> Float[np.ndarray, "B H draws W C"]:
         """Outputs (B, H, 1 or draws, W, C) from the segment on."""
         B, H = len(U), self.r.count
         windows, rows, values, x0 = self._windows(U), [], [], []
@@ -139,13 +140,15 @@ class SegmentChoice:
         y = self.r.outputs(start, windows[which[:, 0]])[:, self.before :]
         return y.reshape(B, H, -1, *y.shape[1:])
 
-    def peaks(self, U: np.ndarray, drawn: bool = True) -> np.ndarray:
+    def peaks(self, U: Float[np.ndarray, "B M"], drawn: bool = True) -> Float[np.ndarray, "B C"]:
         """Largest |output| per channel (B, C), from the pose in which the run began, whichever is true."""
         runs = [self.outputs(U)] + ([self.outputs(U, drawn=True)] if drawn else [])
         most = [np.max(np.abs(y - self.pose), axis=(1, 2, 3)) for y in runs]
         return np.nan_to_num(np.max(most, axis=0), nan=np.inf)
 
-    def within_limits(self, U: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def within_limits(
+        self, U: Float[np.ndarray, "B M"]
+    ) -> tuple[Float[np.ndarray, "B M"], Bool[np.ndarray, " B"]]:
         """Voltages cut down until predicted peaks are within the limits, and which of them are."""
         U, bound = U.copy(), self.limits.outputs(len(self.pose))
         ok = np.zeros(len(U), bool)
@@ -163,8 +166,8 @@ class SegmentChoice:
     # -- information -------------------------------------------------------------------------------
 
     def evidence(
-        self, U: np.ndarray, repeats: Sequence[float], drawn: bool, shift: bool = False
-    ) -> tuple[np.ndarray, Any]:
+        self, U: Float[np.ndarray, "B M"], repeats: Sequence[float], drawn: bool, shift: bool = False
+    ) -> tuple[Float[np.ndarray, "n B H draws H"], Any]:
         """Expected log-likelihood by which h wins over r if h is true, after repeats of each input [nat].
 
             c_r = min over d of  n/2 |L (y - y_r - J_r d)|^2 + 1/2 d' I_r d,     T = c_r - c_h
@@ -227,7 +230,7 @@ class SegmentChoice:
                 details[b]["outputs"] = y[b, :, 0]
         return out, details
 
-    def bound(self, T: np.ndarray) -> np.ndarray:
+    def bound(self, T: Float[np.ndarray, "*B H H"]) -> Float[np.ndarray, "*B"]:
         """Logarithm of a bound of the probability of a wrong answer, from evidence (..., H, H).
 
             sum over pairs of  sqrt(p_h p_r) exp(-T_hr / 4)
@@ -237,15 +240,15 @@ class SegmentChoice:
         """
         terms = self._terms(T)
         top = terms.max(axis=(-1, -2), keepdims=True)
-        return np.log(np.sum(np.exp(terms - top), axis=(-1, -2))) + top[..., 0, 0]
+        return np.asarray(np.log(np.sum(np.exp(terms - top), axis=(-1, -2))) + top[..., 0, 0])
 
     def _terms(self, T: np.ndarray) -> np.ndarray:
         half = 0.5 * (np.log(self.p)[:, None] + np.log(self.p)[None, :]) - math.log(2)
         return np.where(np.eye(self.r.count, dtype=bool), -np.inf, half - T / 4)
 
-    def usefulness(self, T: np.ndarray) -> np.ndarray:
+    def usefulness(self, T: Float[np.ndarray, "*B H H"]) -> Float[np.ndarray, "*B"]:
         """Evidence (...,) that, if all pairs had it, would give the same bound [nat]."""
-        return 4 * (self.bound(np.zeros((self.r.count,) * 2)) - self.bound(T))
+        return np.asarray(4 * (self.bound(np.zeros((self.r.count,) * 2)) - self.bound(T)))
 
     # -- choice ------------------------------------------------------------------------------------
 
