@@ -108,6 +108,10 @@ TABLES = {
     **dict.fromkeys(["from_matlab.md", "troubleshooting.md", "design.md", "cite.md"], ()),
 }
 KNOWN = {
+    "next_experiment.md": {
+        "2.3": "median of the ratios that B4_sequential.md prints",
+        **dict.fromkeys(["0.01", "0.5", "0.3", "0.2"], "error, segment, limits and sizes, settings"),
+    },
     "kernels.md": {
         **dict.fromkeys(["0.03", "0.003", "0.045", "0.015"], "levels of friction, settings [N m]"),
         **dict.fromkeys(["0.1", "1.5", "0.3", "0.25"], "dead zones, limit, offset, settings [V]"),
