@@ -65,7 +65,8 @@ def _run_with_slopes(structure, solver, values, gates, x0, K, u, y, Ts, place, d
 
 @persistent_jit(static=2)
 def _outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN202 - as `free_run`, in batches
-    return jax.vmap(lambda *row: free_run(structure, solver, *row, Ts)[1])(values, gates, x0, u)
+    one = lambda v, g, x, u: free_run(structure, solver, v, g, x, u, Ts)[1]  # noqa: E731
+    return jax.vmap(one)(values, gates, x0, u)
 
 
 @persistent_jit(static=2)
