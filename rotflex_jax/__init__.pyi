@@ -22,7 +22,18 @@ from .discover import (
     locate as locate,
 )
 from .errors import InputError as InputError
-from .experiment import Experiment as Experiment, Limits as Limits, next_experiment as next_experiment
+from .experiment import (
+    CallbackRig as CallbackRig,
+    Experiment as Experiment,
+    FileRig as FileRig,
+    Limits as Limits,
+    Rig as Rig,
+    Segment as Segment,
+    SequentialResult as SequentialResult,
+    SimulatedRig as SimulatedRig,
+    experiment_until as experiment_until,
+    next_experiment as next_experiment,
+)
 from .fit import (
     Bands as Bands,
     Fit as Fit,

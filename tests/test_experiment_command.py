@@ -45,6 +45,59 @@ def test_bad_input_is_one_sentence(run, changes, match, capsys):
     assert match in told and told.startswith("rotflex: ") and "\n" not in told
 
 
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (["--continue", "none.json"], "no recording of its"),
+        (["--continue", "none.json", "run.csv"], "cannot be read"),
+        (["--continue", "none.json", "run.csv", "--voltage", "5"], "leave them out"),
+        (["run.csv"], "belongs to --continue"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5"], "--fit is missing"),
+        (["--fit", "run.csv", "--voltage", "5"], "--between is missing"),
+        (
+            ["--fit", "run.csv", "--between", "a", "b", "--voltage", "5", "--or", "lag@input"],
+            "--state only",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_said_in_a_sentence(arguments, match, capsys):
+    assert called(*arguments) == 2
+    told = capsys.readouterr().err.strip()
+    assert match in told and told.startswith("rotflex: ") and "\n" not in told
+
+
+def test_a_state_that_is_none_is_said_in_a_sentence(run, tmp_path, capsys):
+    for text, match in (
+        ("{", "is not JSON"),
+        ("{}", "holds something else"),
+        ("[1]", "holds something else"),
+    ):
+        (tmp_path / "state.json").write_text(text)
+        assert called("--continue", tmp_path / "state.json", run) == 2
+        assert match in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_an_experiment_goes_on_one_command_at_a_time(run, tmp_path, capsys):
+    """Voltages are played on the independent simulator, from rest each time, until the delay is found."""
+    state, between = tmp_path / "state.json", ["--between", "delay@input", "lag@input"]
+    limits = ["--voltage", 6, "--deflection", 10, "--rank-only", "--json", "-"]
+    assert called("--fit", run, *between, *limits, "--state", state) == 0
+    for k in range(8):
+        told = json.loads(capsys.readouterr().out)
+        if told["next"] is None:
+            break
+        u = np.loadtxt(told["next"]["file"], delimiter=",", skiprows=2)[:, 1]
+        assert np.max(np.abs(u)) <= 6.0 and told["next"]["file"].endswith(f"_{k + 1:03d}.csv")
+        truth = {("delay", "input"): {"time": 0.006}}
+        y = make_record(truth, seed=110, fs=200.0, played=u)["y"]
+        answer = save_csv(rf.Recording(u=u, y=y, Ts=0.005, accept=("saturated",)), tmp_path / "answer.csv")
+        assert called("--continue", state, answer, "--accept", "saturated", "--json", "-") == 0
+    assert told["verdict"] == "decided" and told["best"] == "delay@input"
+    assert called("--continue", state, answer) == 2
+    assert "has ended" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_best_standard_input_is_written(run, tmp_path, capsys):
     file, picture = tmp_path / "next.csv", tmp_path / "next.png"

@@ -221,15 +221,41 @@ OwnEffects = Annotated[
 
 # rotflex experiment
 AmbiguousFiles = Annotated[
-    list[Path],
+    list[Path] | None,
     typer.Option("--fit", metavar="FILE", help="Recording in which the two look alike; may be repeated."),
 ]
 Between = Annotated[
-    tuple[str, str],
+    tuple[str, str] | None,
     typer.Option("--between", metavar="EFFECT@PORT EFFECT@PORT", help="The two: delay@input lag@input."),
 ]
 Voltage = Annotated[
-    float, typer.Option("--voltage", metavar="V", help="Largest voltage the amplifier gives.")
+    float | None, typer.Option("--voltage", metavar="V", help="Largest voltage the amplifier gives.")
+]
+Played = Annotated[
+    Path | None,
+    typer.Argument(metavar="[RECORDING]", help="With --continue: what was recorded of the last voltage."),
+]
+Also = Annotated[
+    list[str] | None,
+    typer.Option("--or", metavar="EFFECT@PORT", help="With --state: a third possibility; may be repeated."),
+]
+State = Annotated[
+    Path | None,
+    typer.Option(
+        "--state", metavar="JSON", help="Begin an experiment that stops by itself, and keep its state here."
+    ),
+]
+GoOn = Annotated[
+    Path | None,
+    typer.Option(
+        "--continue", metavar="JSON", help="Go on from this state with RECORDING: the next voltage."
+    ),
+]
+ErrorProbability = Annotated[
+    float, typer.Option("--error", metavar="SHARE", help="Probability of a wrong answer at which it stops.")
+]
+MostSeconds = Annotated[
+    float, typer.Option("--max-seconds", metavar="SECONDS", help="Time on the rig at which it stops.")
 ]
 Slew = Annotated[float, typer.Option("--slew", metavar="V/S", help="Fastest change of the voltage.")]
 Travel = Annotated[float, typer.Option("--travel", metavar="DEG", help="Largest servo angle from the start.")]

@@ -1,4 +1,4 @@
-"""`rotflex experiment`: the input that distinguishes two effects."""
+"""`rotflex experiment`: the input that distinguishes effects, all at once or a few seconds at a time."""
 
 import io
 import json
@@ -17,9 +17,10 @@ FIGURE_ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 
 @given.reads_files
 def experiment(
-    fit: given.AmbiguousFiles,
-    between: given.Between,
-    voltage: given.Voltage,
+    recording: given.Played = None,
+    fit: given.AmbiguousFiles = None,
+    between: given.Between = None,
+    voltage: given.Voltage = None,
     slew: given.Slew = math.inf,
     travel: given.Travel = math.inf,
     deflection: given.Deflection = math.inf,
@@ -30,29 +31,54 @@ def experiment(
     save: given.InputFile = None,
     plot: given.PlotFile = None,
     json_file: given.JsonFile = None,
+    further: given.Also = None,
+    state: given.State = None,
+    go_on: given.GoOn = None,
+    error: given.ErrorProbability = 0.01,
+    max_seconds: given.MostSeconds = 60.0,
     *,
     columns: given.Columns,
 ) -> None:
-    """Design the input that distinguishes two effects which a recording cannot."""
+    """Design the input that distinguishes two effects which a recording cannot.
+
+    With --state it becomes an experiment that stops by itself: play the voltage that is written, then call it
+    again with --continue STATE.json RECORDING, until it says what is true or that nothing would tell.
+    """
+    if go_on is not None:
+        _continued(go_on, recording, columns, save, json_file, (fit, between, voltage, state))
+        return
+    if recording is not None:
+        raise InputError(
+            f"{recording} was given as what was recorded, but that belongs to --continue; name the state too."
+        )
+    for value, option, example in ((fit, "--fit", "run.csv"), (voltage, "--voltage", "6")):
+        if value is None:
+            raise InputError(f"{option} is missing; write for instance {option} {example}.")
+    if between is None:
+        raise InputError("--between is missing; write for instance --between delay@input lag@input.")
+    assert fit is not None and voltage is not None
+    if further and state is None:
+        raise InputError("--or was given, but more than two are told apart with --state only; add it.")
     given.check_distinct(fit, [])
-    for file in (save, plot, json_file):
+    for file in (save, plot, json_file, state):
         given.check_writable(json_file=file)
     if plot is not None and plot.suffix not in FIGURE_ENDINGS:
         raise InputError(
             f"{plot} has the ending {plot.suffix or '(none)'}, but a figure is written as "
             f"{', '.join(FIGURE_ENDINGS)}; choose one of these."
         )
-    if given.STDOUT in (save, plot):
+    if given.STDOUT in (save, plot, state):
         raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
     model = by_name.model(joint, add or ())
     model, columns = columns.of(model)
-    first, second = (by_name.effect(text) for text in between)
+    first, second, *others = (by_name.effect(text) for text in (*between, *(further or ())))
     if (first.name, first.at) == (second.name, second.at):
         raise InputError(f"--between was given {between[0]} twice, but needs two effects; name another.")
     limits = _limits(voltage, slew, travel, deflection)
     recordings = [columns.load(file) for file in fit]
     longest = max(recordings, key=lambda r: r.N)
-    _check_length(seconds, longest.Ts)
+    if state is None:
+        _check_length(seconds, longest.Ts)
     terminal.print_findings(recordings)
     from rotflex_jax.runtime.xla import enable_fast_start
 
@@ -60,6 +86,26 @@ def experiment(
     import rotflex_jax as rf
     from rotflex_jax.experiment import next_experiment
 
+    if state is not None:
+        from rotflex_jax.experiment.sequential import sequential_experiment
+
+        with terminal.progress("Designing") as step:
+            models = {}
+            for effect in (first, second, *others):
+                step(f"fitting the model with {effect.name}@{effect.at}")
+                models[f"{effect.name}@{effect.at}"] = rf.fit(model + effect, recordings, progress=step)
+            begun = sequential_experiment(
+                models,
+                limits,
+                longest.Ts,
+                error=error,
+                max_seconds=max_seconds,
+                continues=False,
+                improve=not rank_only,
+            )
+            begun = begun.with_next_segment(step)
+        _report(begun, state, save, json_file)
+        return
     with terminal.progress("Designing") as step:
         step(f"fitting the model with {between[0]}")
         fitted = rf.fit(model + first, recordings, progress=step)
@@ -100,6 +146,63 @@ def experiment(
     for path in (save, plot):
         if path is not None:
             terminal.message(f"Written: {path}")
+
+
+def _continued(
+    state: Path, recording: Path | None, columns: Any, save: Path | None, json_file: Path | None, beside: Any
+) -> None:
+    """One step of an experiment that stops by itself: what was recorded in, the next voltage out."""
+    from rotflex_jax.experiment.sequential import SequentialExperiment
+
+    if recording is None:
+        raise InputError(
+            f"--continue was given {state}, but no recording of its last voltage; name that too."
+        )
+    if any(value is not None for value in beside):
+        raise InputError(
+            "--continue was given with --fit, --between, --voltage or --state, but the state has these; "
+            "leave them out."
+        )
+    for file in (save, json_file):
+        given.check_writable(json_file=file)
+    if save == given.STDOUT:
+        raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
+    e = SequentialExperiment.load(state)
+    if e.verdict:
+        raise InputError(f"{state} has ended ({e.verdict}); begin another experiment with --state.")
+    _, columns = columns.of(e.rivals.models[0])
+    from rotflex_jax.runtime.xla import enable_fast_start
+
+    enable_fast_start()
+    played = columns.load(recording)
+    with terminal.progress("Judging") as step:
+        e = e.with_recording(played).with_next_segment(step)
+    _report(e, state, save, json_file)
+
+
+def _report(e: Any, state: Path, save: Path | None, json_file: Path | None) -> None:
+    """Keep the state, write the next voltage, say how it stands."""
+    result, voltage = e.result(), None
+    if e.planned is not None:
+        voltage = save or state.with_name(f"{state.stem}_{len(e.history) + 1:03d}.csv")
+        e.planned.save_csv(voltage)
+    e.save(state)
+    told = result.to_dict() | {
+        "state": str(state),
+        "next": None if e.planned is None else e.planned.to_dict(str(voltage)),
+    }
+    if json_file == given.STDOUT:
+        print(json.dumps(told, indent=2), flush=True)
+        return
+    terminal.output().print(str(result) if e.planned is None else result.sentence, markup=False)
+    if e.planned is not None:
+        terminal.output().print(str(e.planned), markup=False)
+        terminal.message(
+            f"Written: {voltage}; play it from rest and record it, then: "
+            f"rotflex experiment --continue {state} RECORDING"
+        )
+    if json_file is not None:
+        write_file(json_file, json.dumps(told, indent=2) + "\n")
 
 
 def _write_files(found: Any, save: Path | None, plot: Path | None) -> None:

@@ -1,7 +1,21 @@
-"""For two effects that a recording cannot distinguish: the input that would."""
+"""Which effect is true: the input that would tell, and experiments that stop by themselves."""
 
 from rotflex_jax.experiment.design import next_experiment
-from rotflex_jax.experiment.result import Experiment, Rated
+from rotflex_jax.experiment.result import Experiment, Rated, Segment, SequentialResult
+from rotflex_jax.experiment.rig import CallbackRig, FileRig, Rig, SimulatedRig
+from rotflex_jax.experiment.sequential import experiment_until
 from rotflex_jax.experiment.standard_inputs import Limits
 
-__all__ = ["Experiment", "Limits", "Rated", "next_experiment"]
+__all__ = [
+    "CallbackRig",
+    "Experiment",
+    "FileRig",
+    "Limits",
+    "Rated",
+    "Rig",
+    "Segment",
+    "SequentialResult",
+    "SimulatedRig",
+    "experiment_until",
+    "next_experiment",
+]

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +16,11 @@ from rotflex_jax.experiment.discrimination import (
     starts_with_other_shapes,
 )
 from rotflex_jax.experiment.input_optimisation import MAX_EVALUATIONS, optimise_input
-from rotflex_jax.experiment.result import Experiment, Rated
+from rotflex_jax.experiment.result import Experiment, Rated, Segment
 from rotflex_jax.experiment.rival_fit import best_rival_fit, free_run_from_rest
 from rotflex_jax.experiment.rival_model import RivalModel, effect_location, rival_model
+from rotflex_jax.experiment.segment_choice import SegmentChoice
+from rotflex_jax.experiment.sequential import models_of, sequential_experiment
 from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
@@ -33,6 +35,7 @@ DESIGN_PERIOD = 4.0
 DEFAULT_UNCERTAINTY = 0.05
 
 
+@overload
 def next_experiment(
     model: Fit | Model | Mechanism,
     a: Any,
@@ -48,8 +51,42 @@ def next_experiment(
     starts: int = 2,
     looks: int = MAX_EVALUATIONS,
     progress: Progress | None = None,
-) -> Experiment:
-    """The input that best distinguishes two effects, within the limits of the machine.
+) -> Experiment: ...
+
+
+@overload
+def next_experiment(
+    model: Any,
+    *,
+    limits: Limits,
+    seconds: float = 20.0,
+    Ts: float = 0.002,
+    noise: Mapping[str, float] | None = None,
+    process_noise: Mapping[str, float] | None = None,
+    improve: bool = True,
+    probabilities: Any = None,
+    progress: Progress | None = None,
+) -> Segment: ...
+
+
+def next_experiment(
+    model: Any,
+    a: Any = None,
+    b: Any = None,
+    *,
+    limits: Limits,
+    seconds: float = 20.0,
+    Ts: float = 0.002,
+    noise: Mapping[str, float] | None = None,
+    process_noise: Mapping[str, float] | None = None,
+    reference: Float[np.ndarray, " N"] | None = None,
+    improve: bool = True,
+    starts: int = 2,
+    looks: int = MAX_EVALUATIONS,
+    probabilities: Any = None,
+    progress: Progress | None = None,
+) -> Experiment | Segment:
+    """The input that best distinguishes two effects, or several models, within the limits of the machine.
 
         maximise over u   min over (A true, B true)  min over n  1/2 sum_k |L (y_k(u) - y_hat_k(u; n))|^2
 
@@ -62,8 +99,13 @@ def next_experiment(
     differences, at frequencies that the recording may not contain. Compare with the standard inputs in
     `table`, which demand less of the model.
 
+    With models alone (name -> `Fit` or `Model`, a list of them, or the result of a search), all of them are
+    told apart: the input after which a wrong answer is least probable, for the worst of a few draws of what
+    is not known of their parameters, as each step of `experiment_until` chooses it.
+
     Args:
-        model: Fitted model, with one of the effects or with neither; a `Fit` brings noise and intervals.
+        model: Fitted model, with one of the effects or with neither; a `Fit` brings noise and intervals. Or
+            several models, without `a` and `b`.
         a: The first effect: "delay@input", ("delay", "input") or an effect with its parameters. An effect
             that is in the model has the model's parameters; one that is only named is fitted to the other
             under `reference`; if both are only named, the first has the catalogue's parameters.
@@ -77,10 +119,11 @@ def next_experiment(
         improve: Whether to optimise the best standard inputs, or only to rank them.
         starts: Standard inputs to optimise.
         looks: Evaluations of each optimisation at most.
+        probabilities: Of several models beforehand, by name or in their order.
         progress: Called with a line of text now and then.
 
     Returns:
-        Experiment.
+        Experiment, of several models a Segment.
 
     Raises:
         InputError: Unknown or equal effects, no noise, or an impossible length.
@@ -88,6 +131,26 @@ def next_experiment(
     Source: Atkinson and Fedorov 1975 (T-optimality, Biometrika 62); Pasch-Hausdorff envelopes for the slew.
     """
     say = checks.progress(progress)
+    if a is None and b is None and not isinstance(model, Fit | Model | Mechanism):
+        sample_counts(seconds, Ts)
+        models, found = models_of(model, say)
+        several = sequential_experiment(
+            models,
+            limits,
+            Ts,
+            probabilities=found if probabilities is None else probabilities,
+            max_seconds=seconds,
+            segment_seconds=seconds,
+            noise=noise,
+            process_noise=process_noise,
+            improve=improve,
+        )
+        return SegmentChoice(several).best(say)[0]
+    if a is None or b is None:
+        raise InputError(
+            "Two effects must be named where one model is given, such as 'delay@input' and 'lag@input'; or "
+            "give several models."
+        )
     fitted = model.model if isinstance(model, Fit) else Model.of(model)
     if not isinstance(limits, Limits):
         raise InputError(

@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rotflex_jax.experiment.result import Experiment
-from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, INK
+from rotflex_jax.experiment.result import Experiment, Segment, SequentialResult
+from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, FURTHER, INK
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled, thinned
 
 # Seconds of the input, and of the differences, that are drawn sample by sample.
@@ -77,3 +77,58 @@ def _evidence(ax: Axes, e: Experiment, c: int, channel: str) -> None:
         ax.plot(*thinned(e.t, nats), color=colour, lw=1.4, ls=style)
     ax.set_title(f"evidence in {channel} so far")
     ax.set_ylabel("log-likelihood [nat]")
+
+
+def _rival_colours(count: int) -> tuple[str, ...]:
+    """One colour for each rival."""
+    known = (FINAL, BASELINE, *FURTHER)
+    return tuple(known[k % len(known)] for k in range(count))
+
+
+@styled
+def segment_figure(s: Segment) -> Figure:
+    """The next input, and how what each model predicts for it differs from their mean."""
+    figure = blank(10.0, 2.4 + 1.7 * len(s.channels))
+    axes = figure.subplots(1 + len(s.channels), 1, sharex=True)
+    axes[0].step(s.t, s.u, where="post", color=INK, lw=0.9)
+    axes[0].set_title(f"{s.input}, {s.setting}")
+    axes[0].set_ylabel("voltage [V]")
+    for c, (ax, channel) in enumerate(zip(axes[1:], s.channels, strict=True)):
+        mean = s.outputs[:, :, c].mean(axis=0)
+        for name, y, colour in zip(s.rivals, s.outputs[:, :, c], _rival_colours(len(s.rivals)), strict=True):
+            ax.plot(*thinned(s.t, 1e3 * (y - mean)), color=colour, lw=1.2, label=name)
+        ax.set_title(f"{channel}, less the mean of the models")
+        ax.set_ylabel(f"{channel} [mrad]")
+    axes[-1].set_xlabel("time [s]")
+    legend_above(figure, axes[1:])
+    return figure
+
+
+@styled
+def sequential_figure(r: SequentialResult) -> Figure:
+    """Probability of each model over the seconds on the rig, the voltage, and what was recorded."""
+    channels = r.runs[0].channels if r.runs else ()
+    figure = blank(10.0, 4.2 + 1.5 * len(channels))
+    axes = figure.subplots(2 + len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    seconds = [0.0, *(s.seconds for s in r.history)]
+    for name, colour in zip(r.rivals, _rival_colours(len(r.rivals)), strict=True):
+        p = [r.prior[name], *(s.probabilities[name] for s in r.history)]
+        axes[0].plot(seconds, [100 * x for x in p], color=colour, marker="o", ms=3.5, lw=1.3, label=name)
+    axes[0].axhline(100 * (1 - r.error), color=FAINT, lw=1.0, ls="--")
+    axes[0].set_ylim(-3, 103)
+    axes[0].set_ylabel("probability [%]")
+    axes[0].set_title(f"{r.verdict} (dashed: where it stops)")
+    began = 0.0
+    for run in r.runs:
+        t = began + run.t - run.t[0]
+        axes[1].plot(*thinned(t, run.u.astype(float)), color=INK, lw=0.8)
+        for ax, y in zip(axes[2:], run.y.T, strict=True):
+            ax.plot(*thinned(t, 1e3 * y.astype(float)), color=INK, lw=0.8)
+        began += run.N * run.Ts
+    axes[1].set_ylabel("voltage [V]")
+    units = r.runs[0].units if r.runs else ()
+    for ax, channel, unit in zip(axes[2:], channels, units, strict=True):
+        ax.set_ylabel(f"{channel} [m{unit}]")
+    axes[-1].set_xlabel("time on the rig [s]")
+    legend_above(figure, axes[:1])
+    return figure

@@ -12,8 +12,42 @@ from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.recording import Recording
 from rotflex_jax.text.files import write_file
+from rotflex_jax.text.markup import bullets, card, paragraph, table
 from rotflex_jax.text.plain import one_line
+
+
+def voltage_file(
+    path: str | os.PathLike[str], u: Float[np.ndarray, " N"], Ts: float, purpose: str = ""
+) -> Path:
+    """Write a voltage to play: a comment with the units, then `t,voltage`.
+
+    Args:
+        path: Of the file.
+        u: Voltage [V].
+        Ts: Sampling period [s].
+        purpose: What it is for, in the comment.
+
+    Raises:
+        InputError: The folder does not exist, or the file cannot be written; an old one stays.
+    """
+    path = Path(path)
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise InputError(
+            f"{path} cannot be written, since it is a folder or in one that does not exist; name a file "
+            "in a folder that is there."
+        )
+    head = f"# t in s, voltage in V, each held for {Ts:g} s{'; ' * bool(purpose)}{purpose}\nt,voltage"
+    rows = np.column_stack([Ts * np.arange(len(u)), u])
+    form = ["%.15g", "%.17g"]
+    np.savetxt(text := io.StringIO(), rows, fmt=form, delimiter=",", header=head, comments="")
+    return write_file(path, text.getvalue())
+
+
+def plain_limits(limits: Limits) -> dict[str, float | None]:
+    """Limits as plain JSON, None where there is none."""
+    return {k: v if math.isfinite(v) else None for k, v in dataclasses.asdict(limits).items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,21 +142,7 @@ class Experiment:
         Raises:
             InputError: The folder does not exist, or the file cannot be written; an old one stays.
         """
-        path = Path(path)
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            raise InputError(
-                f"{path} cannot be written, since it is a folder or in one that does not exist; name a file "
-                "in a folder that is there."
-            )
-        head = (
-            f"# t in s, voltage in V, each held for {self.Ts:g} s; "
-            f"tells {one_line(' from '.join(self.separates))}\n"
-            "t,voltage"
-        )
-        rows = np.column_stack([self.t, self.u])
-        form = ["%.15g", "%.17g"]
-        np.savetxt(text := io.StringIO(), rows, fmt=form, delimiter=",", header=head, comments="")
-        return write_file(path, text.getvalue())
+        return voltage_file(path, self.u, self.Ts, f"tells {one_line(' from '.join(self.separates))}")
 
     def plot(self) -> Any:
         """Figure: input in time, its spectrum, predicted difference of the two against sensor noise."""
@@ -132,7 +152,6 @@ class Experiment:
 
     def to_dict(self, file: str | None = None) -> dict[str, Any]:
         """Plain JSON types; `file` is where the input was written."""
-        limits = {k: v if math.isfinite(v) else None for k, v in dataclasses.asdict(self.limits).items()}
         return {
             "separates": list(self.separates),
             "input": self.chosen.input,
@@ -144,7 +163,7 @@ class Experiment:
             "expected": self.chosen.to_dict(),
             "table": [r.to_dict() for r in self.table],
             "effects": self.numbers,
-            "limits": limits,
+            "limits": plain_limits(self.limits),
             "noise": self.noise,
             "notes": list(self.notes),
         }
@@ -160,3 +179,226 @@ class Experiment:
             f"  voltage to {c.voltage:.3g} V, slew to {c.slew:.3g} V/s, {peaks} rad predicted",
         ]
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+
+
+@dataclasses.dataclass(frozen=True)
+class Segment:
+    """The next seconds on the rig: the input after which a wrong answer is least probable.
+
+    Attributes:
+        rivals: Names of the models.
+        u: Voltage [V], held over each sample.
+        Ts: Sampling period [s].
+        input: `noise`, `multisine`, `prbs`, `steps`, `sweep`, or `design`.
+        setting: Its parameters in words.
+        nats: Entry (h, r): log-likelihood by which h is expected to win over r if h is true, after
+            `repeats` of it and for the worst of a few draws of the parameters [nat].
+        expected_error: Bound of the probability of a wrong answer after them, at most 0.5.
+        probabilities: Of the models before it.
+        repeats: How often it is repeated in these numbers.
+        peaks: Channel -> largest predicted |output|.
+        table: Kind, setting and worth [nat] of the best inputs that were compared, best first.
+        tried: How many were compared.
+        limits: Of the machine.
+        outputs: Predicted by each model.
+        channels: Names of the outputs.
+    """
+
+    rivals: tuple[str, ...]
+    u: Float[np.ndarray, " N"]
+    Ts: float
+    input: str
+    setting: str
+    nats: Float[np.ndarray, "H H"]
+    expected_error: float
+    probabilities: tuple[float, ...]
+    repeats: float
+    peaks: dict[str, float]
+    table: tuple[tuple[str, str, float], ...]
+    tried: int
+    limits: Limits
+    outputs: Float[np.ndarray, "H N C"]
+    channels: tuple[str, ...]
+
+    @property
+    def t(self) -> Float[np.ndarray, " N"]:
+        """Time of every sample [s]."""
+        return self.Ts * np.arange(len(self.u))
+
+    def save_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write the input: a comment with the units, then `t,voltage`.
+
+        Raises:
+            InputError: The folder does not exist, or the file cannot be written; an old one stays.
+        """
+        return voltage_file(path, self.u, self.Ts, f"tells {one_line(' from '.join(self.rivals))}")
+
+    def plot(self) -> Any:
+        """Figure: the input, and what each model predicts for it less their mean."""
+        from rotflex_jax.experiment.figure import segment_figure  # the layer above, on request
+
+        return segment_figure(self)
+
+    def to_dict(self, file: str | None = None) -> dict[str, Any]:
+        """Plain JSON types; `file` is where the input was written."""
+        return {
+            "separates": list(self.rivals),
+            "input": self.input,
+            "setting": self.setting,
+            "file": file,
+            "seconds": len(self.u) * self.Ts,
+            "Ts": self.Ts,
+            "nats": self.nats.tolist(),
+            "expected_error": self.expected_error,
+            "probabilities": list(self.probabilities),
+            "repeats": self.repeats,
+            "peaks": dict(self.peaks),
+            "table": [{"input": k, "setting": s, "nats": n} for k, s, n in self.table],
+            "tried": self.tried,
+            "limits": plain_limits(self.limits),
+        }
+
+    def __str__(self) -> str:
+        peaks = ", ".join(f"{n} to {v:.3g}" for n, v in self.peaks.items())
+        return (
+            f"To tell {', '.join(self.rivals)} apart: {self.input}, {self.setting}, "
+            f"{len(self.u) * self.Ts:g} s\n"
+            f"  after {self.repeats:g} of it a wrong answer has at most the probability "
+            f"{self.expected_error:.2g}\n"
+            f"  voltage to {np.max(np.abs(self.u)):.3g} V, {peaks} predicted; best of {self.tried} inputs"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class SequentialStep:
+    """One segment of a sequential experiment, after it was played.
+
+    Attributes:
+        seconds: Time on the rig so far [s].
+        input: Kind of the input.
+        setting: Its parameters in words.
+        voltage: Peak [V].
+        expected_error: Bound of the probability of a wrong answer that was expected beforehand.
+        probabilities: Name -> probability of each model now.
+        misfit: What the best model leaves, in units of the noise, at least 1.
+    """
+
+    seconds: float
+    input: str
+    setting: str
+    voltage: float
+    expected_error: float
+    probabilities: dict[str, float]
+    misfit: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return dataclasses.asdict(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class SequentialResult:
+    """What a sequential experiment has shown.
+
+    Attributes:
+        rivals: Names of the models.
+        verdict: `decided`, `time is up`, `not distinguishable`, or `going on`.
+        probabilities: Name -> probability of each model.
+        prior: The same before the first segment.
+        error: Probability of a wrong answer at which it stops.
+        max_seconds: Time at which it stops [s].
+        seconds: Time on the rig [s].
+        history: One entry for each segment.
+        runs: What was played and recorded, each run without a pause.
+        limits: Of the machine.
+        reason: Why no experiment would decide, if so.
+        notes: What a reader must know.
+    """
+
+    rivals: tuple[str, ...]
+    verdict: str
+    probabilities: dict[str, float]
+    prior: dict[str, float]
+    error: float
+    max_seconds: float
+    seconds: float
+    history: tuple[SequentialStep, ...]
+    runs: tuple[Recording, ...]
+    limits: Limits
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def best(self) -> str:
+        """The most probable model."""
+        return max(self.probabilities, key=lambda n: self.probabilities[n])
+
+    @property
+    def standing(self) -> str:
+        """Probabilities in words."""
+        ordered = sorted(self.probabilities.items(), key=lambda item: -item[1])
+        listed = ", ".join(f"{n} {100 * p:.3g} %" for n, p in ordered)
+        return f"after {self.seconds:g} s: {listed}"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in a sentence."""
+        if self.verdict == "decided":
+            others = " or ".join(n for n in self.rivals if n != self.best)
+            return (
+                f"It is {self.best} rather than {others}: probability "
+                f"{100 * self.probabilities[self.best]:.4g} % after {self.seconds:g} s on the rig."
+            )
+        if self.verdict == "not distinguishable":
+            return self.reason
+        if self.verdict == "time is up":
+            return f"{self.seconds:g} s on the rig did not decide ({self.standing.split(': ', 1)[1]})."
+        return f"Nothing is decided yet, {self.standing}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "rivals": list(self.rivals),
+            "verdict": self.verdict,
+            "best": self.best,
+            "sentence": self.sentence,
+            "probabilities": dict(self.probabilities),
+            "prior": dict(self.prior),
+            "error": self.error,
+            "seconds": self.seconds,
+            "max_seconds": self.max_seconds,
+            "history": [s.to_dict() for s in self.history],
+            "limits": plain_limits(self.limits),
+            "notes": list(self.notes),
+        }
+
+    def plot(self) -> Any:
+        """Figure: probability over the seconds on the rig, the voltage, and what was recorded."""
+        from rotflex_jax.experiment.figure import sequential_figure  # the layer above, on request
+
+        return sequential_figure(self)
+
+    def _repr_html_(self) -> str:
+        """Verdict, and the probabilities after each segment."""
+        rows = [
+            (
+                f"{s.seconds:g}",
+                f"{s.input}, {s.setting}",
+                f"{s.voltage:.3g}",
+                *(f"{100 * s.probabilities[n]:.3g}" for n in self.rivals),
+            )
+            for s in self.history
+        ]
+        return card(
+            self.verdict.capitalize(),
+            paragraph(self.sentence),
+            table(("on the rig [s]", "input", "peak [V]", *(f"{n} [%]" for n in self.rivals)), rows, words=2),
+            bullets(self.notes),
+        )
+
+    def __str__(self) -> str:
+        lines = [self.sentence]
+        for s in self.history:
+            listed = ", ".join(f"{n} {100 * p:.3g} %" for n, p in s.probabilities.items())
+            lines.append(f"  {s.seconds:6g} s  {s.input}, {s.setting}, {s.voltage:.3g} V: {listed}")
+        return "\n".join([*lines, *(f"  {n}" for n in self.notes)])

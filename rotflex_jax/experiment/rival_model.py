@@ -116,7 +116,7 @@ def rival_model(
     elif (name, port) not in present:
         m = m + CATALOG[name](at=port)
     before = set(m.parameter_names)
-    m = _with_calibrations(m)
+    m = with_calibrations(m)
     calibrations = tuple(n for n in m.parameter_names if n not in before)
     free = [i for i, n in enumerate(m.parameter_names) if n not in m.trusted]
     K = kalman_gains(m, [process_noise], noise, Ts)[0]
@@ -129,7 +129,7 @@ def rival_model(
     return RivalModel(f"{name}@{port}", m, model.solver, tuple(free), calibrations, K, L)
 
 
-def _with_calibrations(m: Mechanism) -> Mechanism:
+def with_calibrations(m: Mechanism) -> Mechanism:
     """The mechanism with a voltage offset and sensor biases, which every recording has for itself.
 
     The first channel needs no bias: its first position is fitted.

@@ -1,0 +1,319 @@
+"""Seconds on the rig until it is decided: experiments that stop by themselves beside standard inputs.
+
+    python benchmarks/B4_sequential.py --seeds 2000 2001 2002
+
+A machine of the independent simulator hides one effect; an ordinary recording of 6 s at about 1 V rms hardly
+says which of two or three it is. Each rival is fitted to that recording, and all start equally probable. Then
+`experiment_until` plays on the simulator, half a second at a time, until one has the probability 99 %.
+
+Beside it the standard inputs, without a pause and judged by the same rule: of each kind (multisine, binary
+sequence, sweep, steps, noise) the setting and level that the fitted models expect most of, and of these five
+the one that turned out fastest. They are judged at fewer moments, and the earliest possible one counts.
+Last, cases that no input within the limits can tell: does the loop say so.
+
+Writes results/B4_sequential.json and results/B4_sequential.md; rows that are there are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+
+import rotflex_jax as rf
+from arena.records import COUNT, JITTER, make_record
+from arena.scoring import renamed
+from rotflex_jax.data import excitation
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.experiment import Rig, experiment_until
+from rotflex_jax.experiment.rival_set import RunData
+from rotflex_jax.experiment.segment_choice import SegmentChoice
+from rotflex_jax.experiment.sequential import SequentialExperiment, sequential_experiment
+from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
+from rotflex_jax.text.files import write_file
+
+TS, ORDINARY, MOST, SEGMENT, ERROR = 0.002, 6.0, 20.0, 0.5, 0.01
+LIMITS = rf.Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
+# Within these nothing moves far beyond the noise.
+NARROW = rf.Limits(voltage=0.3, travel=np.deg2rad(5), deflection=np.deg2rad(0.3))
+# Moments at which a standard input is judged [s]; the earliest since the one before counts.
+MOMENTS = (0.5, 1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20)
+LEVELS, PLAYED = (1.0, 0.5, 0.25), 1
+
+# The effect that is there with its numbers, and its rivals.
+CASES = {
+    "delay or lag": (("delay", "input"), {"time": 4.5e-4}, [("lag", "input")]),
+    "lag or delay": (("lag", "input"), {"time": 5e-4}, [("delay", "input")]),
+    "second mode or sensor gain": (
+        ("second_mode", "arm"),
+        {"inertia": 3e-5, "frequency": 10.0, "damping": 0.03},
+        [("sensor_gain", "alpha")],
+    ),
+    "hardening spring or bent sensor": (
+        ("cubic_spring", "joint"),
+        {"coefficient": 0.15},
+        [("sensor_cubic", "alpha")],
+    ),
+    "bent sensor or hardening spring": (
+        ("sensor_cubic", "alpha"),
+        {"cubic": 0.15},
+        [("cubic_spring", "joint")],
+    ),
+    "Coulomb friction or drag": (("coulomb", "hub"), {"level": 0.001}, [("quadratic_drag", "hub")]),
+    "delay, lag or play": (
+        ("delay", "input"),
+        {"time": 4.5e-4},
+        [("lag", "input"), ("backlash", "hub")],
+    ),
+    "Coulomb friction, drag or Dahl friction": (
+        ("coulomb", "hub"),
+        {"level": 0.001},
+        [("quadratic_drag", "hub"), ("dahl", "hub")],
+    ),
+}
+HOPELESS = {
+    "delay or lag": (("delay", "input"), {"time": 2e-4}, [("lag", "input")]),
+    "lag or delay": (("lag", "input"), {"time": 2e-4}, [("delay", "input")]),
+}
+NOISE = dict.fromkeys(("theta", "alpha"), math.hypot(JITTER, COUNT / math.sqrt(12)))
+
+
+class ArenaRig(Rig):
+    """The independent simulator as a rig whose motion goes on."""
+
+    def __init__(self, truth: tuple, numbers: dict, seed: int, limits: rf.Limits) -> None:
+        self.limits, self.Ts, self.continues = limits, TS, True
+        self.given, self.seed, self.played = ({truth: numbers}, seed), seed, np.zeros(0)
+        self.clean = np.zeros((0, 2))
+
+    def play(self, u: np.ndarray) -> np.ndarray:
+        """From rest with all voltages so far, since the simulator begins there; noise as it was."""
+        self.played = np.concatenate([self.played, u])
+        return recorded(*self.given, self.played)[1][-len(u) :]
+
+
+def recorded(effects: dict, seed: int, played: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Voltage and outputs of the machine of a seed, with sensor noise of its own."""
+    r = make_record(effects, seed=seed, played=played, fs=1 / TS)
+    rng = np.random.default_rng([seed, 4])
+    noisy = r["clean"] + JITTER * rng.standard_normal((len(played), 2))
+    return r["u"], COUNT * np.round(noisy / COUNT)
+
+
+def fits(truth: tuple, numbers: dict, rivals: list, seed: int) -> dict[str, rf.Fit]:
+    """Each model fitted to an ordinary recording."""
+    r = make_record({truth: numbers}, kind="noise", seed=seed, seconds=ORDINARY)
+    first = rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena")
+    joint = rf.fit(rf.joints.paper(), first).model
+    half = {k: (v if k in ("frequency", "damping") else v / 2) for k, v in renamed(truth, numbers).items()}
+    found = {"@".join(truth): rf.fit(joint + CATALOG[truth[0]](at=truth[1], **half), first)}
+    for name, at in rivals:
+        found[f"{name}@{at}"] = rf.fit(joint + SMALL.get(name, CATALOG[name])(at=at), first)
+    return found
+
+
+# Starts of rivals that are far from small in the catalogue.
+SMALL = {
+    "lag": lambda at: CATALOG["lag"](at=at, time=5e-4),
+    "delay": lambda at: CATALOG["delay"](at=at, time=5e-4),
+    "backlash": lambda at: CATALOG["backlash"](at=at, gap=1e-3),
+    "sensor_cubic": lambda at: CATALOG["sensor_cubic"](at=at, cubic=0.1),
+    "cubic_spring": lambda at: CATALOG["cubic_spring"](at=at, stiffness=0.1),
+    "quadratic_drag": lambda at: CATALOG["quadratic_drag"](at=at, coefficient=2e-4),
+    "dahl": lambda at: CATALOG["dahl"](at=at, level=5e-4),
+}
+
+
+def standard(N: int, seed: int) -> list[tuple[str, str, np.ndarray]]:
+    """Standard inputs of the whole length, at the limit of the voltage."""
+    V, out = LIMITS.voltage, []
+    for corner in (2.0, 5.0, 15.0, 40.0):
+        u = excitation.noise(N, TS, rms=V / NOISE_CREST, bandwidth=corner, seed=seed)
+        out.append(("noise", f"{corner:g} Hz", np.clip(u, -V, V)))
+    for high in (6.0, 12.0, 30.0, 80.0):
+        u = excitation.multisine(N, TS, band=(0.25, high), rms=V / MULTISINE_CREST, seed=seed)
+        out.append(("multisine", f"to {high:g} Hz", np.clip(u, -V, V)))
+        out.append(("sweep", f"to {high:g} Hz", excitation.sweep(N, TS, band=(0.25, high), amplitude=V)))
+    for hold in (0.1, 0.05, 0.02, 0.01):
+        u = excitation.prbs(N, TS, amplitude=V, hold=hold, seed=seed)
+        out.append(("prbs", f"held {1e3 * hold:g} ms", u))
+    for hold in ((0.15, 0.8), (0.05, 0.3), (0.02, 0.1)):
+        u = excitation.steps(N, TS, amplitude=V, hold=hold, seed=seed)
+        out.append(("steps", f"held {1e3 * hold[0]:g} to {1e3 * hold[1]:g} ms", u))
+    return [(kind, setting, u - u.mean()) for kind, setting, u in out]
+
+
+def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str, np.ndarray]]:
+    """Of each kind the setting and level that the models expect most of, within the limits all the time."""
+    long = SequentialExperiment(
+        start.rivals, type(start.settings)(LIMITS, segment_seconds=MOST, improve=False), start.prior
+    )
+    choice = SegmentChoice(long)
+    made = standard(round(MOST / TS), seed)
+    U, ok = choice.within_limits(np.array([u for *_, u in made]))
+    offered = [
+        (k, s, level, level * u)
+        for level in LEVELS
+        for (k, s, _), u, good in zip(made, U, ok, strict=True)
+        if good
+    ]
+    T, _ = choice.evidence(np.array([u for *_, u in offered]), (1.0,), drawn=False)
+    worth = choice.usefulness(T[0].min(axis=2))
+    chosen, taken = [], {}
+    for i in np.argsort(-worth):
+        k, s, _, u = offered[i]
+        if taken.get(k, 0) < PLAYED:
+            taken[k] = taken.get(k, 0) + 1
+            chosen.append((k, f"{s}, {np.max(np.abs(u)):.2g} V", u))
+    return chosen
+
+
+def played_standard(start: SequentialExperiment, rig: ArenaRig, u: np.ndarray) -> dict:
+    """Seconds until a standard input decides, by the same rule."""
+    _, y = recorded(*rig.given, u)
+    before = 0.0
+    e, r = start, start.rivals
+    unknowns: tuple = ()
+    for t in MOMENTS:
+        n = round(t / TS)
+        run = RunData(u[:n], y[:n])
+        first = r.first_unknowns(run)
+        new = []
+        for h in range(r.count):
+            x = unknowns[h] if unknowns else np.concatenate([r.prior_mean[h], first])
+            starts = [x] + (r.other_shapes(h, x) if t <= 3 * SEGMENT else [])
+            new.append(r.fitted(h, starts, [run], 0, start.samples).unknowns)
+        unknowns = tuple(new)
+        e = SequentialExperiment(r, start.settings, start.prior, runs=(run,), unknowns=unknowns)
+        p = e.probabilities
+        if p.max() >= 1 - ERROR:
+            return {"seconds": before + SEGMENT, "decided": True, "best": r.labels[int(np.argmax(p))]}
+        before = t
+    return {"seconds": MOST, "decided": False, "best": r.labels[int(np.argmax(p))]}
+
+
+def trial(name: str, seed: int, say, hopeless: bool = False, alone: bool = False) -> dict:
+    """One case on one machine."""
+    truth, numbers, rivals = (HOPELESS if hopeless else CASES)[name]
+    began = time.perf_counter()
+    models = fits(truth, numbers, rivals, seed)
+    right, limits = "@".join(truth), NARROW if hopeless else LIMITS
+    rig = ArenaRig(truth, numbers, seed, limits)
+    settings = {"noise": NOISE, "error": ERROR, "max_seconds": MOST, "segment_seconds": SEGMENT}
+    result = experiment_until(models, rig, **settings, progress=say)
+    row = {
+        "case": name,
+        "seed": seed,
+        "truth": right,
+        "hopeless": hopeless,
+        "verdict": result.verdict,
+        "best": result.best,
+        "sentence": result.sentence,
+        "seconds": result.seconds,
+        "probability": result.probabilities[result.best],
+        "misfit": result.history[-1].misfit if result.history else None,
+        "inputs": [[s.input, s.setting, s.voltage] for s in result.history],
+        "peaks": np.max(np.abs(np.concatenate([r.y for r in result.runs])), axis=0).tolist(),
+        "statuses": {n: m.status for n, m in models.items()},
+        "loop_s": time.perf_counter() - began,
+        "standard": [],
+    }
+    if not (hopeless or alone):
+        start = sequential_experiment(models, limits, TS, **settings)
+        for kind, setting, u in best_standard(start, seed):
+            row["standard"].append({"input": kind, "setting": setting, **played_standard(start, rig, u)})
+            say(f"{name} {seed}: {kind} {setting}: {row['standard'][-1]}")
+    row["elapsed_s"] = time.perf_counter() - began
+    return row
+
+
+def fastest(row: dict) -> dict:
+    """The standard input that decided rightly first; the whole time where none did."""
+    good = [s for s in row["standard"] if s["decided"] and s["best"] == row["truth"]]
+    least = {"input": "none", "setting": "", "seconds": MOST, "decided": False}
+    return min(good, key=lambda s: s["seconds"]) if good else least
+
+
+def summary(rows: list[dict]) -> str:
+    """Markdown."""
+    told = [r for r in rows if not r["hopeless"]]
+    lost = [r for r in rows if r["hopeless"]]
+    lines = [
+        "# Seconds on the rig until it is decided",
+        "",
+        f"Error probability {ERROR:g}, at most {MOST:g} s, segments of {SEGMENT:g} s; the fastest of five "
+        "standard inputs that decided rightly stands beside, `>` where none did.",
+        "",
+        "| case | seed | the loop | seconds | best standard input | seconds | ratio |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    ratios, wrong, wrong_standard, played = [], 0, 0, 0
+    for r in told:
+        s, right = fastest(r), r["best"] == r["truth"]
+        verdict = r["verdict"] + ("" if right else ", WRONG" if r["verdict"] == "decided" else "")
+        wrong += r["verdict"] == "decided" and not right
+        wrong_standard += sum(x["decided"] and x["best"] != r["truth"] for x in r["standard"])
+        played += len(r["standard"])
+        good = r["verdict"] == "decided" and right
+        ratio = s["seconds"] / r["seconds"] if good else (1.0 if not s["decided"] else s["seconds"] / MOST)
+        ratios.append(ratio)
+        more = "" if s["decided"] else "> "
+        lines.append(
+            f"| {r['case']} | {r['seed']} | {verdict} | {r['seconds']:g} | {s['input']} {s['setting']} "
+            f"| {more}{s['seconds']:g} | {more}{ratio:.1f} |"
+        )
+    if told:
+        decided = sum(r["verdict"] == "decided" for r in told)
+        lines += [
+            "",
+            f"{len(told)} cases of 40 wanted. The loop decided {decided}, {wrong} of them wrongly; of "
+            f"{played} standard inputs {wrong_standard} decided wrongly. Median of the ratios "
+            f"{np.median(ratios):.1f}; median seconds {np.median([r['seconds'] for r in told]):.1f} beside "
+            f"{np.median([fastest(r)['seconds'] for r in told]):.1f}.",
+        ]
+    if lost:
+        said = sum(r["verdict"] == "not distinguishable" for r in lost)
+        took = np.median([r["seconds"] for r in lost])
+        lines += [
+            "",
+            f"Where the limits leave nothing to see ({NARROW.voltage:g} V): {said} of {len(lost)} times it "
+            f"said so, after {took:g} s in the median; "
+            f"{sum(r['verdict'] == 'decided' for r in lost)} times it decided.",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[2000, 2001, 2002])
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument(
+        "--hopeless", type=int, nargs="*", default=[], help="seeds of cases that nothing can tell"
+    )
+    parser.add_argument("--alone", action="store_true", help="leave the standard inputs out")
+    parser.add_argument("--minutes", type=float, default=1e9, help="begin no case after so long")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    given = parser.parse_args()
+    began, file = time.monotonic(), given.out / "B4_sequential.json"
+    rows = json.loads(file.read_text())["rows"] if file.exists() else []
+    have = {(r["case"], r["seed"], r["hopeless"]) for r in rows}
+    todo = [(n, s, True) for s in given.hopeless for n in HOPELESS]
+    todo += [(n, s, False) for s in given.seeds for n in given.cases]
+    for name, seed, hopeless in todo:
+        if (name, seed, hopeless) in have or time.monotonic() - began > 60 * given.minutes:
+            continue
+        rows.append(trial(name, seed, lambda s: print(s, flush=True), hopeless, given.alone))
+        given.out.mkdir(exist_ok=True, parents=True)
+        write_file(file, json.dumps({"schema": 1, "rows": rows}, indent=1) + "\n")
+        write_file(file.with_suffix(".md"), summary(rows))
+    print(summary(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""A machine on which voltages can be played: a class to derive from, and some that are ready."""
+
+import abc
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax import checks
+from rotflex_jax.data.files import load
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.result import voltage_file
+from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.mechanism import Mechanism, simulate
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+
+
+class Rig(abc.ABC):
+    """A machine on which voltages can be played; derive from it and write `play`.
+
+    Attributes:
+        limits: What the machine bears.
+        Ts: Sampling period [s].
+        continues: Whether a segment begins in the motion with which the one before has ended. If not, the
+            machine comes to rest in between, and each segment has offsets and first states of its own.
+    """
+
+    limits: Limits
+    Ts: float
+    continues: bool = True
+
+    @abc.abstractmethod
+    def play(self, u: Float[np.ndarray, " N"]) -> Recording | Float[np.ndarray, "N C"]:
+        """Play a voltage and record.
+
+        Args:
+            u: Voltage [V], each value held for one sampling period.
+
+        Returns:
+            Outputs at the instants of the voltage, or a recording, whose voltage is then taken for what was
+            really applied.
+        """
+
+
+class SimulatedRig(Rig):
+    """A model in the place of the machine, whose motion goes on from one segment to the next.
+
+    Args:
+        model: The machine.
+        limits: What it bears.
+        Ts: Sampling period [s].
+        noise: Channel -> standard deviation of the sensor noise.
+        seed: Of the noise.
+    """
+
+    def __init__(
+        self,
+        model: Model | Mechanism,
+        limits: Limits,
+        Ts: float,
+        noise: Mapping[str, float] | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.model, self.limits, self.Ts = (
+            Model.of(model),
+            checked_limits(limits),
+            checks.positive(Ts, "Ts", "s", "0.002"),
+        )
+        channels = self.model.mechanism.channels
+        given = noise or {}
+        self._sd = np.array(
+            [checks.number(given.get(c, 0.0), "noise", least=0, example="{'theta': 5e-4}") for c in channels]
+        )
+        self._rng, self._played = np.random.default_rng(checks.seed(seed)), np.zeros(0)
+
+    def play(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N C"]:
+        """Outputs with noise, from the motion in which the last segment has ended."""
+        # From the start each time: a delay or a drift remembers voltages, which no state holds.
+        self._played = np.concatenate([self._played, checks.signal(u)])
+        m = self.model.mechanism
+        y = simulate(m, self._played, self.Ts, solver=self.model.solver)[-len(u) :]
+        return y + self._sd * self._rng.standard_normal(y.shape)
+
+
+class CallbackRig(Rig):
+    """A rig that a function plays.
+
+    Args:
+        function: From the voltage [V] to the outputs, or to a recording.
+        limits: What the machine bears.
+        Ts: Sampling period [s].
+        continues: Whether the motion goes on from one segment to the next.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Float[np.ndarray, " N"]], Any],
+        limits: Limits,
+        Ts: float,
+        continues: bool = True,
+    ) -> None:
+        if not callable(function):
+            raise InputError(
+                f"Argument `function` must be a function from voltages to outputs, but is "
+                f"{checks.shown(function)}; give one that plays on the rig."
+            )
+        self.function, self.limits, self.continues = function, checked_limits(limits), bool(continues)
+        self.Ts = checks.positive(Ts, "Ts", "s", "0.002")
+
+    def play(self, u: Float[np.ndarray, " N"]) -> Recording | Float[np.ndarray, "N C"]:
+        """What the function returns."""
+        return self.function(u)
+
+
+class FileRig(Rig):
+    """A rig that is fed by files: `voltage_001.csv` is written, `recording_001.csv` is waited for.
+
+    Args:
+        folder: Where the files lie.
+        limits: What the machine bears.
+        Ts: Sampling period [s].
+        patience: How long a recording is waited for [s].
+        continues: Whether the motion goes on from one segment to the next.
+        columns: Arguments of `rotflex_jax.load`, such as `degrees=True`.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        limits: Limits,
+        Ts: float,
+        patience: float = 600.0,
+        continues: bool = False,
+        **columns: Any,
+    ) -> None:
+        self.folder, self.limits, self.continues = Path(folder), checked_limits(limits), bool(continues)
+        if not self.folder.is_dir():
+            raise InputError(f"{self.folder} is no folder; make it first, or name one that is there.")
+        self.Ts = checks.positive(Ts, "Ts", "s", "0.002")
+        self.patience, self.columns, self._count = checks.positive(patience, "patience"), columns, 0
+
+    def play(self, u: Float[np.ndarray, " N"]) -> Recording:
+        """Write the voltage, wait for the recording."""
+        self._count += 1
+        answer = self.folder / f"recording_{self._count:03d}.csv"
+        voltage_file(self.folder / f"voltage_{self._count:03d}.csv", u, self.Ts)
+        ends = time.monotonic() + self.patience
+        while not answer.exists():
+            if time.monotonic() > ends:
+                raise InputError(
+                    f"{answer} did not appear within {self.patience:g} s; play the voltage beside it and put "
+                    "the recording there, or give more `patience`."
+                )
+            time.sleep(0.05)
+        return load(answer, **self.columns)
+
+
+def checked_limits(limits: Any) -> Limits:
+    """Limits as they are.
+
+    Raises:
+        InputError: Something else.
+    """
+    if not isinstance(limits, Limits):
+        raise InputError(
+            f"Argument `limits` must be Limits(voltage=...), but is {checks.shown(limits)}; give what the "
+            "machine bears."
+        )
+    return limits

@@ -1,0 +1,660 @@
+"""Several rival models in one structure: fitted to all recordings so far, with their probabilities.
+
+All effects of all models are built into one mechanism, and gates say which of them a model has, so that one
+compiled program serves every rival. What a recording says of a model is its evidence: the likelihood averaged
+over the parameters, first states and offsets that the model may have (Laplace's method).
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.signal import fftconvolve
+
+from rotflex_jax import checks
+from rotflex_jax.effects.base import Effect
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.rival_fit import LARGEST_STEP, MAX_STEPS, RULES
+from rotflex_jax.experiment.rival_model import with_calibrations
+from rotflex_jax.fit.result import Fit
+from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
+from rotflex_jax.mechanism.assembly import Layout, rest_state
+from rotflex_jax.mechanism.validation import process_noise_of
+from rotflex_jax.models.model import Model
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, minimise
+from rotflex_jax.parameters import Transform
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import double_precision
+
+# Standard deviations of a fit are those of one recording at one amplitude: they are doubled. No coordinate is
+# less certain than by the second number, or a logarithm would become no statement at all.
+FIT_SPREAD, LARGEST_SPREAD = 2.0, 2.0
+# Uncertainty of a parameter without a standard deviation, as a share of its value.
+UNKNOWN_SHARE = 0.05
+# What a run has for itself before anything of it is known: calibrations in units of their typical size,
+# positions and speeds in their own units. Wide, and the same for every rival.
+CALIBRATION_SPREAD, STATE_SPREAD = 5.0, 10.0
+# Other shapes of an effect that a fit starts from.
+SHAPE_FACTORS = (0.6, 1.6)
+# Rows of one call of a batched program; more are run in turn, fewer are filled up, so nothing compiles again.
+BATCH = 16
+# Recordings are filled up to lengths that grow by this factor from the first.
+LENGTH_FACTOR = 4
+
+
+@persistent_jit(static=2)
+def _run_with_slopes(structure, solver, values, gates, x0, K, u, y, Ts, place, dvalues, dx0):  # noqa: ANN001, ANN202
+    """Predicted outputs (N, C) and the state at a place (n,), each with slopes along the last axis."""
+    seen = jnp.ones_like(u)
+
+    def run(values: Array, x0: Array) -> tuple[Array, Array]:
+        X, y_hat = predictor_run(structure, solver, values, gates, x0, u, y, seen, K, Ts)
+        return y_hat, X[place]
+
+    def along(v: Array, x: Array) -> Any:
+        return jax.jvp(run, (values, x0), (v, x))
+
+    return jax.vmap(along, out_axes=((None, None), (-1, -1)))(dvalues, dx0)
+
+
+@persistent_jit(static=2)
+def _outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN202 - as `free_run`, in batches
+    one = lambda v, g, x, u: free_run(structure, solver, v, g, x, u, Ts)[1]  # noqa: E731
+    return jax.vmap(one)(values, gates, x0, u)
+
+
+@persistent_jit(static=2)
+def _outputs_with_slopes(structure, solver, values, gates, x0, u, dvalues, dx0, Ts):  # noqa: ANN001, ANN202
+    """Outputs (N, C) of one run, and their slopes along the last axis."""
+
+    def along(v: Array, x: Array) -> Any:
+        run = lambda v, x: free_run(structure, solver, v, gates, x, u, Ts)[1]  # noqa: E731
+        return jax.jvp(run, (values, x0), (v, x))
+
+    return jax.vmap(along, out_axes=(None, -1))(dvalues, dx0)
+
+
+@persistent_jit(static=2)
+def _input_slopes(structure, solver, values, gates, x0, u, weight, Ts):  # noqa: ANN001, ANN202
+    """Slope of a weighted sum of the outputs of one run along its voltage (N,)."""
+    run = lambda u: free_run(structure, solver, values, gates, x0, u, Ts)[1]  # noqa: E731
+    return jax.grad(lambda u: jnp.sum(weight * run(u)))(u)
+
+
+class Start(NamedTuple):
+    """Rows of runs that begin in given states: parameter values, gates and first states of each."""
+
+    values: Float[np.ndarray, "B P"]
+    gates: Float[np.ndarray, "B E"]
+    x0: Float[np.ndarray, "B n"]
+
+
+class RunData(NamedTuple):
+    """What the rig has played without a pause, and what was recorded."""
+
+    u: Float[np.ndarray, " N"]
+    y: Float[np.ndarray, "N C"]
+
+
+@dataclasses.dataclass(frozen=True)
+class RivalPosterior:
+    """What is known of one rival's parameters after some recordings.
+
+    The unknowns are the machine's free parameters (unconstrained), then for each run its calibrations and its
+    first positions and speeds.
+
+    Attributes:
+        unknowns: Most probable values.
+        cost: Half the squared whitened residuals [nat].
+        prior_cost: Half the squared distance from what was known before [nat].
+        gradient: Of both costs together along the unknowns.
+        information: `J'J` of the whitened residuals.
+        precision: Diagonal blocks of what was known before.
+        residuals: Whitened residuals of each run.
+        state: State in the last run at the place that was asked for.
+        state_slope: Its slope along machine parameters and what the last run has for itself.
+    """
+
+    unknowns: Float[np.ndarray, " D"]
+    cost: float
+    prior_cost: float
+    gradient: Float[np.ndarray, " D"]
+    information: Float[np.ndarray, "D D"]
+    precision: Float[np.ndarray, "D D"]
+    residuals: tuple[Float[np.ndarray, "_ C"], ...]
+    state: Float[np.ndarray, " n"]
+    state_slope: Float[np.ndarray, "n A"]
+
+    def log_evidence(self, scale: float) -> float:
+        """Logarithm of the averaged likelihood, constants common to all rivals left out [nat].
+
+        Args:
+            scale: Variance of the whitened residuals.
+
+        Source: D. J. C. MacKay, Bayesian interpolation, Neural Computation 4, 1992.
+        """
+        if not math.isfinite(self.cost):
+            return -math.inf
+        after = np.linalg.slogdet(self.information / scale + self.precision)[1]
+        return (
+            -self.cost / scale - self.prior_cost - 0.5 * float(after - np.linalg.slogdet(self.precision)[1])
+        )
+
+    def covariance(self, scale: float, pick: Int[np.ndarray, " A"]) -> Float[np.ndarray, "A A"]:
+        """Covariance of some unknowns, all others averaged over."""
+        whole = np.linalg.inv(self.information / scale + self.precision)[np.ix_(pick, pick)]
+        return (whole + whole.T) / 2
+
+
+@dataclasses.dataclass(frozen=True)
+class RivalSet:
+    """Rival models of one machine, in one structure.
+
+    Attributes:
+        labels: Names of the H models.
+        models: As they were given, each with what was known of its parameters beforehand.
+        structure: The mechanism with the effects of all of them.
+        solver: Integration rule.
+        gates: Which of the E effects each model has.
+        values: Parameter values of each.
+        free: Indices of the free parameters of each that belong to the machine.
+        own: Indices of the calibrations, which every run has for itself.
+        prior_mean: Unconstrained free parameters of each.
+        prior_covariance: Their covariance.
+        noise: Standard deviation of the sensor noise per channel.
+        process_noise: Port -> intensity of the process torque [(N m)^2 s].
+        Ts: Sampling period [s].
+    """
+
+    labels: tuple[str, ...]
+    models: tuple[Model, ...]
+    structure: Mechanism
+    solver: Solver
+    gates: Float[np.ndarray, "H E"]
+    values: Float[np.ndarray, "H P"]
+    free: tuple[Int[np.ndarray, " _"], ...]
+    own: Int[np.ndarray, " o"]
+    prior_mean: tuple[Float[np.ndarray, " _"], ...]
+    prior_covariance: tuple[Float[np.ndarray, "_ _"], ...]
+    noise: Float[np.ndarray, " C"]
+    process_noise: dict[str, float]
+    Ts: float
+
+    # -- sizes -------------------------------------------------------------------------------------
+
+    @property
+    def count(self) -> int:
+        """Number of rivals."""
+        return len(self.labels)
+
+    @property
+    def layout(self) -> Layout:
+        """Order of the states."""
+        return Layout.of(self.structure.structure)
+
+    @property
+    def run_unknowns(self) -> int:
+        """Unknowns that each run has for itself: calibrations, positions, speeds."""
+        return len(self.own) + 2 * self.layout.n
+
+    @functools.cached_property
+    def rest(self) -> Float[np.ndarray, " n"]:
+        """State at rest."""
+        return rest_state(self.structure.structure, np.float64)
+
+    @functools.cached_property
+    def transform(self) -> Transform:
+        """Unconstrained <-> physical, of all parameters."""
+        return Transform.of(self.structure.parameter_specifications)
+
+    # -- whitening ---------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _filters(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
+        """Gain (n, C), inverse Cholesky factor (C, C), and `A, A K, C` where a predictor corrects."""
+        found = []
+        for model in self.models:
+            m = with_calibrations(model.mechanism)
+            K = kalman_gains(m, [self.process_noise], self.noise, self.Ts)[0]
+            own, q = Layout.of(m.structure), 2 * self.layout.n
+            rows = own.linear if own.linear == self.layout.linear else q
+            gain = np.zeros((self.layout.size, len(self.noise)))
+            gain[:rows] = K[:rows]
+            ss = linearise(m)
+            CK = ss.C @ K[: own.linear]
+            S = np.linalg.solve(np.eye(len(CK)) - CK, np.diag(np.square(self.noise)))
+            L = np.linalg.inv(np.linalg.cholesky((S + S.T) / 2))
+            found.append((gain, L, (ss, K[: own.linear]) if np.any(K) else None))
+        return found
+
+    def _impulse_response(self, h: int, M: int) -> np.ndarray | None:
+        """Response (M, C, C) of the innovations to a difference of the outputs; None where it is itself."""
+        linear = self._filters[h][2]
+        if linear is None:
+            return None
+        ss, K = linear
+        A = ss.discretise(self.Ts)[0]
+        response, carried = [np.eye(len(ss.C))], A @ K
+        for _ in range(M - 1):
+            response.append(-ss.C @ carried)
+            carried = A @ (carried - K @ (ss.C @ carried))
+        return np.array(response)
+
+    def whitened(
+        self, h: int, difference: Float[np.ndarray, "*B M C"], adjoint: bool = False
+    ) -> Float[np.ndarray, "*B M C"]:
+        """Whitened innovations that a difference of the outputs makes under rival `h`, to first order.
+
+        Args:
+            h: Number of the rival.
+            difference: What is measured less what the rival expects.
+            adjoint: The transposed operation, for gradients.
+        """
+        L, response = self._filters[h][1], self._impulse_response(h, difference.shape[-2])
+        if response is None:
+            return difference @ (L if adjoint else L.T)
+        x, M = difference @ L if adjoint else difference, difference.shape[-2]
+        if adjoint:
+            x, response = x[..., ::-1, :], np.swapaxes(response, 1, 2)
+        out = np.zeros_like(x)
+        for i in range(x.shape[-1]):
+            for j in range(x.shape[-1]):
+                kernel = response[:, i, j].reshape((1,) * (x.ndim - 2) + (M,))
+                out[..., i] += fftconvolve(x[..., j], kernel, axes=-1)[..., :M]
+        return out[..., ::-1, :] if adjoint else out @ L.T
+
+    # -- fits --------------------------------------------------------------------------------------
+
+    def values_and_slopes(
+        self, h: int, machine: Float[np.ndarray, "*B m"], own: Float[np.ndarray, "*B o"]
+    ) -> tuple[Float[np.ndarray, "*B P"], Float[np.ndarray, "*B P"]]:
+        """Physical values, and the slope of each along its unconstrained coordinate."""
+        shape = machine.shape[:-1]
+        z = np.broadcast_to(self.transform.unconstrain(self.values[h]), (*shape, self.values.shape[1])).copy()
+        z[..., self.free[h]], z[..., self.own] = machine, own
+        physical, slope = self.transform.physical(z)
+        values = np.broadcast_to(self.values[h], z.shape).copy()
+        for pick in (self.free[h], self.own):
+            values[..., pick] = physical[..., pick]
+        return values, slope
+
+    def _seeds(self, h: int, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Directions of the unknowns of one run in values and first state, filled up to one number."""
+        widest = max(map(len, self.free)) + self.run_unknowns
+        m, o, q = len(self.free[h]), len(self.own), 2 * self.layout.n
+        dvalues = np.zeros((widest, len(slope)))
+        dx0 = np.zeros((widest, self.layout.size))
+        dvalues[np.arange(m), self.free[h]] = slope[self.free[h]]
+        dvalues[m + np.arange(o), self.own] = slope[self.own]
+        dx0[m + o + np.arange(q), np.arange(q)] = 1.0
+        return dvalues, dx0
+
+    def _run(self, h: int, x: np.ndarray, run: RunData, place: int, length: int) -> tuple[np.ndarray, ...]:
+        """Whitened residuals (N, C), their slopes (N, C, A), a state and its slopes, for one run."""
+        m, o = len(self.free[h]), len(self.own)
+        values, slope = self.values_and_slopes(h, x[:m], x[m : m + o])
+        dvalues, dx0 = self._seeds(h, slope)
+        start = self.rest.copy()
+        start[: 2 * self.layout.n] = x[m + o :]
+        N, (K, L, _) = len(run.u), self._filters[h]
+        u = np.concatenate([run.u, np.zeros(length - N)])
+        y = np.concatenate([run.y, np.repeat(run.y[-1:], length - N, axis=0)])
+        with double_precision():
+            given = (values, self.gates[h], start, K, u, y, self.Ts, np.int64(place), dvalues, dx0)
+            (y_hat, state), (dy, dstate) = _run_with_slopes(
+                self.structure.structure, self.solver, *map(jnp.asarray, given)
+            )
+        A = m + self.run_unknowns
+        w = (run.y - np.asarray(y_hat)[:N]) @ L.T
+        J = -np.einsum("kc,ncd->nkd", L, np.asarray(dy)[:N, :, :A])
+        return w, J, np.asarray(state), np.asarray(dstate)[:, :A]
+
+    def _precision(self, h: int, runs: int) -> np.ndarray:
+        m, o, q = len(self.free[h]), len(self.own), 2 * self.layout.n
+        own = np.concatenate([np.full(o, CALIBRATION_SPREAD**-2.0), np.full(q, STATE_SPREAD**-2.0)])
+        out = np.diag(np.concatenate([np.zeros(m), np.tile(own, runs)]))
+        out[:m, :m] = np.linalg.inv(self.prior_covariance[h])
+        return out
+
+    def posterior(
+        self, h: int, unknowns: Float[np.ndarray, " D"], runs: Sequence[RunData], place: int, first: int
+    ) -> RivalPosterior:
+        """What the runs say of rival `h` at some unknowns, without moving them.
+
+        Args:
+            h: Number of the rival.
+            unknowns: Of all runs.
+            runs: What was recorded.
+            place: Sample of the last run whose state is wanted.
+            first: Shortest length that a program is compiled for.
+        """
+        m, r = len(self.free[h]), self.run_unknowns
+        D, machine = m + r * len(runs), np.arange(m)
+        information, gradient, cost, residuals = np.zeros((D, D)), np.zeros(D), 0.0, []
+        state, slope = self.rest, np.zeros((self.layout.size, m + r))
+        for k, run in enumerate(runs):
+            pick = np.concatenate([machine, m + r * k + np.arange(r)])
+            here = place if k == len(runs) - 1 else 0
+            w, J, state, slope = self._run(h, unknowns[pick], run, here, padded_length(len(run.u), first))
+            J = J.reshape(w.size, -1)
+            information[np.ix_(pick, pick)] += J.T @ J
+            gradient[pick] += J.T @ w.ravel()
+            cost += 0.5 * float(np.sum(w**2))
+            residuals.append(w)
+        precision = self._precision(h, len(runs))
+        away = unknowns - np.concatenate([self.prior_mean[h], np.zeros(D - m)])
+        known = np.isfinite(cost) and np.all(np.isfinite(information))
+        if not known:
+            cost = math.inf
+        return RivalPosterior(
+            unknowns,
+            cost,
+            0.5 * float(away @ precision @ away),
+            gradient + precision @ away,
+            information if known else np.zeros((D, D)),
+            precision,
+            tuple(residuals),
+            state,
+            slope,
+        )
+
+    def fitted(
+        self,
+        h: int,
+        starts: Sequence[Float[np.ndarray, " D"]],
+        runs: Sequence[RunData],
+        place: int,
+        first: int,
+    ) -> RivalPosterior:
+        """Rival `h` at its most probable unknowns given all runs, from several starts; as `posterior`."""
+        m = len(self.free[h])
+        limit = np.concatenate([np.full(m, LARGEST_STEP), np.full(len(starts[0]) - m, np.inf)])
+
+        def equations(x: np.ndarray) -> NormalEquations:
+            p = self.posterior(h, x, runs, place, first)
+            return NormalEquations(np.array([p.cost + p.prior_cost]), p.gradient, p.information + p.precision)
+
+        best = min(
+            (minimise(equations, x, RULES, limit=limit, max_steps=MAX_STEPS) for x in starts),
+            key=lambda found: float(found.cost) if np.isfinite(found.cost) else math.inf,
+        )
+        return self.posterior(h, best.x, runs, place, first)
+
+    def first_unknowns(self, run: RunData) -> Float[np.ndarray, " r"]:
+        """What a run has for itself where its fit starts: no offset, the pose of its first sample."""
+        n, rows = self.layout.n, np.array(self.layout.output_rows)
+        q = np.linalg.lstsq(rows[:, :n], run.y[0], rcond=None)[0]
+        return np.concatenate([np.zeros(len(self.own)), q, np.zeros(n)])
+
+    def other_shapes(self, h: int, unknowns: Float[np.ndarray, " D"]) -> list[Float[np.ndarray, " D"]]:
+        """The same with other shapes of the effects that not every rival has, one parameter at a time."""
+        names, found = self.structure.parameter_names, []
+        shared = np.all(self.gates > 0, axis=0)
+        for e, effect in enumerate(self.structure.effects):
+            if shared[e] or self.gates[h, e] == 0:
+                continue
+            for name in effect.values:
+                i = names.index(f"{effect.at}.{effect.name}.{name}")
+                where = np.flatnonzero(self.free[h] == i)
+                value = self.values[h, i]
+                if name in effect.amplitudes or not len(where) or value == 0:
+                    continue
+                spec = self.structure.parameter_specifications[i]
+                for factor in SHAPE_FACTORS:
+                    if spec.lower < factor * value < spec.upper:
+                        changed, physical = unknowns.copy(), self.values[h].copy()
+                        physical[i] = factor * value
+                        changed[where[0]] = self.transform.unconstrain(physical)[i]
+                        found.append(changed)
+        return found
+
+    # -- batches of runs ---------------------------------------------------------------------------
+
+    def _batched(self, program: Any, rows: Sequence[np.ndarray]) -> Any:
+        """A batched program over any number of rows, `BATCH` at a time."""
+        B, parts = len(rows[0]), []
+        with double_precision():
+            Ts = jnp.asarray(float(self.Ts))
+            for k in range(0, B, BATCH):
+                chunk = [row[k : k + BATCH] for row in rows]
+                fill = BATCH - len(chunk[0])
+                full = [np.concatenate([c, np.repeat(c[:1], fill, axis=0)]) for c in chunk]
+                out = program(self.structure.structure, self.solver, *map(jnp.asarray, full), Ts)
+                parts.append(jax.tree.map(lambda a: np.asarray(a)[: BATCH - fill], out))  # noqa: B023
+        return jax.tree.map(lambda *a: np.concatenate(a), *parts)
+
+    def _each(self, program: Any, rows: Sequence[np.ndarray]) -> Any:
+        """A program of one run over several, one after the other.
+
+        Batches of batches of slopes crash as compiled by JAX 0.10 for a machine of one coordinate.
+        """
+        with double_precision():
+            Ts, found = jnp.asarray(float(self.Ts)), []
+            for row in zip(*rows, strict=True):
+                out = program(self.structure.structure, self.solver, *map(jnp.asarray, row), Ts)
+                found.append(jax.tree.map(np.asarray, out))
+        return jax.tree.map(lambda *a: np.stack(a), *found)
+
+    def outputs(self, start: Start, u: Float[np.ndarray, "B M"]) -> Float[np.ndarray, "B M C"]:
+        """Outputs of free runs from given states."""
+        return self._batched(_outputs, (*start, u))
+
+    def outputs_with_slopes(
+        self,
+        start: Start,
+        u: Float[np.ndarray, "B M"],
+        dvalues: Float[np.ndarray, "B D P"],
+        dx0: Float[np.ndarray, "B D n"],
+    ) -> tuple[Float[np.ndarray, "B M C"], Float[np.ndarray, "B M C D"]]:
+        """The same, and their slopes along directions of values and first states."""
+        return self._each(_outputs_with_slopes, (*start, u, dvalues, dx0))
+
+    def input_slopes(
+        self, start: Start, u: Float[np.ndarray, "B M"], weight: Float[np.ndarray, "B M C"]
+    ) -> Float[np.ndarray, "B M"]:
+        """Slope of the weighted sum of the outputs along each sample of the voltage [1/V]."""
+        return self._each(_input_slopes, (*start, u, weight))
+
+
+def padded_length(N: int, first: int) -> int:
+    """The length that a recording of N samples is filled up to.
+
+    >>> [padded_length(N, 500) for N in (500, 501, 2001)]
+    [500, 2000, 8000]
+    """
+    length = first
+    while length < N:
+        length *= LENGTH_FACTOR
+    return length
+
+
+def rival_set(
+    given: Any,
+    *,
+    Ts: float,
+    noise: Mapping[str, float] | None = None,
+    process_noise: Mapping[str, float] | None = None,
+    uncertainty: float = UNKNOWN_SHARE,
+) -> RivalSet:
+    """Rival models in one structure, with what is known of their parameters.
+
+    Args:
+        given: Name -> `Fit`, `Model` or `Mechanism`; or a list of these, named by the effects that not all
+            have.
+        Ts: Sampling period [s].
+        noise: Channel -> standard deviation of the sensor noise; that of the fits if None.
+        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
+        uncertainty: Standard deviation of parameters that come without one, as a share of their value.
+
+    Raises:
+        InputError: Fewer than two, machines that differ in more than effects, no noise.
+    """
+    uncertainty = checks.number(uncertainty, "uncertainty", above=0, example="0.05")
+    items = _items(given)
+    models = [g.model if isinstance(g, Fit) else Model.of(g) for _, g in items]
+    reduced = [_without_gates(m) for m in models]
+    labels = _labels([name for name, _ in items], reduced)
+    first = reduced[0].mechanism
+    for label, m in zip(labels, reduced, strict=True):
+        other = m.mechanism
+        same = (
+            other.coordinates == first.coordinates
+            and dict(other.ports) == dict(first.ports)
+            and other.outputs == first.outputs
+            and other.units == first.units
+            and m.solver == reduced[0].solver
+        )
+        if not same:
+            raise InputError(
+                f"{labels[0]!r} and {label!r} differ in coordinates, ports, outputs or solver, but models of "
+                "one machine may differ in effects only; build them from the same mechanism."
+            )
+    effects: dict[tuple[str, str], Effect] = {}
+    complete = [with_calibrations(m.mechanism) for m in reduced]
+    for m in complete:
+        for e in m.effects:
+            known = effects.setdefault((e.name, e.at), e)
+            if (
+                type(known) is not type(e)
+                or set(known.values) != set(e.values)
+                or e.replace(**known.values) != known
+            ):
+                raise InputError(
+                    f"The effect {e.name}@{e.at} has another form in one model than in another, but one "
+                    "structure must serve all; give it the same settings."
+                )
+    union = dataclasses.replace(first, effects=tuple(effects.values()), trusted=frozenset())
+    names, specs = union.parameter_names, union.parameter_specifications
+    transform = Transform.of(specs)
+    before = {n for m in reduced for n in m.mechanism.parameter_names}
+    calibrations = {n for m in complete for n in m.parameter_names} - before
+    calibrations |= {
+        f"{e.at}.{e.name}.{p}" for e in union.effects if e.name == "voltage_offset" for p in e.values
+    }
+    own = np.array([i for i, n in enumerate(names) if n in calibrations], dtype=int)
+    gates, values, free, mean, covariance = [], [], [], [], []
+    for m, (_, source) in zip(complete, items, strict=True):
+        mine = {(e.name, e.at) for e in m.effects}
+        gates.append([float((e.name, e.at) in mine) for e in union.effects])
+        of = dict(zip(m.parameter_names, m.values, strict=True))
+        v = np.array([of.get(n, x) for n, x in zip(names, union.values, strict=True)])
+        v[own] = 0.0
+        pick = np.array(
+            [i for i, n in enumerate(names) if n in of and n not in m.trusted | calibrations], int
+        )
+        values.append(v)
+        free.append(pick)
+        mean.append(transform.unconstrain(v)[pick])
+        listed = [names[i] for i in pick]
+        covariance.append(_known_covariance(source, listed, v[pick], specs, transform, pick, uncertainty))
+    sd = _noise([g for _, g in items], noise, first.channels)
+    return RivalSet(
+        labels,
+        tuple(reduced),
+        union,
+        reduced[0].solver,
+        np.array(gates),
+        np.array(values),
+        tuple(free),
+        own,
+        tuple(mean),
+        tuple(covariance),
+        sd,
+        process_noise_of(first, process_noise),
+        float(Ts),
+    )
+
+
+def _items(given: Any) -> list[tuple[str | None, Any]]:
+    pairs = list(given.items()) if isinstance(given, Mapping) else None
+    if pairs is None and isinstance(given, Sequence) and not isinstance(given, str):
+        pairs = [(None, g) for g in given]
+    good = pairs is not None and all(isinstance(g, Fit | Model | Mechanism) for _, g in pairs)
+    if pairs is None or not good or len(pairs) < 2:
+        raise InputError(
+            "Two or more fitted models are needed to tell which is true, but "
+            f"{'one' if good else checks.shown(given)} was given; give a list of them, or name -> model."
+        )
+    return [(None if n is None else str(n), g) for n, g in pairs]
+
+
+def _without_gates(model: Model) -> Model:
+    """The model without the effects that its gates switch off."""
+    if model.gates is None:
+        return model
+    m = model.mechanism
+    for e, gate in zip(m.effects, model.gates, strict=True):
+        m = m if gate else m.without(e.name, e.at)
+    return dataclasses.replace(model, mechanism=m, gates=None)
+
+
+def _labels(names: list[str | None], models: list[Model]) -> tuple[str, ...]:
+    sets = [{f"{e.name}@{e.at}" for e in m.mechanism.effects} for m in models]
+    common = set.intersection(*sets)
+    labels = [n or " + ".join(sorted(s - common)) or "nothing more" for n, s in zip(names, sets, strict=True)]
+    twice = [n for n in labels if labels.count(n) > 1]
+    if twice:
+        raise InputError(
+            f"Two of the models are both {twice[0]!r}, but each needs a name or effects of its own; give "
+            "name -> model."
+        )
+    return tuple(labels)
+
+
+def _known_covariance(
+    source: Any,
+    names: list[str],
+    values: np.ndarray,
+    specs: Sequence[Any],
+    transform: Transform,
+    pick: np.ndarray,
+    uncertainty: float,
+) -> np.ndarray:
+    """Covariance of unconstrained free parameters: that of a fit, wider; else a share of their values."""
+    whole = np.array([s.typical for s in specs], float)
+    whole[pick] = values
+    z = transform.unconstrain(whole)
+    slope = np.abs(transform.physical(z)[1][pick])
+    typical = np.array([specs[i].typical for i in pick])
+    spread = uncertainty * np.maximum(np.abs(values), uncertainty * typical) / np.maximum(slope, 1e-300)
+    out = np.diag(np.clip(spread, 1e-6, LARGEST_SPREAD) ** 2)
+    if not isinstance(source, Fit):
+        return out
+    of = {n: i for i, n in enumerate(source.free_names)}
+    known = [k for k, n in enumerate(names) if n in of]
+    at = [of[names[k]] for k in known]
+    C = source.covariance[np.ix_(at, at)] * FIT_SPREAD**2
+    scale = slope[known]
+    C = C / np.maximum(np.outer(scale, scale), 1e-300)
+    good = np.isfinite(np.diag(C)) & (np.diag(C) > 0)
+    sd = np.where(good, np.sqrt(np.where(good, np.diag(C), 1.0)), LARGEST_SPREAD)
+    correlation = np.nan_to_num(C / np.outer(sd, sd)) * np.outer(good, good)
+    np.fill_diagonal(correlation, 1.0)
+    # Two that only their ratio determines are correlated nearly to one, which rounding may carry beyond.
+    w, V = np.linalg.eigh((correlation + correlation.T) / 2)
+    correlation = (V * np.maximum(w, 1e-9)) @ V.T
+    sd = np.clip(sd, 1e-6, LARGEST_SPREAD)
+    out[np.ix_(known, known)] = correlation * np.outer(sd, sd)
+    return out
+
+
+def _noise(given: list[Any], noise: Mapping[str, float] | None, channels: tuple[str, ...]) -> np.ndarray:
+    """Standard deviation of the sensor noise per channel: as given, or the least of the fits."""
+    if noise is None:
+        fits = [g for g in given if isinstance(g, Fit)]
+        noise = {c: min(f.noise[c] for f in fits) for c in channels} if fits else None
+    good = isinstance(noise, Mapping) and set(noise) == set(channels)
+    sd = [checks.real(noise[c]) for c in channels] if isinstance(noise, Mapping) and good else []
+    if not (sd and all(0 < v < np.inf for v in sd)):
+        raise InputError(
+            f"The sensor noise was given as {noise if good else checks.shown(noise)}, but every channel "
+            f"({', '.join(channels)}) needs a positive standard deviation; give "
+            "noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
+        )
+    return np.array(sd)

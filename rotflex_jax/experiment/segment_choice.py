@@ -1,0 +1,462 @@
+"""The next seconds of a sequential experiment: the input after which a wrong answer is least probable."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rotflex_jax.data import excitation
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.discrimination import SMOOTH_MAXIMUM_EXPONENT
+from rotflex_jax.experiment.input_optimisation import PENALTY_WEIGHT, PENALTY_WIDTH, SMALLEST_ASCENT_STEP
+from rotflex_jax.experiment.result import Segment
+from rotflex_jax.experiment.rival_set import BATCH, Start
+from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
+
+if TYPE_CHECKING:
+    from rotflex_jax.experiment.sequential import SequentialExperiment
+
+Progress = Callable[[str], None]
+
+# Voltage before a segment that its simulation begins with, for actuators that remember, and rest after it
+# within which the machine must stay inside its limits [s].
+BEFORE, AFTER = 0.3, 0.3
+# An input is judged by what so many repetitions of it would show, since the first alone says as much of the
+# parameters as of the rival.
+LOOK_AHEAD = 4
+# Draws from what is known of each rival's parameters; the worst counts for an input, the best for giving up.
+DRAWS = 3
+# Share of a parameter's distance to its bound that a draw leaves.
+LEFT_TO_BOUND = 0.2
+# Levels at which each standard input is tried, as shares of what the limits allow.
+LEVELS = (1.0, 0.5, 0.2)
+# Inputs that are improved by gradient, evaluations of each, and shares of the voltage limit of its steps.
+IMPROVED, LOOKS, FIRST_STEP, MOMENTUM = 4, 40, 0.3, 0.5
+# A log-likelihood ratio of mean T has the variance 2T: beyond so many deviations it is left out of account.
+DEVIATIONS = 2.0
+# Cuts by which an input is brought within the limits on motion.
+CUTS = 6
+# Inputs that a table lists.
+LISTED = 8
+# A shift of a logarithm beyond this is no longer a small change; the slope is then taken without it.
+LARGEST_SHIFT = 1.0
+
+
+class SegmentChoice:
+    """Chooses the next segment from where an experiment stands."""
+
+    def __init__(self, e: "SequentialExperiment") -> None:
+        self.e, self.r, self.limits = e, e.rivals, e.settings.limits
+        self.M, self.before = e.samples, e._before
+        self.after = round(AFTER / self.r.Ts)
+        self.p = np.maximum(e.probabilities, 1e-12)
+        self.rng = np.random.default_rng([e.settings.seed, len(e.history)])
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Where each rival's runs begin, along what they may be wrong, and draws of them."""
+        r, e = self.r, self.e
+        n, o, q = self.r.layout.size, len(r.own), 2 * r.layout.n
+        goes_on = bool(e.runs) and e.settings.continues
+        self.history = e.runs[-1].u[-self.before :] if goes_on else np.zeros(self.before)
+        self.pose = e.runs[-1].y[0] if goes_on else np.zeros(len(r.structure.channels))
+        values, x0, self.dvalues, self.dx0, self.information, self.nominal = [], [], [], [], [], []
+        drawn: list[list[tuple[np.ndarray, np.ndarray]]] = []
+        for h in range(r.count):
+            m, own = len(r.free[h]), np.zeros(o)
+            machine, state, prior = r.prior_mean[h], r.rest.copy(), r.prior_covariance[h]
+            spread = np.concatenate([np.zeros(m), np.ones(o + q)])
+            slope_x = np.zeros((n, m + o + q))
+            slope_x[np.arange(q), m + o + np.arange(q)] = 1.0
+            if e.runs:
+                post, D = e.posteriors[h], m + r.run_unknowns
+                machine = post.unknowns[:m]
+                last = np.concatenate([np.arange(m), len(post.unknowns) - r.run_unknowns + np.arange(o + q)])
+                cov = post.covariance(e.scale, last if goes_on else np.arange(m))
+                if goes_on:
+                    own = post.unknowns[last[m : m + o]]
+                    state, slope_x = post.state, post.state_slope
+                prior = cov
+            if not goes_on:
+                D = m + o + q
+                cov = np.zeros((D, D))
+                cov[:m, :m] = prior
+                fresh = r._precision(h, 1)[m:, m:]
+                cov[m:, m:] = np.linalg.inv(fresh)
+            v, slope = r.values_and_slopes(h, machine, own)
+            seeds, _ = r._seeds(h, slope)
+            dx = np.zeros((len(seeds), n))
+            dx[: m + o + q] = slope_x.T
+            values.append(v)
+            x0.append(state)
+            self.nominal.append((machine, own))
+            self.dvalues.append(seeds)
+            self.dx0.append(dx)
+            self.information.append(np.linalg.inv(cov + 1e-12 * np.diag(np.diag(cov))))
+            # A run that is still to begin starts at rest: only the machine is drawn.
+            loose = cov if goes_on else cov * np.outer(1 - spread, 1 - spread)
+            w, V = np.linalg.eigh((loose + loose.T) / 2)
+            steps = (V * np.sqrt(np.maximum(w, 0))) @ self.rng.standard_normal((len(w), DRAWS))
+            drawn.append([(self._likely(h, v, seeds[: len(d)].T @ d), state + slope_x @ d) for d in steps.T])
+        self.values, self.x0, self.drawn = np.array(values), np.array(x0), drawn
+        self.machine_own = [len(r.free[h]) + o + q for h in range(r.count)]
+
+    def _likely(self, h: int, values: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Values of a draw: a change of physical values, of which some distance to a bound is left.
+
+        A logarithm that is hardly known would grow a small effect out of all proportion.
+        """
+        out, lower, upper = values + change, self.r.transform.lower, self.r.transform.upper
+        with np.errstate(invalid="ignore"):
+            out = np.where(np.isfinite(lower), np.maximum(out, lower + LEFT_TO_BOUND * (values - lower)), out)
+            return np.where(
+                np.isfinite(upper), np.minimum(out, upper - LEFT_TO_BOUND * (upper - values)), out
+            )
+
+    # -- runs --------------------------------------------------------------------------------------
+
+    def _windows(self, U: np.ndarray) -> np.ndarray:
+        """Voltages with what was played before and rest after (B, W)."""
+        B = len(U)
+        return np.concatenate([np.tile(self.history, (B, 1)), U, np.zeros((B, self.after))], axis=1)
+
+    def _start(self, h: np.ndarray) -> Start:
+        return Start(self.values[h], self.r.gates[h], self.x0[h])
+
+    def outputs(self, U: Float[np.ndarray, "B M"], drawn: bool = False) -> Float[np.ndarray, "B H draws W C"]:
+        """Outputs (B, H, 1 or draws, W, C) from the segment on."""
+        B, H = len(U), self.r.count
+        windows, rows, values, x0 = self._windows(U), [], [], []
+        for b in range(B):
+            for h in range(H):
+                for v, x in self.drawn[h] if drawn else [(self.values[h], self.x0[h])]:
+                    rows.append((b, h))
+                    values.append(v)
+                    x0.append(x)
+        which = np.array(rows)
+        start = Start(np.array(values), self.r.gates[which[:, 1]], np.array(x0))
+        y = self.r.outputs(start, windows[which[:, 0]])[:, self.before :]
+        return y.reshape(B, H, -1, *y.shape[1:])
+
+    def peaks(self, U: Float[np.ndarray, "B M"], drawn: bool = True) -> Float[np.ndarray, "B C"]:
+        """Largest |output| per channel (B, C), from the pose in which the run began, whichever is true."""
+        runs = [self.outputs(U)] + ([self.outputs(U, drawn=True)] if drawn else [])
+        most = [np.max(np.abs(y - self.pose), axis=(1, 2, 3)) for y in runs]
+        return np.nan_to_num(np.max(most, axis=0), nan=np.inf)
+
+    def within_limits(
+        self, U: Float[np.ndarray, "B M"]
+    ) -> tuple[Float[np.ndarray, "B M"], Bool[np.ndarray, " B"]]:
+        """Voltages cut down until predicted peaks are within the limits, and which of them are."""
+        U, bound = U.copy(), self.limits.outputs(len(self.pose))
+        ok = np.zeros(len(U), bool)
+        for k in range(CUTS + 1):
+            todo = np.flatnonzero(~ok)
+            if not len(todo):
+                break
+            excess = np.max(self.peaks(U[todo]) / bound, axis=1)
+            ok[todo[excess <= 1]] = True
+            over = todo[excess > 1]
+            if k < CUTS:
+                U[over] *= (0.98 / np.clip(excess[excess > 1], 1.02, 5.0))[:, None]
+        return U, ok
+
+    # -- information -------------------------------------------------------------------------------
+
+    def evidence(
+        self, U: Float[np.ndarray, "B M"], repeats: Sequence[float], drawn: bool, shift: bool = False
+    ) -> tuple[Float[np.ndarray, "n B H draws H"], Any]:
+        """Expected log-likelihood by which h wins over r if h is true, after repeats of each input [nat].
+
+            c_r = min over d of  n/2 |L (y - y_r - J_r d)|^2 + 1/2 d' I_r d,     T = c_r - c_h
+
+        with `y` the run of h with its most probable parameters or with drawn ones, which h too must be
+        fitted to.
+
+        Args:
+            U: Voltages.
+            repeats: Numbers of repetitions n.
+            drawn: Whether the true parameters are drawn too.
+            shift: Whether the minimising `d` and residuals are wanted, for gradients.
+
+        Returns:
+            (n, B, H, draws, H) and for each input and pair the residuals and `d`, if wanted.
+        """
+        group, parts, details = max(1, BATCH // self.r.count), [], []
+        for k in range(0, len(U), group):
+            part, detail = self._evidence_of(U[k : k + group], repeats, drawn, shift)
+            parts.append(part)
+            details += detail
+        return np.concatenate(parts, axis=1), details
+
+    def _evidence_of(
+        self, U: np.ndarray, repeats: Sequence[float], drawn: bool, shift: bool
+    ) -> tuple[np.ndarray, list[Any]]:
+        r, H, B = self.r, self.r.count, len(U)
+        hs = np.tile(np.arange(H), B)
+        windows = np.repeat(self._windows(U), H, axis=0)
+        y, J = r.outputs_with_slopes(
+            self._start(hs), windows, np.array(self.dvalues)[hs], np.array(self.dx0)[hs]
+        )
+        inside = slice(self.before, self.before + self.M)
+        y = y[:, inside].reshape(B, H, 1, self.M, -1)
+        J = J[:, inside].reshape(B, H, *J[:, inside].shape[1:])
+        true = np.concatenate([y, self.outputs(U, drawn=True)[..., : self.M, :]], axis=2) if drawn else y
+        out, details = np.zeros((len(repeats), B, H, true.shape[2], H)), [{} for _ in range(B)]
+        root = math.sqrt(self.e.scale)
+        for b in range(B):
+            for other in range(H):
+                D = self.machine_own[other]
+                A = r.whitened(other, np.moveaxis(J[b, other, ..., :D], -1, 0)) / root
+                A = A.reshape(D, -1).T
+                G = A.T @ A
+                for h in range(H):
+                    if h == other and not drawn:
+                        continue
+                    e = r.whitened(other, true[b, h] - y[b, other]) / root
+                    e = e.reshape(len(e), -1)
+                    c, g = np.sum(e**2, axis=1), e @ A
+                    for i, n in enumerate(repeats):
+                        d = np.linalg.solve(self.information[other] + n * G, n * g.T)
+                        out[i, b, h, :, other] = 0.5 * n * (c - np.sum(g * d.T, axis=1))
+                    if shift and h != other:
+                        details[b][h, other] = ((e[0] - A @ d[:, 0]).reshape(self.M, -1), d[:, 0])
+        own = np.einsum("ibhdh->ibhd", out)
+        out = np.nan_to_num(out - own[..., None], nan=0.0, posinf=0.0, neginf=0.0)
+        if shift:
+            for b in range(B):
+                details[b]["outputs"] = y[b, :, 0]
+        return out, details
+
+    def bound(self, T: Float[np.ndarray, "*B H H"]) -> Float[np.ndarray, "*B"]:
+        """Logarithm of a bound of the probability of a wrong answer, from evidence (..., H, H).
+
+            sum over pairs of  sqrt(p_h p_r) exp(-T_hr / 4)
+
+        Source: T. Kailath, The divergence and Bhattacharyya distance measures in signal selection, IEEE
+            Trans. Communication Technology 15, 1967.
+        """
+        terms = self._terms(T)
+        top = terms.max(axis=(-1, -2), keepdims=True)
+        return np.asarray(np.log(np.sum(np.exp(terms - top), axis=(-1, -2))) + top[..., 0, 0])
+
+    def _terms(self, T: np.ndarray) -> np.ndarray:
+        half = 0.5 * (np.log(self.p)[:, None] + np.log(self.p)[None, :]) - math.log(2)
+        return np.where(np.eye(self.r.count, dtype=bool), -np.inf, half - T / 4)
+
+    def usefulness(self, T: Float[np.ndarray, "*B H H"]) -> Float[np.ndarray, "*B"]:
+        """Evidence (...,) that, if all pairs had it, would give the same bound [nat]."""
+        return np.asarray(4 * (self.bound(np.zeros((self.r.count,) * 2)) - self.bound(T)))
+
+    # -- choice ------------------------------------------------------------------------------------
+
+    def _standard(self) -> list[tuple[str, str, np.ndarray]]:
+        """Standard inputs of one segment, new ones each time, at several levels."""
+        N, Ts, V, out = self.M, self.r.Ts, self.limits.voltage, []
+        seed, top = int(self.rng.integers(2**31)), 0.4 / Ts
+        low = max(0.5, 1 / (N * Ts))
+        made = []
+        for corner in (2.0, 5.0, 15.0, 40.0):
+            u = excitation.noise(N, Ts, rms=V / NOISE_CREST, bandwidth=corner, seed=seed)
+            made.append(("noise", f"{corner:g} Hz", u))
+        for high in (6.0, 12.0, 30.0, 80.0):
+            band = (low, max(2 * low, min(high, top)))
+            u = excitation.multisine(N, Ts, band=band, rms=V / MULTISINE_CREST, seed=seed)
+            made.append(("multisine", f"to {band[1]:g} Hz", u))
+            made.append(("sweep", f"to {band[1]:g} Hz", excitation.sweep(N, Ts, band=band, amplitude=V)))
+        for hold in (0.1, 0.05, 0.02, 0.01):
+            u = excitation.prbs(N, Ts, amplitude=V, hold=max(hold, Ts), seed=seed)
+            made.append(("prbs", f"held {1e3 * max(hold, Ts):g} ms", u))
+        for hold in ((0.15, 0.8), (0.05, 0.3), (0.02, 0.1)):
+            u = excitation.steps(N, Ts, amplitude=V, hold=hold, seed=seed)
+            made.append(("steps", f"held {1e3 * hold[0]:g} to {1e3 * hold[1]:g} ms", u))
+        for kind, setting, u in made:
+            out.append((kind, setting, u - u.mean()))
+        if self.e.history and self.e.history[-1].input == "design":
+            out.append(("design", "as the last one", self.e.runs[-1].u[-self.M :]))
+        return out
+
+    def best(self, say: Progress) -> tuple[Segment, str]:
+        """The segment with the least expected error, and why none would decide, if so."""
+        e, Ts = self.e, self.r.Ts
+        named = self._standard()
+        U = np.array([self.limits.playable(u, Ts) for *_, u in named])
+        U, ok = self.within_limits(U)
+        if not ok.any():
+            raise InputError(
+                "The machine is predicted to leave the limits on travel or deflection under the smallest "
+                "voltage, which an offset or its motion may do; widen the limits, or bring it to rest first."
+            )
+        named = [(k, s, level) for level in LEVELS for (k, s, _), good in zip(named, ok, strict=True) if good]
+        U = np.concatenate([level * U[ok] for level in LEVELS])
+        left = max(1.0, (e.settings.max_seconds - e.seconds) / e.settings.segment_seconds)
+        repeats = (float(min(LOOK_AHEAD, left)), left)
+        T, _ = self.evidence(U, repeats, drawn=True)
+        score = self.usefulness(T[0].min(axis=2))
+        tried = len(U)
+        if e.settings.improve:
+            starts = self._distinct(np.argsort(-score), named)
+            say(f"improving {len(starts)} inputs")
+            designs = self._improved(U[starts], repeats[0])
+            designs, ok = self.within_limits(np.array([self.limits.playable(u, Ts) for u in designs]))
+            if ok.any():
+                new, _ = self.evidence(designs[ok], repeats, drawn=True)
+                T, U = np.concatenate([T, new], axis=1), np.concatenate([U, designs[ok]])
+                score = np.concatenate([score, self.usefulness(new[0].min(axis=2))])
+                from_ = [named[i] for i, good in zip(starts, ok, strict=True) if good]
+                named += [("design", f"from {k}, {s}", 1.0) for k, s, _ in from_]
+                tried = len(U)
+        order = np.argsort(-score)
+        top = order[0]
+        peaks = self.peaks(U[top : top + 1])[0]
+        label = lambda i: (named[i][0], named[i][1] + (f", x {named[i][2]:g}" if named[i][2] != 1 else ""))  # noqa: E731
+        worst = np.maximum(T[0, top].min(axis=1), 0.0)
+        segment = Segment(
+            rivals=self.r.labels,
+            u=U[top],
+            Ts=Ts,
+            input=label(top)[0],
+            setting=label(top)[1],
+            nats=worst,
+            expected_error=float(min(0.5, math.exp(self.bound(worst)))),
+            probabilities=tuple(e.probabilities.tolist()),
+            repeats=repeats[0],
+            peaks=dict(zip(self.r.structure.channels, peaks.tolist(), strict=True)),
+            table=tuple((*label(i), float(score[i])) for i in order[:LISTED]),
+            tried=tried,
+            limits=self.limits,
+            outputs=self.outputs(U[top : top + 1])[0, :, 0, : self.M],
+            channels=self.r.structure.channels,
+        )
+        return segment, self._too_small(T[1], left, tried, label(int(order[0])))
+
+    def _distinct(self, order: np.ndarray, named: list[Any]) -> list[int]:
+        """The best input of each of the best kinds."""
+        chosen, kinds = [], set()
+        for i in order:
+            if named[i][:2] not in kinds:
+                kinds.add(named[i][:2])
+                chosen.append(int(i))
+            if len(chosen) == IMPROVED:
+                break
+        return chosen
+
+    def _too_small(self, T: np.ndarray, left: float, tried: int, best: tuple[str, str]) -> str:
+        """Why no input would decide in the time that is left; empty if one may.
+
+        Whichever rival is true, some other stays possible even under the best input, the most favourable
+        parameters and a lucky draw of the noise.
+        """
+        p, error, H = self.p, self.e.settings.error, self.r.count
+        alive = [h for h in range(H) if p[h] > error / (10 * H)]
+        reached = np.maximum(T.max(axis=(0, 2)), 0.0)
+        stuck = {}
+        for h in alive:
+            needs = math.log((1 - error) / error) - np.log(p[h] / p)
+            lucky = reached[h] + DEVIATIONS * np.sqrt(2 * reached[h])
+            others = [r for r in alive if r != h and lucky[r] < needs[r]]
+            if not others:
+                return ""
+            stuck[h] = max(others, key=lambda r: p[r])
+        if len(alive) < 2:
+            return ""
+        h = max(alive, key=lambda h: p[h])
+        r = stuck[h]
+        names, s = self.r.labels, self.e.settings
+        gain = max(float(reached[h, r]), float(reached[r, h]))
+        need = max(0.0, math.log((1 - error) / error) - math.log(p[h] / p[r]))
+        return (
+            f"No experiment within these limits distinguishes {names[h]} from {names[r]}: after "
+            f"{self.e.seconds:g} s on the rig the best of {tried} inputs ({', '.join(best)}) would bring at "
+            f"most {gain:.2g} nats in the {left * s.segment_seconds:.3g} s that are left, and {need:.2g} are "
+            "needed."
+        )
+
+    # -- improvement by gradient -------------------------------------------------------------------
+
+    def _value_and_slope(self, X: np.ndarray, n: float) -> tuple[np.ndarray, np.ndarray]:
+        """Logarithm of the usefulness less penalties of peaks, and its slope along inputs per limit."""
+        r, H, S, Ts = self.r, self.r.count, len(X), self.r.Ts
+        played = [self.limits.playable_with_sources(self.limits.voltage * x, Ts) for x in X]
+        U = np.array([u for u, _, _ in played])
+        T, details = self.evidence(U, (n,), drawn=False, shift=True)
+        T = T[0, :, :, 0]
+        useful = np.maximum(self.usefulness(T), 1e-12)
+        terms = self._terms(T)
+        share = np.exp(terms - terms.max(axis=(1, 2), keepdims=True))
+        share /= share.sum(axis=(1, 2), keepdims=True)
+        root, C, bound = math.sqrt(self.e.scale), len(self.pose), self.limits.outputs(len(self.pose))
+        value, W = np.log(useful), self.before + self.M + self.after
+        rows: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
+        finite = np.isfinite(bound)
+        for s in range(S):
+            own = np.zeros((H, W, C))
+            for h in range(H):
+                y = details[s]["outputs"][h] - self.pose
+                size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
+                excess = np.log(np.maximum(size / bound, 1e-12))
+                quadratic = np.clip(np.where(finite, excess, 0.0), 0.0, PENALTY_WIDTH)
+                penalty = quadratic**2 / (2 * PENALTY_WIDTH) + np.where(
+                    finite, np.maximum(excess - PENALTY_WIDTH, 0.0), 0.0
+                )
+                value[s] -= PENALTY_WEIGHT * float(np.sum(penalty))
+                power = np.abs(y / size) ** (SMOOTH_MAXIMUM_EXPONENT - 1) * np.sign(y)
+                slope = power / np.sum(np.abs(y / size) ** SMOOTH_MAXIMUM_EXPONENT, axis=0) / size
+                own[h, self.before : self.before + self.M] -= (
+                    PENALTY_WEIGHT * quadratic / PENALTY_WIDTH * slope
+                )
+                for other in range(H):
+                    if other == h:
+                        continue
+                    left, d = details[s][h, other]
+                    back = r.whitened(other, left, adjoint=True) / root
+                    back = n * share[s, h, other] / useful[s] * back
+                    own[h, self.before : self.before + self.M] += back
+                    weight = np.zeros((W, C))
+                    weight[self.before : self.before + self.M] = -back
+                    rows.append((s, *self._moved(other, d), weight))
+                rows.append((s, h, self.values[h], self.x0[h], own[h]))
+        which = np.array([row[0] for row in rows])
+        start = Start(
+            np.array([row[2] for row in rows]),
+            r.gates[[row[1] for row in rows]],
+            np.array([row[3] for row in rows]),
+        )
+        g = r.input_slopes(start, self._windows(U)[which], np.array([row[4] for row in rows]))
+        g = np.nan_to_num(g[:, self.before : self.before + self.M])
+        total = np.zeros((S, self.M))
+        np.add.at(total, which, g)
+        out = [
+            self.limits.voltage * (np.bincount(low, t, self.M) + np.bincount(high, t, self.M)) / 2
+            for t, (_, low, high) in zip(total, played, strict=True)
+        ]
+        return value, np.array(out)
+
+    def _moved(self, h: int, d: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+        """A rival with its unknowns shifted: its number, values and first state."""
+        m, o = len(self.r.free[h]), len(self.r.own)
+        if np.any(np.abs(d[: m + o]) > LARGEST_SHIFT):
+            d = np.zeros_like(d)
+        machine, own = self.nominal[h]
+        values = self.r.values_and_slopes(h, machine + d[:m], own + d[m : m + o])[0]
+        return h, values, self.x0[h] + self.dx0[h][: len(d)].T @ d
+
+    def _improved(self, U: np.ndarray, n: float) -> np.ndarray:
+        """Inputs after gradient ascent, several at once: a step that gains is lengthened, else cut."""
+        x = np.clip(U / self.limits.voltage, -1.0, 1.0)
+        value, g = self._value_and_slope(x, n)
+        way, step = g.copy(), np.full(len(x), FIRST_STEP)
+        for _ in range(LOOKS):
+            size = np.sqrt(np.mean(way**2, axis=1))
+            if not np.any((step > SMALLEST_ASCENT_STEP) & (size > 0)):
+                break
+            trial = np.clip(x + (step / np.maximum(size, 1e-300))[:, None] * way, -1.0, 1.0)
+            new, slope = self._value_and_slope(trial, n)
+            better = new > value
+            ratio = np.linalg.norm(slope, axis=1) / np.maximum(np.linalg.norm(way, axis=1), 1e-300)
+            way = np.where(better[:, None], MOMENTUM * ratio[:, None] * way + slope, way)
+            x, value = np.where(better[:, None], trial, x), np.where(better, new, value)
+            step = np.where(better, np.minimum(1.6 * step, 20.0), step / 4)
+        return self.limits.voltage * x

@@ -1,0 +1,571 @@
+"""Experiments that stop by themselves: a few seconds are chosen, played and judged, until it is decided.
+
+Each segment is the one after which the expected probability of a wrong answer is least; after each the
+rivals are fitted to everything recorded so far and their probabilities follow. It ends when one is probable
+enough (Wald's sequential test), when the time is up, or when no input within the limits would decide.
+"""
+
+import dataclasses
+import functools
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax import checks
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, plain_limits
+from rotflex_jax.experiment.rig import Rig, checked_limits
+from rotflex_jax.experiment.rival_set import UNKNOWN_SHARE, RivalPosterior, RivalSet, RunData, rival_set
+from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
+from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.fit.greybox import fit
+from rotflex_jax.models import model_json
+from rotflex_jax.recording import Recording
+from rotflex_jax.text.files import write_file
+
+Progress = Callable[[str], None]
+
+SEGMENT_SECONDS, MOST_SECONDS, ERROR = 1.0, 60.0, 0.01
+SHORTEST_SEGMENT = 0.4
+KIND = "rotflex_jax sequential experiment"
+# Segments that are played before giving up, and times in turn that the gain must be too small.
+TRIED, IN_TURN = 2, 2
+# Segments after which fits start from other shapes of an effect too.
+SHAPES_AFTER = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class SequentialSettings:
+    """How a sequential experiment is run.
+
+    Attributes:
+        limits: What the machine bears.
+        segment_seconds: Length of a segment [s].
+        error: Probability of a wrong answer at which it stops.
+        max_seconds: Time on the rig at which it stops [s].
+        continues: Whether the motion goes on from one segment to the next.
+        improve: Whether inputs are improved by gradient.
+        seed: Of standard inputs and draws.
+    """
+
+    limits: Limits
+    segment_seconds: float = SEGMENT_SECONDS
+    error: float = ERROR
+    max_seconds: float = MOST_SECONDS
+    continues: bool = True
+    improve: bool = True
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class SequentialExperiment:
+    """Where a sequential experiment stands; each step makes a new one.
+
+    Attributes:
+        rivals: The models.
+        settings: How it is run.
+        prior: Probability of each before the first segment.
+        runs: What was played and recorded, each run without a pause.
+        unknowns: Most probable unknowns of each rival.
+        history: One entry for each segment.
+        too_small: Times in turn that no input promised to decide.
+        verdict: `decided`, `time is up`, `not distinguishable`, or empty while it goes on.
+        reason: What the verdict rests on where nothing was decided.
+        planned: The segment to play next.
+    """
+
+    rivals: RivalSet
+    settings: SequentialSettings
+    prior: Float[np.ndarray, " H"]
+    runs: tuple[RunData, ...] = ()
+    unknowns: tuple[Float[np.ndarray, " _"], ...] = ()
+    history: tuple[SequentialStep, ...] = ()
+    too_small: int = 0
+    verdict: str = ""
+    reason: str = ""
+    planned: Segment | None = None
+
+    # -- what is known -----------------------------------------------------------------------------
+
+    @property
+    def samples(self) -> int:
+        """Samples of a segment."""
+        return round(self.settings.segment_seconds / self.rivals.Ts)
+
+    @property
+    def seconds(self) -> float:
+        """Time on the rig so far [s]."""
+        return sum(len(r.u) for r in self.runs) * self.rivals.Ts
+
+    @property
+    def _before(self) -> int:
+        return round(BEFORE / self.rivals.Ts)
+
+    @functools.cached_property
+    def posteriors(self) -> tuple[RivalPosterior, ...]:
+        """What is known of each rival after all recordings."""
+        place = len(self.runs[-1].u) - self._before
+        return tuple(
+            self.rivals.posterior(h, x, self.runs, place, self.samples) for h, x in enumerate(self.unknowns)
+        )
+
+    @functools.cached_property
+    def scale(self) -> float:
+        """Variance of the whitened residuals of the best rival, at least one, times their correlation.
+
+        What no rival explains makes each of them less sure.
+        """
+        if not self.runs:
+            return 1.0
+        best = min(self.posteriors, key=lambda p: p.cost)
+        if not math.isfinite(best.cost):
+            return 1.0
+        count = sum(w.size for w in best.residuals)
+        variance = 2 * best.cost / max(count - len(best.unknowns), 1)
+        return max(1.0, variance * _correlation_time(best.residuals))
+
+    @functools.cached_property
+    def probabilities(self) -> Float[np.ndarray, " H"]:
+        """Probability of each rival."""
+        if not self.runs:
+            return self.prior
+        logs = np.array([p.log_evidence(self.scale) for p in self.posteriors])
+        if not np.any(np.isfinite(logs)):
+            return self.prior
+        with np.errstate(divide="ignore"):
+            logs = logs - np.max(logs) + np.log(self.prior)
+        weight = np.exp(logs - np.max(logs))
+        return weight / weight.sum()
+
+    # -- state of an experiment on disk ------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types, from which `from_dict` makes the same again, bit for bit."""
+        r, planned = self.rivals, self.planned
+        return {
+            "kind": KIND,
+            "schema": 1,
+            "models": {
+                n: model_json.to_dict(model_json.Saved(m)) for n, m in zip(r.labels, r.models, strict=True)
+            },
+            "covariances": [c.tolist() for c in r.prior_covariance],
+            "Ts": r.Ts,
+            "noise": dict(zip(r.structure.channels, r.noise.tolist(), strict=True)),
+            "process_noise": dict(r.process_noise),
+            "settings": dataclasses.asdict(self.settings) | {"limits": plain_limits(self.settings.limits)},
+            "prior": self.prior.tolist(),
+            "runs": [{"u": x.u.tolist(), "y": x.y.tolist()} for x in self.runs],
+            "unknowns": [x.tolist() for x in self.unknowns],
+            "history": [s.to_dict() for s in self.history],
+            "too_small": self.too_small,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "planned": None
+            if planned is None
+            else {
+                f.name: v.tolist() if isinstance(v := getattr(planned, f.name), np.ndarray) else v
+                for f in dataclasses.fields(planned)
+                if f.name != "limits"
+            },
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "SequentialExperiment":
+        """The experiment that `to_dict` described.
+
+        Raises:
+            InputError: It is none, or one of a later version.
+        """
+        if not isinstance(data, Mapping) or data.get("kind") != KIND or data.get("schema") != 1:
+            raise InputError(
+                "The state of a sequential experiment is needed, but the file holds something else; give one "
+                "that `rotflex experiment --state` has written."
+            )
+        try:
+            models = {n: model_json.from_dict(m).model for n, m in data["models"].items()}
+            rivals = rival_set(
+                models, Ts=data["Ts"], noise=data["noise"], process_noise=data["process_noise"]
+            )
+            covariances = tuple(np.array(c, float) for c in data["covariances"])
+            rivals = dataclasses.replace(rivals, prior_covariance=covariances)
+            given = dict(data["settings"])
+            bounds = {k: math.inf if v is None else v for k, v in given.pop("limits").items()}
+            settings = SequentialSettings(Limits(**bounds), **given)
+            planned = data["planned"]
+            if planned is not None:
+                arrays = {k: np.array(planned[k], float) for k in ("u", "nats", "outputs")}
+                tuples = {k: tuple(planned[k]) for k in ("rivals", "probabilities", "channels")}
+                table = tuple(tuple(row) for row in planned["table"])
+                planned = Segment(**(planned | arrays | tuples | {"table": table, "limits": settings.limits}))
+            channels = len(rivals.noise)
+            return cls(
+                rivals,
+                settings,
+                np.array(data["prior"], float),
+                tuple(
+                    RunData(np.array(x["u"], float), np.array(x["y"], float).reshape(-1, channels))
+                    for x in data["runs"]
+                ),
+                tuple(np.array(x, float) for x in data["unknowns"]),
+                tuple(SequentialStep(**s) for s in data["history"]),
+                int(data["too_small"]),
+                str(data["verdict"]),
+                str(data["reason"]),
+                planned,
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"The state of the experiment is incomplete or was changed by hand ({type(error).__name__}); "
+                "begin the experiment again."
+            ) from None
+
+    def save(self, path: str | Path) -> Path:
+        """Write the state as JSON; `load` reads it.
+
+        Raises:
+            InputError: The file cannot be written; an old one stays.
+        """
+        return write_file(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> "SequentialExperiment":
+        """The state that `save` has written.
+
+        Raises:
+            InputError: No such file, or none of a sequential experiment.
+        """
+        try:
+            data = json.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(
+                f"{path} cannot be read ({error.strerror}); give one that `rotflex experiment --state` wrote."
+            ) from None
+        except (ValueError, RecursionError):
+            raise InputError(
+                f"{path} is not JSON; give a file that `rotflex experiment --state` has written."
+            ) from None
+        return cls.from_dict(data)
+
+    # -- the next segment --------------------------------------------------------------------------
+
+    def with_next_segment(self, progress: Progress | None = None) -> "SequentialExperiment":
+        """The same with the next segment planned, or with the verdict that none would decide."""
+        if self.verdict or self.planned is not None:
+            return self
+        planner = SegmentChoice(self)
+        segment, reason = planner.best(progress or (lambda _: None))
+        too_small = self.too_small + 1 if reason else 0
+        if too_small >= IN_TURN and len(self.history) >= TRIED:
+            return dataclasses.replace(
+                self, too_small=too_small, verdict="not distinguishable", reason=reason
+            )
+        return dataclasses.replace(self, too_small=too_small, planned=segment)
+
+    def with_recording(self, recording: Recording | Float[np.ndarray, "N C"]) -> "SequentialExperiment":
+        """The same after the planned segment was played.
+
+        Args:
+            recording: Outputs at the instants of the voltage, or a recording.
+
+        Raises:
+            InputError: No segment is planned, or what was recorded is not of it.
+        """
+        if self.planned is None:
+            raise InputError("A recording was given, but no segment is planned; plan the next one first.")
+        run = _checked(recording, self.planned, self.rivals)
+        r, runs = self.rivals, self.runs
+        own = [r.first_unknowns(run)] if not runs or not self.settings.continues else []
+        if own:
+            runs = (*runs, run)
+        else:
+            last = runs[-1]
+            whole = RunData(np.concatenate([last.u, run.u]), np.concatenate([last.y, run.y]))
+            runs = (*runs[:-1], whole)
+        place, unknowns = len(runs[-1].u) - self._before, []
+        for h in range(r.count):
+            start = np.concatenate([self.unknowns[h] if self.unknowns else r.prior_mean[h], *own])
+            starts = [start]
+            if len(self.history) < SHAPES_AFTER:
+                starts += r.other_shapes(h, start)
+            unknowns.append(r.fitted(h, starts, runs, place, self.samples).unknowns)
+        new = dataclasses.replace(self, runs=runs, unknowns=tuple(unknowns), planned=None)
+        p = new.probabilities
+        step = SequentialStep(
+            seconds=new.seconds,
+            input=self.planned.input,
+            setting=self.planned.setting,
+            voltage=float(np.max(np.abs(run.u))),
+            expected_error=self.planned.expected_error,
+            probabilities=dict(zip(r.labels, p.tolist(), strict=True)),
+            misfit=math.sqrt(new.scale),
+        )
+        verdict = ""
+        if np.max(p) >= 1 - self.settings.error:
+            verdict = "decided"
+        elif new.seconds > self.settings.max_seconds - 0.5 * self.settings.segment_seconds:
+            verdict = "time is up"
+        return dataclasses.replace(new, history=(*self.history, step), verdict=verdict)
+
+    def result(self) -> SequentialResult:
+        """What is known now, as a result."""
+        r, s = self.rivals, self.settings
+        notes = []
+        if self.history and self.scale > 4:
+            notes.append(
+                "No rival explains the recordings: what the best one leaves counts as "
+                f"{math.sqrt(self.scale):.1f} times the noise of the sensors, and probabilities are among "
+                "these rivals only."
+            )
+        return SequentialResult(
+            rivals=r.labels,
+            verdict=self.verdict or "going on",
+            probabilities=dict(zip(r.labels, self.probabilities.tolist(), strict=True)),
+            prior=dict(zip(r.labels, self.prior.tolist(), strict=True)),
+            error=s.error,
+            max_seconds=s.max_seconds,
+            seconds=self.seconds,
+            history=self.history,
+            runs=tuple(
+                Recording(u=x.u, y=x.y, Ts=r.Ts, channels=r.structure.channels, accept=_ANYTHING)
+                for x in self.runs
+            ),
+            limits=s.limits,
+            reason=self.reason,
+            notes=tuple(notes),
+        )
+
+
+_ANYTHING = ("constant", "saturated")
+
+
+def _correlation_time(residuals: Sequence[np.ndarray]) -> float:
+    """Samples that say as much as one independent one, at least 1; of the most correlated channel.
+
+    Source: A. D. Sokal, Monte Carlo methods in statistical mechanics, 1997, section 3: the sum of the
+    autocorrelation to five times itself.
+    """
+    most = 1.0
+    for w in residuals:
+        for e in (w - w.mean(axis=0)).T:
+            N = len(e)
+            power = np.abs(np.fft.rfft(e, 2 * N)) ** 2
+            r = np.fft.irfft(power)[:N]
+            if r[0] > 0:
+                tau = 2 * np.cumsum(r / r[0]) - 1
+                window = np.arange(N) >= 5 * tau
+                most = max(most, float(tau[np.argmax(window)] if window.any() else tau.max()))
+    return most
+
+
+def _checked(recording: Any, planned: Segment, rivals: RivalSet) -> RunData:
+    """Voltage and outputs of the segment."""
+    N, channels = len(planned.u), rivals.structure.channels
+    if isinstance(recording, Recording):
+        if abs(recording.Ts / rivals.Ts - 1) > 1e-3:
+            raise InputError(
+                f"The recording has a sampling period of {recording.Ts:g} s, but the experiment one of "
+                f"{rivals.Ts:g} s; record at that rate."
+            )
+        if set(recording.channels) < set(channels):
+            raise InputError(
+                f"The recording has the channels {', '.join(recording.channels)}, but the models "
+                f"{', '.join(channels)}; record these."
+            )
+        u = recording.u.astype(float)
+        y = np.column_stack([recording.channel(c).astype(float) for c in channels])
+    else:
+        y = np.asarray(recording)
+        u = planned.u
+        if y.dtype.kind not in "iuf" or y.ndim != 2 or y.shape[1] != len(channels):
+            raise InputError(
+                f"The rig returned {checks.shown(recording)} of shape {y.shape}, but {N} samples of "
+                f"{', '.join(channels)} are needed; return an array of shape ({N}, {len(channels)})."
+            )
+        y = y.astype(float)
+    if len(y) != N or not np.all(np.isfinite(y)):
+        flaw = "" if np.all(np.isfinite(y)) else ", some not finite"
+        raise InputError(
+            f"The recording has {len(y)} samples{flaw}, but the segment has {N}; record every sample of it, "
+            "from its first."
+        )
+    return RunData(u, y)
+
+
+def sequential_experiment(
+    models: Any,
+    limits: Limits,
+    Ts: float,
+    *,
+    probabilities: Mapping[str, float] | Sequence[float] | None = None,
+    error: float = ERROR,
+    max_seconds: float = MOST_SECONDS,
+    segment_seconds: float = SEGMENT_SECONDS,
+    continues: bool = True,
+    noise: Mapping[str, float] | None = None,
+    process_noise: Mapping[str, float] | None = None,
+    uncertainty: float = UNKNOWN_SHARE,
+    improve: bool = True,
+    seed: int = 0,
+) -> SequentialExperiment:
+    """A sequential experiment before its first segment; arguments as in `experiment_until`."""
+    error = checks.number(error, "error", above=0, below=0.5, example="0.01")
+    segment_seconds = checks.number(
+        segment_seconds, "segment_seconds", least=SHORTEST_SEGMENT, unit="s", example="1.0"
+    )
+    max_seconds = checks.number(max_seconds, "max_seconds", least=segment_seconds, unit="s", example="60.0")
+    Ts = checks.number(Ts, "Ts", above=0, below=0.05, unit="s", example="0.002")
+    rivals = rival_set(models, Ts=Ts, noise=noise, process_noise=process_noise, uncertainty=uncertainty)
+    settings = SequentialSettings(
+        checked_limits(limits),
+        segment_seconds,
+        error,
+        max_seconds,
+        bool(continues),
+        bool(improve),
+        checks.whole(seed, "seed", 0),
+    )
+    return SequentialExperiment(rivals, settings, _prior(probabilities, rivals.labels))
+
+
+def _prior(given: Any, labels: tuple[str, ...]) -> np.ndarray:
+    """Probabilities beforehand, in the order of the rivals; equal ones if none are given."""
+    if given is None:
+        return np.full(len(labels), 1 / len(labels))
+    if isinstance(given, Mapping):
+        values = [checks.real(given.get(n)) for n in labels] if set(given) == set(labels) else []
+    else:
+        values = [checks.real(x) for x in given] if isinstance(given, Sequence | np.ndarray) else []
+    p = np.array(values)
+    if len(p) != len(labels) or not (np.all(np.isfinite(p)) and np.all(p >= 0) and p.sum() > 0):
+        raise InputError(
+            f"Argument `probabilities` must have a number from 0 for each of {', '.join(labels)}, but is "
+            f"{checks.shown(given)}; give one for each, or leave it out."
+        )
+    return p / p.sum()
+
+
+def experiment_until(
+    models: Any,
+    rig: Rig,
+    *,
+    probabilities: Mapping[str, float] | Sequence[float] | None = None,
+    error: float = ERROR,
+    max_seconds: float = MOST_SECONDS,
+    segment_seconds: float = SEGMENT_SECONDS,
+    noise: Mapping[str, float] | None = None,
+    process_noise: Mapping[str, float] | None = None,
+    uncertainty: float = UNKNOWN_SHARE,
+    improve: bool = True,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> SequentialResult:
+    r"""Experiment until it is decided which of several models is true.
+
+    A segment is chosen, played and recorded; each model is fitted to all that was recorded; and the
+    probabilities follow from the averaged likelihoods,
+
+    .. math::
+        p_h \propto p_h^0 \int p(y \mid \vartheta, h)\, p(\vartheta \mid h)\, d\vartheta .
+
+    It stops when one has at least the probability `1 - error`: if one of the models is true, a wrong one is
+    then named with at most the probability `error`, averaged over the probabilities beforehand (Wald's test;
+    for two models of equal probability its thresholds are those of error rates `error` each way). It stops
+    too when the time is up, and when no input within the limits would decide in the time that is left.
+
+    Not where none of the models is near the machine: probabilities are among those given.
+
+    Args:
+        models: Name -> `Fit`, `Model` or `Mechanism`, or a list of them; or the result of a search, whose
+            probable sets of effects are fitted. A `Fit` says how well its parameters are known.
+        rig: Plays voltages, and has the limits.
+        probabilities: Of each model beforehand; equal if None, those of the search if there are some.
+        error: Probability of a wrong answer at which it stops.
+        max_seconds: Time on the rig at which it stops [s].
+        segment_seconds: Length of a segment [s].
+        noise: Channel -> standard deviation of the sensor noise; that of the fits if None.
+        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
+        uncertainty: Standard deviation of parameters that come without one, as a share of their value.
+        improve: Whether inputs are improved by gradient, or standard ones played.
+        seed: Of standard inputs and draws.
+        progress: Called with a line of text now and then.
+
+    Returns:
+        SequentialResult.
+
+    Raises:
+        InputError: No rig, fewer than two models, no noise, or a recording that does not fit.
+
+    Source: A. Wald, Sequential tests of statistical hypotheses, Annals of Mathematical Statistics 16, 1945;
+        C. W. Baum and V. V. Veeravalli, A sequential procedure for multihypothesis testing, IEEE Trans.
+        Information Theory 40, 1994; G. E. P. Box and W. J. Hill, Discrimination among mechanistic models,
+        Technometrics 9, 1967.
+    """
+    say = checks.progress(progress)
+    if not isinstance(rig, Rig):
+        raise InputError(
+            f"Argument `rig` must be a Rig, but is {checks.shown(rig)}; derive a class from rotflex_jax.Rig, "
+            "or use CallbackRig, SimulatedRig or FileRig."
+        )
+    models, found = models_of(models, say)
+    e = sequential_experiment(
+        models,
+        checked_limits(getattr(rig, "limits", None)),
+        checks.positive(getattr(rig, "Ts", None), "Ts", "s", "0.002"),
+        probabilities=found if probabilities is None else probabilities,
+        error=error,
+        max_seconds=max_seconds,
+        segment_seconds=segment_seconds,
+        continues=rig.continues,
+        noise=noise,
+        process_noise=process_noise,
+        uncertainty=uncertainty,
+        improve=improve,
+        seed=seed,
+    )
+    while not (e := e.with_next_segment(say)).verdict:
+        assert e.planned is not None
+        say(f"{e.seconds:g} s: playing {e.planned.input}, {e.planned.setting}")
+        e = e.with_recording(rig.play(e.planned.u))
+        say(e.result().standing)
+        if e.verdict:
+            break
+    return e.result()
+
+
+# Sets of effects of a search that are less probable than this are left out, and at most so many are fitted.
+LEAST_PROBABLE, MOST_SETS = 0.02, 5
+
+
+def models_of(given: Any, say: Progress) -> tuple[Any, Mapping[str, float] | None]:
+    """Models as they are; of a search's result the probable sets, fitted to its recordings.
+
+    Args:
+        given: As `models` in `experiment_until`.
+        say: Told what is fitted.
+
+    Returns:
+        Models, and name -> probability where the search had some.
+    """
+    known, train = getattr(given, "probabilities", None), getattr(given, "train", None)
+    if known is None or not train:
+        return given, None
+    models, found = {}, {}
+    for s in known.sets[:MOST_SETS]:
+        if s.probability < LEAST_PROBABLE and len(models) >= 2:
+            continue
+        m, label = given.baseline.model, " + ".join(sorted(s.effects)) or "nothing more"
+        have = {(e.name, e.at) for e in m.mechanism.effects}
+        final = {(e.name, e.at): e for e in given.model.mechanism.effects}
+        for name in sorted(s.effects):
+            at = tuple(name.split("@"))
+            if at not in have:
+                m = m + final.get(at, CATALOG[at[0]](at=at[1]))
+        say(f"fitting {label}")
+        models[label], found[label] = fit(m, list(train)), s.probability
+    return models, found
