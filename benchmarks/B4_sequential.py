@@ -25,8 +25,8 @@ from pathlib import Path
 import numpy as np
 
 import rotflex_jax as rf
-from arena.records import COUNT, JITTER, make_record
-from arena.scoring import renamed
+from rotflex_jax.arena.marking import renamed
+from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.data import excitation
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.experiment import Rig, experiment_until

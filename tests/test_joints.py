@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from arena.records import COUNT, JITTER, make_record
 from rotflex_jax import Recording, fit, joints
+from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.effects import Coulomb, Motor
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.springs import ARM_ANCHORS, HUB_ANCHORS, SIDE, SPRINGS

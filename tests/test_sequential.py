@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
-from arena.records import make_record
+from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import rival_set as rivals_module
 from rotflex_jax.experiment.rival_set import CALIBRATION_SPREAD, STATE_SPREAD

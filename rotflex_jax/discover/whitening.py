@@ -41,8 +41,8 @@ class Whitener:
         if self.a.shape[1] > 1:
             channels = [scipy.signal.lfilter(a, 1.0, e[..., c], axis=-1) for c, a in enumerate(self.a)]
             filtered = np.stack(channels, axis=-1)
-        # Channel by channel: there are few of them, and a product of matrices this thin takes several times as
-        # long for many signals.
+        # Channel by channel: a product of matrices this thin takes several times as long for many
+        # signals.
         w = np.empty(filtered.shape)
         for i, row in enumerate(self.L):
             first, *others = [j for j in range(len(row)) if row[j] != 0]
