@@ -29,8 +29,7 @@ rf.enable_compilation_cache()
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.experiment.discrimination import starts_with_other_shapes
-from rotflex_jax.experiment.rival_fit import best_rival_fit
-from rotflex_jax.experiment.rival_model import RivalModel, rival_model
+from rotflex_jax.experiment.rival_fit import RivalModel, best_rival_fit, rival_model
 from rotflex_jax.experiment.standard_inputs import standard_inputs
 from rotflex_jax.text.files import write_file
 

@@ -21,8 +21,8 @@ from collections.abc import Callable
 
 import rotflex_jax as rf
 from rotflex_jax.compare import METHODS, QUICK, Comparison
-from rotflex_jax.compare.figures import overlays, ranks
-from rotflex_jax.text.templates import write_files
+from rotflex_jax.compare.page import overlays, ranks
+from rotflex_jax.text.markup import write_files
 
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE / "results" / "B5"

@@ -20,11 +20,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = {
-    "discover/end_state.py": ("test_limits_of_verdict.py", "test_assessment.py"),
     "discover/selection.py": ("test_limits_of_decisions.py", "test_decide.py"),
     "discover/probabilities.py": ("test_probabilities.py",),
     "discover/localise.py": ("test_locate.py",),
-    "discover/stand_in.py": ("test_stand_in.py",),
+    "discover/conclusion.py": ("test_stand_in.py", "test_limits_of_verdict.py", "test_assessment.py"),
     "mechanism/friction.py": ("test_mechanism.py", "test_load_friction.py"),
 }
 LONGEST = 600.0

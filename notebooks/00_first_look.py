@@ -24,7 +24,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import rotflex_jax as rf
-from rotflex_jax.discover.conditions import missing_acceleration
+from rotflex_jax.discover.localise import missing_acceleration
 from rotflex_jax.report import figures
 
 # Models run in double precision by themselves, and nothing depends on chance: runs repeat exactly.

@@ -7,11 +7,9 @@ import numpy as np
 
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import levenberg_marquardt
+from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
+from rotflex_jax.discover.likelihood import LikelihoodProblem, levenberg_marquardt
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, scales
-from rotflex_jax.discover.whitening import Whitener
 from rotflex_jax.fit.dataset import Dataset, prepare
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, Mechanism

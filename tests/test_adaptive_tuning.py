@@ -8,8 +8,7 @@ import pytest
 from rotflex_jax.adaptive import LMS, RLS
 from rotflex_jax.adaptive.learning_curve import learning_curve
 from rotflex_jax.adaptive.moments import Moments, ar1_covariance
-from rotflex_jax.adaptive.objectives import sample_moments, tuning_data, values_at
-from rotflex_jax.adaptive.settings import RangeTransform
+from rotflex_jax.adaptive.objectives import RangeTransform, sample_moments, tuning_data, values_at
 from rotflex_jax.adaptive.step_sizes import Margin, mean_square_bound
 from rotflex_jax.adaptive.tuning import grid, loss_and_slopes, tune
 from rotflex_jax.basis import Delays, Orthonormal, Volterra

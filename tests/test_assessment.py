@@ -9,9 +9,8 @@ from rich.console import Console
 from test_report import NOISE, read, two_rounds
 
 from rotflex_jax.cli import terminal
-from rotflex_jax.discover.assessment import NATS_PER_SAMPLE, Grade, assess, grade
-from rotflex_jax.discover.end_state import end_state
-from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.discover.conclusion import end_state
+from rotflex_jax.discover.verdict import NATS_PER_SAMPLE, Grade, Verdict, assess, grade
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.labels import effect_label, effect_phrase, sentence, with_titles
 from rotflex_jax.fit.result import Fit

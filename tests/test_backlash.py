@@ -12,11 +12,10 @@ import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator import plant as arena
 from rotflex_jax.arena.simulator.laws import laws
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.score_test import scores
 from rotflex_jax.discover.supermodel import EffectLocation, build, scales
-from rotflex_jax.discover.whitening import Whitener
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare
 from rotflex_jax.joints import paper, single_inertia

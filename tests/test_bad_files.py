@@ -24,9 +24,8 @@ import scipy.sparse
 
 from rotflex_jax.cli.arguments import check_distinct
 from rotflex_jax.data import load, save_csv
-from rotflex_jax.data.binary import read_mat, table_from_parquet
+from rotflex_jax.data.binary import columns_of_parquet, read_mat, table_from_parquet
 from rotflex_jax.data.matlab import variables_of_mat
-from rotflex_jax.data.parquet import columns_of_parquet
 from rotflex_jax.data.tables import distinct
 from rotflex_jax.effects import Coulomb
 from rotflex_jax.effects.learned import LearnedTorque

@@ -21,7 +21,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.batch import Fleet, fleet, page, storage, workers
-from rotflex_jax.batch.code_digest import code_text
+from rotflex_jax.batch.task import code_text
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime import xla
 

@@ -18,9 +18,8 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.cli import app, main, terminal
 from rotflex_jax.data.datasets import DATASETS
-from rotflex_jax.discover.assessment import assess
 from rotflex_jax.discover.result import RunErrors
-from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.discover.verdict import Verdict, assess
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.runtime import xla

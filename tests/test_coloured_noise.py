@@ -8,7 +8,7 @@ import scipy
 from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
-from rotflex_jax.discover.coloured_noise import advice, coloured_noise
+from rotflex_jax.discover.explanation import advice, coloured_noise
 from rotflex_jax.discover.tables import next_steps
 
 N, Ts = 3000, 0.004

@@ -14,7 +14,7 @@ from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.cli import app
 from rotflex_jax.compare import ARX, METHODS, QUICK, Comparison, Fitted, Method, physics, register
 from rotflex_jax.compare.arx import DifferenceEquation, fit_difference_equation
-from rotflex_jax.compare.evaluation import hide_outputs, windowed_runs
+from rotflex_jax.compare.method import hide_outputs, windowed_runs
 from rotflex_jax.discover import Discovery
 from rotflex_jax.mechanism import simulate
 from rotflex_jax.models.model import Model

@@ -12,8 +12,8 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.cli import app
 from rotflex_jax.compare import Comparison, Fitted
-from rotflex_jax.compare.evaluation import errors_by_horizon, horizon_segments
-from rotflex_jax.compare.figures import drawn, horizons, overlays, ranks, spectra
+from rotflex_jax.compare.method import errors_by_horizon, horizon_segments
+from rotflex_jax.compare.page import drawn, horizons, overlays, ranks, spectra
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime import xla

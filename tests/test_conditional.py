@@ -8,8 +8,8 @@ from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.discover import search
-from rotflex_jax.discover.conditional import conditional_note, excluding
 from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.result import conditional_note, excluding
 from rotflex_jax.parameters import Estimate, Specification
 
 

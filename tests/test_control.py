@@ -16,8 +16,7 @@ from rotflex_jax import effects as fx
 from rotflex_jax.cli import main
 from rotflex_jax.control import close_loop, controller_to_c, credible_models
 from rotflex_jax.control.closed_loop import run_loop
-from rotflex_jax.control.design import AT_REST
-from rotflex_jax.control.motion import Tracking, torques_along
+from rotflex_jax.control.design import AT_REST, Tracking, torques_along
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import xl330_pendulum
 from rotflex_jax.mechanism.linear import zero_order_hold

@@ -7,13 +7,11 @@ import pytest
 import small_problem as sp
 
 from rotflex_jax.discover import selection
-from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.likelihood import in_blocks
-from rotflex_jax.discover.refit import levenberg_marquardt
+from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
+from rotflex_jax.discover.likelihood import in_blocks, levenberg_marquardt
 from rotflex_jax.discover.selection import admissible, choose, distinguished, paired_gain
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
-from rotflex_jax.discover.whitening import Whitener
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.recording import Recording
 

@@ -15,7 +15,7 @@ from test_report import NOISE, moved, photographed, two_rounds
 
 import rotflex_jax as rf
 from rotflex_jax.compare.table import Comparison, Row
-from rotflex_jax.discover.milestone import milestone
+from rotflex_jax.discover.checkpoint import milestone
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.notebook.live import Live, live

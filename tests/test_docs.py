@@ -226,7 +226,7 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
 
 
 def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
-    from rotflex_jax.discover import assessment, result, selection
+    from rotflex_jax.discover import result, selection, verdict
 
     text = (DOCS / "method.md").read_text()
     rows = dict(re.findall(r"\| ([\d.]+) \| `selection\.(\w+)` \|", text))
@@ -235,7 +235,7 @@ def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
     }
     assert len(rows) == 4
     assert f"within {result.NEAR_FLOOR:g} times the noise" in text
-    assert f"less than {assessment.NATS_PER_SAMPLE:g} nat" in text
+    assert f"less than {verdict.NATS_PER_SAMPLE:g} nat" in text
     assert selection.SEPARATE_Z == 2.0 and "less than two standard deviations" in text
 
 

@@ -13,10 +13,14 @@ from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.data.excitation import multisine, noise, prbs
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import rival_fit
-from rotflex_jax.experiment.discrimination import Discrimination, DiscriminationProblem
-from rotflex_jax.experiment.input_optimisation import optimise_input
-from rotflex_jax.experiment.rival_fit import RivalFit, fit_rival, free_run_from_rest
-from rotflex_jax.experiment.rival_model import effect_location, rival_model
+from rotflex_jax.experiment.discrimination import Discrimination, DiscriminationProblem, optimise_input
+from rotflex_jax.experiment.rival_fit import (
+    RivalFit,
+    effect_location,
+    fit_rival,
+    free_run_from_rest,
+    rival_model,
+)
 from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision

@@ -27,7 +27,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.export import to_c
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, simulate
-from rotflex_jax.mechanism.units import Units
+from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import parameter
 

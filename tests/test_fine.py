@@ -8,9 +8,12 @@ import pytest
 import small_problem as sp
 
 import rotflex_jax as rf
-from rotflex_jax.discover.bias_correction import SUBSTEP_FACTOR, correct_discretisation_bias
-from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import levenberg_marquardt
+from rotflex_jax.discover.likelihood import (
+    SUBSTEP_FACTOR,
+    LikelihoodProblem,
+    correct_discretisation_bias,
+    levenberg_marquardt,
+)
 from rotflex_jax.effects import Delay, Heating, Lag
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.parameters import Transform

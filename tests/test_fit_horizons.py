@@ -14,8 +14,7 @@ from rotflex_jax.discover.search import SearchState
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.fit import fit
 from rotflex_jax.fit.inference import RecordingSlopes, curvature, nats_that_count
-from rotflex_jax.fit.physical_ranges import physical_ranges
-from rotflex_jax.fit.plausibility import Reach, beyond_recordings
+from rotflex_jax.fit.plausibility import Reach, beyond_recordings, physical_ranges
 from rotflex_jax.joints import paper, quanser_2010
 from rotflex_jax.mechanism import Mechanism, simulate
 from rotflex_jax.metrics import window_starts

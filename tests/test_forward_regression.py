@@ -6,8 +6,8 @@ import pytest
 from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import forward_regression, least_squares
-from rotflex_jax.fit.forward_regression import forward_path
 from rotflex_jax.fit.linear import factor
+from rotflex_jax.fit.series import forward_path
 from rotflex_jax.recording import Recording
 
 TRUE = {"u[t-1]": 1.0, "u[t-3]": -0.6, "u[t]^2": 0.4, "u[t-1] * u[t-2]": 0.25}

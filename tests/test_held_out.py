@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import small_problem as sp
 
+from rotflex_jax.discover.hypothesis import Whitener
 from rotflex_jax.discover.selection import admissible
 from rotflex_jax.discover.validation import ValidationSet, validate
-from rotflex_jax.discover.whitening import Whitener
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax import joints
 from rotflex_jax.effects import Coulomb, CurrentDrive, Inertia, LoadFriction, Spring, Viscous
-from rotflex_jax.fit.exact_sensitivities import Dual, impulse_slopes, null_space, random_values
 from rotflex_jax.fit.identifiable import Identifiability, identifiable
+from rotflex_jax.fit.structural_identifiability import Dual, impulse_slopes, null_space, random_values
 from rotflex_jax.mechanism import Mechanism, linearise
 
 JOINT = joints.paper()

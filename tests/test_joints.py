@@ -9,7 +9,7 @@ from rotflex_jax import Recording, fit, joints
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.effects import Coulomb, Motor
 from rotflex_jax.errors import InputError
-from rotflex_jax.joints.springs import ARM_ANCHORS, HUB_ANCHORS, SIDE, SPRINGS
+from rotflex_jax.joints.rotary_flexible import ARM_ANCHORS, HUB_ANCHORS, SIDE, SPRINGS
 from rotflex_jax.mechanism import linearise
 from rotflex_jax.runtime.xla import double_precision
 

@@ -10,21 +10,22 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.latent_comparison import calibrated, with_effects_of
+from rotflex_jax.discover.explanation import calibrated, with_effects_of
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.effects import Coulomb, CubicSpring, Gravity, SensorBias
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.latent import latent_torque, smoother
-from rotflex_jax.latent.augmented_model import AugmentedStep, UnknownTorque, linearise_along
-from rotflex_jax.latent.figure import latent_maps, latent_time
-from rotflex_jax.latent.result import binned_mean
+from rotflex_jax.latent.result import binned_mean, latent_maps, latent_time
 from rotflex_jax.latent.smoother import (
+    AugmentedStep,
     InitialDistribution,
     IntensityEstimator,
     LinearTimeVaryingModel,
+    UnknownTorque,
     fixed_interval_smoother,
+    linearise_along,
     log_likelihood,
 )
 from rotflex_jax.mechanism import linearise, simulate_states

@@ -12,10 +12,18 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.formula import FUNCTIONS, Formula, Term, candidates, read_formula
-from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.spline_map import FittedMap, MapEquations, _smoother, penalties
-from rotflex_jax.discover.whitening import Whitener
+from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
+from rotflex_jax.discover.spline_map import (
+    FUNCTIONS,
+    FittedMap,
+    Formula,
+    MapEquations,
+    Term,
+    _smoother,
+    candidates,
+    penalties,
+    read_formula,
+)
 from rotflex_jax.effects import CATALOG, LearnedTorque, QuadraticDrag
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper

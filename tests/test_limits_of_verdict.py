@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from rotflex_jax.discover.end_state import end_state
+from rotflex_jax.discover.conclusion import end_state
 from rotflex_jax.discover.verdict import Verdict
 
 SAMPLES = 1000  # of each of the two channels

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
 from rotflex_jax.discover import locate
-from rotflex_jax.discover.conditions import condition_sets
+from rotflex_jax.discover.localise import condition_sets
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper
 from rotflex_jax.recording import Recording

@@ -10,13 +10,11 @@ from test_cli import DEMO, recorded, run, write  # noqa: F401 - fixtures
 from test_report import two_rounds
 
 import rotflex_jax as rf
-from rotflex_jax.discover.explanation import Explanation
-from rotflex_jax.discover.model_tests import model_tests
+from rotflex_jax.discover.explanation import Explanation, model_tests
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.comparison import default_labels
-from rotflex_jax.models.frequency_response import frequency_response
 from rotflex_jax.models.model import Model
-from rotflex_jax.models.residual_tests import residual_tests
+from rotflex_jax.models.residual_tests import frequency_response, residual_tests
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.report.page import render
 

@@ -15,9 +15,9 @@ from rotflex_jax.cli.terminal import save_simulation
 from rotflex_jax.data.excitation import noise
 from rotflex_jax.effects import Coulomb, CubicSpring, Inertia, Motor, Spring
 from rotflex_jax.export import latex, text, to_c
-from rotflex_jax.mechanism.units import Units
+from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
-from rotflex_jax.text.plain import one_line, printable, spreadsheet_cell
+from rotflex_jax.text.numbers import one_line, printable, spreadsheet_cell
 
 HOSTILE = (
     "arm */ static int owned(void) { return 1; } /*",

@@ -17,7 +17,7 @@ from rotflex_jax.data import excitation, save_csv
 from rotflex_jax.discover.probabilities import Probabilities
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT
 from rotflex_jax.runtime import xla
 
 NAN, INF = math.nan, math.inf

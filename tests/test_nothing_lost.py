@@ -20,14 +20,14 @@ from rotflex_jax.batch import storage
 from rotflex_jax.batch.result import Fleet, RecordingRow
 from rotflex_jax.batch.task import record
 from rotflex_jax.cli import app, terminal
-from rotflex_jax.cli.rounds_so_far import RoundsSoFar
+from rotflex_jax.cli.stopping import RoundsSoFar
 from rotflex_jax.data import save_csv
-from rotflex_jax.discover.milestone import milestone
+from rotflex_jax.discover.checkpoint import milestone
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.result import Experiment
 from rotflex_jax.models.model import Model
 from rotflex_jax.text.files import UNFINISHED, write_file
-from rotflex_jax.text.templates import write_files
+from rotflex_jax.text.markup import write_files
 
 PACKAGE = Path(rf.__file__).parent
 K = np.arange(60.0)
@@ -190,7 +190,7 @@ from rotflex_jax.cli import main
 
 def search(*given, progress, **options):
     import hashlib, numpy as np
-    from rotflex_jax.discover.milestone import milestone
+    from rotflex_jax.discover.checkpoint import milestone
     from rotflex_jax.text.files import UNFINISHED
     progress(milestone("as it is", ["theta"], {"theta": "rad"}, np.ones(1), np.ones(1)))
     progress(milestone("+ coulomb at hub", ["theta"], {"theta": "rad"}, np.ones(1), np.ones(1)))

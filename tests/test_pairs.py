@@ -9,9 +9,8 @@ from scipy.optimize import lsq_linear
 
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.horizon import Horizons, as_free_run
 from rotflex_jax.discover.hypothesis import CandidateStart
-from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.pairs import (
     best_candidates,
     find_pair,
@@ -19,7 +18,6 @@ from rotflex_jax.discover.pairs import (
     promising_pairs,
     refit_pairs,
 )
-from rotflex_jax.discover.refit import refit
 from rotflex_jax.discover.score_test import (
     MAX_THRESHOLD_AMPLITUDE,
     Score,
@@ -30,6 +28,7 @@ from rotflex_jax.discover.score_test import (
 )
 from rotflex_jax.discover.stepwise import fit_baseline
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, build, scales
+from rotflex_jax.discover.validation import Horizons, as_free_run
 from rotflex_jax.fit.dataset import prepare
 from rotflex_jax.models.model import Model
 

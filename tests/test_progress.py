@@ -5,7 +5,7 @@ import time
 import pytest
 
 from rotflex_jax.cli import terminal
-from rotflex_jax.discover.milestone import TimeLeft, beginning
+from rotflex_jax.discover.checkpoint import TimeLeft, beginning
 
 
 class Clock:

@@ -9,9 +9,9 @@ import pytest
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.data.excitation import noise
-from rotflex_jax.discover import proposal
+from rotflex_jax.discover import conclusion
+from rotflex_jax.discover.conclusion import proposed, seen_limits, with_proposal
 from rotflex_jax.discover.discovery import Discovery
-from rotflex_jax.discover.proposal import proposed, seen_limits, with_proposal
 from rotflex_jax.discover.result import NEXT, Round, Stage
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.mechanism import simulate
@@ -38,9 +38,9 @@ def found(verdict: Verdict = Verdict.AMBIGUOUS) -> Discovery:
 
 @pytest.fixture(scope="module")
 def answered():
-    old, proposal.PROPOSAL_SECONDS = proposal.PROPOSAL_SECONDS, 3.0
+    old, conclusion.PROPOSAL_SECONDS = conclusion.PROPOSAL_SECONDS, 3.0
     yield with_proposal(found())
-    proposal.PROPOSAL_SECONDS = old
+    conclusion.PROPOSAL_SECONDS = old
 
 
 def test_the_best_standard_input_is_proposed_within_what_the_machine_has_borne(answered):

@@ -11,13 +11,13 @@ import pytest
 from scipy.signal import freqs
 
 import rotflex_jax as rf
-from rotflex_jax.data.benchmarks import Benchmark, Published, benchmark
+from rotflex_jax.data.datasets import Benchmark, Published, benchmark
 from rotflex_jax.effects import CATALOG, Coulomb, CubicSpring, ViscousAsymmetric, VoltageDrift, VoltageOffset
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import sensor_noise
 from rotflex_jax.mechanism.intersample import substep_voltages
+from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.mechanism.roles import search_places
-from rotflex_jax.mechanism.units import Units
 from rotflex_jax.recording import Recording
 
 Measured = Callable[[str], list[Recording]]

@@ -7,8 +7,8 @@ import pytest
 import small_problem as sp
 from scipy.optimize import least_squares
 
-from rotflex_jax.discover import refit as refit_module
-from rotflex_jax.discover.refit import (
+from rotflex_jax.discover import likelihood as refit_module
+from rotflex_jax.discover.likelihood import (
     EXTRA_ALTERNATIONS,
     MAX_COORDINATE_STEP,
     _grid,
@@ -18,7 +18,7 @@ from rotflex_jax.discover.refit import (
 )
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.windows import Windows
+from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.parameters import Transform
 
 

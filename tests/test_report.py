@@ -17,12 +17,11 @@ from test_locate import recording as turning, reversals, white
 
 from rotflex_jax.discover import locate
 from rotflex_jax.discover.discovery import Discovery
-from rotflex_jax.discover.explanation import Explanation, remaining_failures
-from rotflex_jax.discover.formula import Formula, Term
-from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
+from rotflex_jax.discover.explanation import Explanation, LatentTorqueComparison, remaining_failures
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.probabilities import Probabilities, SetProbability
 from rotflex_jax.discover.result import Ranked, Round, Stage, Where
+from rotflex_jax.discover.spline_map import Formula, Term
 from rotflex_jax.discover.tables import next_steps
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import Coulomb, CubicSpring, LearnedTorque

@@ -26,10 +26,10 @@ from rotflex_jax.reproduce.adaptation import (
     watched_index,
 )
 from rotflex_jax.reproduce.experiment import Reproduction, short_memory_errors
-from rotflex_jax.reproduce.machine import linear_joint, machine_rows, symmetric_twin
 from rotflex_jax.reproduce.models import grey_box, linearised, nmse
 from rotflex_jax.reproduce.plants import plant, response
 from rotflex_jax.reproduce.records import from_measured, simulated
+from rotflex_jax.reproduce.settings import linear_joint, machine_rows, symmetric_twin
 from rotflex_jax.runtime import xla
 
 SHORT = {"samples": 1500, "held_out": 800, "runs": 2, "step": 0.005}

@@ -12,11 +12,11 @@ from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.cli import main
-from rotflex_jax.cli.rounds_so_far import RoundsSoFar
+from rotflex_jax.cli.stopping import RoundsSoFar
 from rotflex_jax.discover.checkpoint import digest_of_search
-from rotflex_jax.discover.horizon import Horizons
+from rotflex_jax.discover.validation import Horizons
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording.digest import content
+from rotflex_jax.recording.recording import content
 
 
 @pytest.fixture(scope="module")

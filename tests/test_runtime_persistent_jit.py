@@ -22,7 +22,7 @@ import rotflex_jax as rf
 from rotflex_jax.effects import Coulomb, LuGre
 from rotflex_jax.effects.base import Force
 from rotflex_jax.mechanism import Exponential
-from rotflex_jax.mechanism.units import Units
+from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.parameters import parameter
 from rotflex_jax.runtime import persistent_jit
 from rotflex_jax.runtime.persistent_jit import (

@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.refit import levenberg_marquardt
+from rotflex_jax.discover.likelihood import levenberg_marquardt
 from rotflex_jax.discover.score_test import Score, _amplitudes, scores
 from rotflex_jax.discover.supermodel import EffectLocation, build
 from rotflex_jax.effects.base import Scale

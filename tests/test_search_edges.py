@@ -9,9 +9,9 @@ from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.discover import search
-from rotflex_jax.discover.assessment import NEAR_FLOOR, Assessment, in_noise
+from rotflex_jax.discover.verdict import NEAR_FLOOR, Assessment, in_noise
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording.digest import shared_samples
+from rotflex_jax.recording.recording import shared_samples
 
 NAN = float("nan")
 

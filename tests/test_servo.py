@@ -15,7 +15,7 @@ from rotflex_jax.cli.arguments import Columns
 from rotflex_jax.discover.batched_predictor import ParameterSet
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import build, scales
-from rotflex_jax.effects.servo import DYNAMIXEL_GAIN_SCALE
+from rotflex_jax.effects.motor import DYNAMIXEL_GAIN_SCALE
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare
 from rotflex_jax.joints import by_name, position_servo, xl330_pendulum

@@ -7,7 +7,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.fit.signs import check_signs
+from rotflex_jax.fit.plausibility import check_signs
 
 JOINT = rf.Model(rf.joints.paper())
 

@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 from small_problem import HUB, NOISE, problem, recordings, records, start, supermodel
 
-from rotflex_jax.discover import search, stand_in
-from rotflex_jax.discover.horizon import SearchHorizon
-from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_effect
-from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import levenberg_marquardt
-from rotflex_jax.discover.result import HorizonGain
-from rotflex_jax.discover.stand_in import (
+from rotflex_jax.discover import conclusion, search
+from rotflex_jax.discover.conclusion import (
     LEAST_CHANGE,
     SCATTER,
     WindowSizes,
@@ -21,8 +16,11 @@ from rotflex_jax.discover.stand_in import (
     signs,
     window_sizes,
 )
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_effect
+from rotflex_jax.discover.likelihood import LikelihoodProblem, levenberg_marquardt
+from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet
+from rotflex_jax.discover.validation import SearchHorizon, ValidatedHypothesis, ValidationSet
 from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder
 from rotflex_jax.parameters import specifications
 
@@ -111,8 +109,8 @@ def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pyte
     if folds:  # the recordings for training are all there are
         sizes = {"free runs": sizes["free runs, held out"]}
     left = {"predictions": 30.0, "predictions, held out": 20.0}
-    monkeypatch.setattr(stand_in, "window_sizes", lambda problem, h, locations: {HUB: sizes[problem]})
-    monkeypatch.setattr(stand_in, "nats_above_noise", lambda problem, h: left[problem])
+    monkeypatch.setattr(conclusion, "window_sizes", lambda problem, h, locations: {HUB: sizes[problem]})
+    monkeypatch.setattr(conclusion, "nats_above_noise", lambda problem, h: left[problem])
     rest = 60.0 if folds else 50.0
     final = space(free_run=runs, hypothesis=None, adapted=None)
     horizons = (prediction, space(problem="free runs", validation=validation))

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from rotflex_jax.discover.whitening import Whitener, fit_whitener, log_likelihood
+from rotflex_jax.discover.hypothesis import Whitener, fit_whitener, log_likelihood
 
 FLOOR = np.array([1e-9, 1e-9])
 MIXED = np.array([[2.0, 0.6], [0.6, 0.5]])

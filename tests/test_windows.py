@@ -9,16 +9,14 @@ import small_problem as sp
 
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.evaluation import calibrate
-from rotflex_jax.discover.horizon import Horizons, as_free_run
-from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import refit
+from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.score_test import scores
 from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
 from rotflex_jax.discover.supermodel import build, scales
-from rotflex_jax.discover.validation import validate
+from rotflex_jax.discover.validation import Horizons, as_free_run, validate
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.windows import Windows
+from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
     RunParameters,

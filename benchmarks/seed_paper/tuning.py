@@ -10,8 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from rotflex_jax.adaptive import LMS
-from rotflex_jax.adaptive.objectives import tuning_data
-from rotflex_jax.adaptive.settings import RangeTransform
+from rotflex_jax.adaptive.objectives import RangeTransform, tuning_data
 from rotflex_jax.adaptive.tuning import grid, loss_and_slopes, tune
 from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.recording import Recording

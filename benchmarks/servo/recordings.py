@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 import rotflex_jax as rf
-from rotflex_jax.effects.servo import DYNAMIXEL_GAIN_SCALE
+from rotflex_jax.effects.motor import DYNAMIXEL_GAIN_SCALE
 from servo.friction_models import GRAVITY, Logs
 
 MASS, LENGTH = 0.49, 0.1

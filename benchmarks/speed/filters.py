@@ -12,8 +12,7 @@ import numpy as np
 
 from rotflex_jax import Recording
 from rotflex_jax.adaptive import LMS, RLS, grid, run
-from rotflex_jax.adaptive.objectives import evaluate, tuning_data, values_at
-from rotflex_jax.adaptive.settings import RangeTransform
+from rotflex_jax.adaptive.objectives import RangeTransform, evaluate, tuning_data, values_at
 from rotflex_jax.adaptive.tuning import loss_and_slopes
 from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.runtime.xla import double_precision, mesh_of

@@ -5,8 +5,6 @@ learning curves), and the search for settings by gradient (`tune`) or on a grid 
 """
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter, scan
-from rotflex_jax.adaptive.identification import Identified, identify
-from rotflex_jax.adaptive.kalman import Kalman
 from rotflex_jax.adaptive.lattice import VolterraLattice
 from rotflex_jax.adaptive.learning_curve import (
     LearningCurve,
@@ -17,9 +15,9 @@ from rotflex_jax.adaptive.learning_curve import (
 )
 from rotflex_jax.adaptive.lms import LMS, NLMS, AffineProjection, fixed_point
 from rotflex_jax.adaptive.moments import Moments, ar1_covariance
-from rotflex_jax.adaptive.rls import RLS
-from rotflex_jax.adaptive.running import Run, run
-from rotflex_jax.adaptive.settings import Tuned
+from rotflex_jax.adaptive.objectives import Tuned
+from rotflex_jax.adaptive.rls import RLS, Kalman
+from rotflex_jax.adaptive.running import Identified, Run, identify, run
 from rotflex_jax.adaptive.step_sizes import Stability, analyse, mean_bound, mean_square_bound
 from rotflex_jax.adaptive.tuning import grid, tune
 

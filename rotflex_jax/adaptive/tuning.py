@@ -14,21 +14,19 @@ from rotflex_jax.adaptive.filter import AdaptiveFilter, count
 from rotflex_jax.adaptive.lms import LMS
 from rotflex_jax.adaptive.objectives import (
     MOST_WEIGHTS_FOR_STABILITY,
+    FilterBuilder,
     Objective,
+    RangeTransform,
+    Tuned,
     TuningData,
+    TuningPath,
+    build_filter,
     evaluate,
     sample_moments,
+    starting_sets,
     tuning_data,
     tuning_result,
     values_at,
-)
-from rotflex_jax.adaptive.settings import (
-    FilterBuilder,
-    RangeTransform,
-    Tuned,
-    TuningPath,
-    build_filter,
-    starting_sets,
 )
 from rotflex_jax.adaptive.step_sizes import Margin
 from rotflex_jax.basis import Basis

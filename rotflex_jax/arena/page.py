@@ -6,7 +6,7 @@ from typing import Any
 from rotflex_jax.arena.problems import MEASURED
 from rotflex_jax.arena.scores import COLUMNS, FAILED, Marks, Scores, cells, name_of
 from rotflex_jax.text.files import path_of, write_file
-from rotflex_jax.text.templates import fill_template
+from rotflex_jax.text.markup import fill_template
 
 HEADINGS = {
     "right": "Answers that are right as a whole, of all simulated records.",

@@ -7,8 +7,16 @@ products of either. `reach` tells beforehand what a bank can do, `optimise_poles
 from rotflex_jax.basis.bank import Bank, Basis, Delays
 from rotflex_jax.basis.orthogonalise import GramSchmidt, Hermite, Orthogonalised
 from rotflex_jax.basis.orthonormal import Orthonormal
-from rotflex_jax.basis.pole_search import PoleSearch, optimise_poles
-from rotflex_jax.basis.reach import ar1, bank_covariance, best_laguerre, fir_nmse, memory_for, minimum_nmse
+from rotflex_jax.basis.pole_search import (
+    PoleSearch,
+    ar1,
+    bank_covariance,
+    best_laguerre,
+    fir_nmse,
+    memory_for,
+    minimum_nmse,
+    optimise_poles,
+)
 from rotflex_jax.basis.volterra import Volterra
 
 __all__ = [

@@ -12,9 +12,9 @@ from rotflex_jax.discover.result import NEAR_FLOOR
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.text.colours import FAINT, FINAL, MUTED
+from rotflex_jax.text.markup import fill_template
 from rotflex_jax.text.numbers import multiple, plain_number, ratio, readable, together
 from rotflex_jax.text.plotting import FigureRegistry, blank, by_section, legend_above, plain_ticks
-from rotflex_jax.text.templates import fill_template
 
 # Effects that are drawn, the most frequent ones.
 MOST_EFFECTS = 15

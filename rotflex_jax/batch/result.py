@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax.batch.task import Record
-from rotflex_jax.text.plain import printable, spreadsheet_cell
+from rotflex_jax.text.numbers import printable, spreadsheet_cell
 
 Errors = dict[str, float | None]
 
@@ -168,7 +168,7 @@ class Fleet:
     def write(self) -> Path:
         """Write `summary.csv` and `summary.html`; returns the path of the page."""
         from rotflex_jax.batch.page import render  # matplotlib is loaded only where it draws
-        from rotflex_jax.text.templates import write_files
+        from rotflex_jax.text.markup import write_files
 
         write_files(self.folder, {"summary.csv": self.to_csv(), "summary.html": render(self)})
         return self.page

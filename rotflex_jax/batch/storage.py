@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax import __version__
-from rotflex_jax.batch.code_digest import code_text, of_main
 from rotflex_jax.batch.result import RecordingRow
-from rotflex_jax.batch.task import Record, Search, SearchTask, record, subjects
+from rotflex_jax.batch.task import Record, Search, SearchTask, code_text, of_main, record, subjects
 from rotflex_jax.checks import real, shown
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.digest import content, digest_of
+from rotflex_jax.recording.recording import content, digest_of
 from rotflex_jax.text.files import write_file
 
 RESULTS, MODELS, PAGES = "recordings", "models", "pages"

@@ -20,12 +20,11 @@ from rotflex_jax.cli.data import check, data_app
 from rotflex_jax.cli.experiment import experiment
 from rotflex_jax.cli.models import export, simulate
 from rotflex_jax.cli.reproduce import reproduce
-from rotflex_jax.cli.rounds_so_far import RoundsSoFar
-from rotflex_jax.cli.stopping import STOPPED
+from rotflex_jax.cli.stopping import STOPPED, RoundsSoFar
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
-from rotflex_jax.text.plain import printable
+from rotflex_jax.text.numbers import printable
 
 if TYPE_CHECKING:
     from rotflex_jax.recording import Recording

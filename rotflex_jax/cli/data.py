@@ -72,7 +72,7 @@ def check(
     joint = given.joint_for(files, joint, columns)
     model = by_name.model(joint)
     model, columns = columns.of(model)
-    from rotflex_jax.fit.signs import check_signs
+    from rotflex_jax.fit.plausibility import check_signs
 
     for name, recording in ((str(file), r) for file in files for r in columns.load_all([file])):
         terminal.print_recording(recording)

@@ -48,8 +48,7 @@ def reproduce(
 
     enable_fast_start()
     from rotflex_jax.reproduce import reproduce as run
-    from rotflex_jax.reproduce.page import headings, table, write
-    from rotflex_jax.reproduce.wording import headline
+    from rotflex_jax.reproduce.page import headings, headline, table, write
 
     with terminal.progress("Reproducing") as step:
         result = run(settings, *parts, joint=mechanism if parts else None, progress=step)
@@ -109,7 +108,7 @@ def _recordings(
 
 
 def _list(settings: Any) -> None:
-    from rotflex_jax.reproduce.machine import machine_rows
+    from rotflex_jax.reproduce.settings import machine_rows
 
     rows = []
     for row in settings.table() + machine_rows(settings()):

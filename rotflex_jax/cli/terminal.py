@@ -17,8 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from rotflex_jax.text.files import write_file
-from rotflex_jax.text.numbers import digits, readable
-from rotflex_jax.text.plain import one_line, printable, spreadsheet_cell
+from rotflex_jax.text.numbers import digits, one_line, printable, readable, spreadsheet_cell
 
 # Rows of a long table that are shown.
 LISTED_RECORDINGS = 60
@@ -56,7 +55,7 @@ class _Told:
     def take(self, step: str) -> str:
         """A new line, as it is shown."""
         if self.time_left is None and hasattr(step, "kind"):  # a search has begun
-            from rotflex_jax.discover.milestone import TimeLeft
+            from rotflex_jax.discover.checkpoint import TimeLeft
 
             self.time_left = TimeLeft()
         if self.time_left is not None:

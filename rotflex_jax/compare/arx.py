@@ -6,8 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.compare.evaluation import require_one_sampling_period, split_for_validation, validation_cost
-from rotflex_jax.compare.method import Fitted, Progress
+from rotflex_jax.compare.method import (
+    Fitted,
+    Progress,
+    require_one_sampling_period,
+    split_for_validation,
+    validation_cost,
+)
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording

@@ -7,8 +7,13 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
-from rotflex_jax.compare.evaluation import require_one_sampling_period, split_for_validation, validation_cost
-from rotflex_jax.compare.method import Fitted, Progress
+from rotflex_jax.compare.method import (
+    Fitted,
+    Progress,
+    require_one_sampling_period,
+    split_for_validation,
+    validation_cost,
+)
 from rotflex_jax.fit.linear import factor
 from rotflex_jax.models.linear_system import LinearSystem
 from rotflex_jax.models.model import Model

@@ -1,18 +1,22 @@
-"""What a method is: it learns from recordings, and the result can simulate another one."""
+"""What a method of the comparison is, and its free runs over recordings it has not learned from."""
 
 import abc
 import dataclasses
 import difflib
+import itertools
+import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax import metrics
 from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.quality import ACCEPTABLE
 
 Progress = Callable[[str], None]
 
@@ -141,3 +145,225 @@ def _check(method: Any) -> None:
             f"{method!r} was given as a method, but a method has name, title and "
             f"fit(model, train, say); give one of {', '.join(METHODS)}, or such an object."
         )
+
+
+# A run that leaves the range of the measurements so many times over has diverged.
+DIVERGENCE_FACTOR = 100.0
+
+
+def hide_outputs(recording: Recording, seconds: float | None = None) -> Recording:
+    """The recording with its outputs held constant where a model must not use them.
+
+    Args:
+        recording: The recording to simulate.
+        seconds: Length of the windows [s], of each of which a model may use the first `n_init` samples; if
+            None, of the recording alone.
+    """
+    k = np.arange(recording.N)
+    hidden = k >= recording.n_init if seconds is None else metrics.counted(recording, seconds)
+    last = np.maximum.accumulate(np.where(hidden, 0, k))
+    return dataclasses.replace(recording, y=recording.y[last], accept=ACCEPTABLE)
+
+
+def free_runs(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Float[np.ndarray, "_ C"], ...]:
+    """One free run over each recording, none of which can use outputs after `n_init` samples."""
+    return tuple(_with_recording_shape(simulator.simulate(hide_outputs(r)), r) for r in recordings)
+
+
+def _with_recording_shape(run: np.ndarray, recording: Recording) -> np.ndarray:
+    y_hat = np.asarray(run, float)
+    if y_hat.shape != recording.y.shape:
+        raise InputError(
+            f"The free run has the shape {y_hat.shape}, but {recording.y.shape} is needed; "
+            "simulate every sample and channel of the recording."
+        )
+    return y_hat
+
+
+def windowed_runs(
+    simulator: Simulator, recordings: Sequence[Recording], seconds: float
+) -> tuple[Float[np.ndarray, "_ C"], ...]:
+    """Free runs over each recording that start again every few seconds, as in a search.
+
+    A simulator that has `simulate_windows`, as every grey box, does it itself: the voltage drives it over the
+    whole recording, and a delay, a lag or a drift goes on from window to window. A black box (difference
+    equation, state space, series) estimates its state, or the input before, from the first samples of a
+    recording: it runs over each window as over a recording of its own.
+
+    Args:
+        simulator: It uses the input and the first `n_init` samples of each window.
+        recordings: The recordings to simulate.
+        seconds: Length of the windows [s].
+    """
+    whole = getattr(simulator, "simulate_windows", None)
+    if whole is not None:
+        return tuple(_with_recording_shape(whole(hide_outputs(r, seconds), seconds), r) for r in recordings)
+    runs = []
+    for r in recordings:
+        starts = metrics.window_starts(r, seconds)[0].tolist()
+        segments = [r.slice(i, j) for i, j in zip(starts, [*starts[1:], r.N], strict=True)]
+        segments = [dataclasses.replace(segment, n_init=r.n_init) for segment in segments]
+        runs.append(np.concatenate(free_runs(simulator, segments)))
+    return tuple(runs)
+
+
+def one_step_predictions(
+    predict: Callable[[Recording], Float[np.ndarray, "_ C"]], recordings: Sequence[Recording]
+) -> tuple[Float[np.ndarray, "_ C"], ...]:
+    """Predictions one step ahead; they use every sample before the one predicted."""
+    return tuple(np.asarray(predict(recording), float) for recording in recordings)
+
+
+def simulation_time(simulator: Simulator, recordings: Sequence[Recording]) -> float:
+    """Time of the free runs [s]; run them once before, so that no compilation is counted."""
+    start = time.perf_counter()
+    free_runs(simulator, recordings)
+    return time.perf_counter() - start
+
+
+def divergence_reason(
+    runs: Sequence[Float[np.ndarray, "_ C"]], recordings: Sequence[Recording], ranges: Float[np.ndarray, " C"]
+) -> str:
+    """When the first run diverged, as a sentence; "" where none did.
+
+    Args:
+        runs: Free runs.
+        recordings: The recordings that they simulate.
+        ranges: Range of each channel in all data.
+    """
+    limit = np.where(ranges > 0, DIVERGENCE_FACTOR * ranges, np.inf)
+    for y_hat, recording in zip(runs, recordings, strict=True):
+        start = recording.y[: recording.n_init].mean(axis=0)
+        # Written so that NaN counts as outside.
+        outside = ~(np.abs(y_hat - start) <= limit).all(axis=1) | ~np.isfinite(y_hat).all(axis=1)
+        if outside.any():
+            seconds = float(np.argmax(outside)) * recording.Ts
+            when = f"after {seconds:.3g} s"
+            return f"the free run leaves the measured range {DIVERGENCE_FACTOR:g} times over {when}"
+    return ""
+
+
+def error_metrics(
+    recordings: Sequence[Recording], runs: Sequence[Float[np.ndarray, "_ C"]]
+) -> dict[str, dict[str, float]]:
+    """Metric -> channel -> value, over all recordings together, after the samples of `n_init`."""
+    y = np.concatenate([r.y[r.n_init :] for r in recordings]).astype(float)
+    y_hat = np.concatenate([run[r.n_init :] for r, run in zip(recordings, runs, strict=True)])
+    formulas = {
+        "rmse": metrics.rmse,
+        "nrmse": metrics.nrmse,
+        "fit_percent": metrics.fit_percent,
+        "worst": metrics.max_error,
+    }
+    with np.errstate(all="ignore"):
+        return {
+            name: dict(zip(recordings[0].channels, formula(y, y_hat).tolist(), strict=True))
+            for name, formula in formulas.items()
+        }
+
+
+def windowed_errors(
+    simulator: Simulator, recordings: Sequence[Recording], seconds: float
+) -> dict[str, float]:
+    """Channel -> root mean square error of `windowed_runs`, over all recordings together."""
+    runs = windowed_runs(simulator, recordings, seconds)
+    with np.errstate(all="ignore"):
+        rms = metrics.windowed_rmse(recordings, [r.y for r in recordings], runs, seconds)
+    return dict(zip(recordings[0].channels, rms.tolist(), strict=True))
+
+
+# Stretches of time that errors are reported for, and free runs that they are averaged over, at most.
+HORIZON_POINTS, HORIZON_RUNS = 16, 12
+
+
+@dataclasses.dataclass(frozen=True)
+class Horizon:
+    """Root mean square error of free runs by the time since the last measured sample that they use.
+
+    Attributes:
+        seconds: End of each stretch of time [s].
+        rmse: Channel -> error within each stretch [unit].
+        runs: Number of runs.
+    """
+
+    seconds: tuple[float, ...]
+    rmse: dict[str, tuple[float, ...]]
+    runs: int
+
+
+def horizon_segments(recordings: Sequence[Recording], seconds: float) -> list[Recording]:
+    """Stretches of equal length from all recordings, evenly spread; they may overlap.
+
+    Args:
+        recordings: Test recordings.
+        seconds: Horizon of the free runs [s].
+    """
+    segments = []
+    for r in recordings:
+        length = min(r.N, r.n_init + max(2, round(seconds / r.Ts)))
+        count = max(1, HORIZON_RUNS // len(recordings))
+        starts = np.unique(np.linspace(0, r.N - length, count).astype(int))
+        segments += [r.slice(int(i), int(i) + length) for i in starts]
+    return segments
+
+
+def errors_by_horizon(simulator: Simulator, recordings: Sequence[Recording], seconds: float) -> Horizon:
+    """Error against the horizon, in stretches of time that grow with it.
+
+    The voltage drives a grey box over the whole recording, as in windows (`windowed_runs`).
+
+    Args:
+        simulator: The model to evaluate.
+        recordings: Test recordings of one sampling period.
+        seconds: Horizon [s].
+    """
+    if isinstance(simulator, Model):
+        pairs = [simulator.behind_actuation(r) for r in recordings]
+        simulator, recordings = pairs[0][0], [r for _, r in pairs]
+    parts = horizon_segments(recordings, seconds)
+    runs = free_runs(simulator, parts)
+    ahead = min(r.N - r.n_init for r in parts)
+    edges = np.unique(np.round(np.geomspace(1, ahead, HORIZON_POINTS)).astype(int))
+    with np.errstate(all="ignore"):
+        e = np.stack([(r.y - y_hat)[r.n_init :][:ahead] for r, y_hat in zip(parts, runs, strict=True)])
+        squares = np.mean(e**2, axis=0)  # (ahead, C)
+        ends = np.concatenate([[0], edges])
+        rms = [np.sqrt(squares[a:b].mean(axis=0)) for a, b in itertools.pairwise(ends)]
+    by_channel = np.array(rms).T
+    return Horizon(
+        tuple((edges * recordings[0].Ts).tolist()),
+        {c: tuple(v.tolist()) for c, v in zip(recordings[0].channels, by_channel, strict=True)},
+        len(parts),
+    )
+
+
+def split_for_validation(train: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+    """First part of each recording, to fit, and last part, for validation."""
+    parts = [recording.split(share) for recording in train]
+    return [a for a, _ in parts], [b for _, b in parts]
+
+
+def require_one_sampling_period(recordings: Sequence[Recording], what: str) -> None:
+    """Refuse recordings of different sampling periods, for which no single sampled model holds.
+
+    Raises:
+        InputError: Their sampling periods differ.
+    """
+    if len({r.Ts for r in recordings}) > 1:
+        raise InputError(
+            f"The recordings have different sampling periods, but {what} has one; decimate them to the same."
+        )
+
+
+def validation_cost(simulator: Simulator, recordings: Sequence[Recording]) -> float:
+    """Mean over the channels of the log of the free-run error; infinite where a run diverges.
+
+    Args:
+        simulator: The model to evaluate.
+        recordings: Validation part of the training recordings; one run over each.
+    """
+    with np.errstate(all="ignore"):
+        runs = free_runs(simulator, recordings)
+        e = np.concatenate([(r.y - y_hat)[r.n_init :] for r, y_hat in zip(recordings, runs, strict=True)])
+        cost = float(np.mean(np.log(np.sqrt(np.mean(e**2, axis=0)) + 1e-300)))
+    return np.inf if np.isnan(cost) else cost

@@ -7,25 +7,26 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from rotflex_jax import checks, joints
-from rotflex_jax.compare.evaluation import (
+from rotflex_jax.compare.method import (
+    Method,
+    Progress,
     divergence_reason,
     error_metrics,
     errors_by_horizon,
     free_runs,
     one_step_predictions,
+    selected_methods,
     simulation_time,
     windowed_errors,
 )
-from rotflex_jax.compare.method import Method, Progress, selected_methods
 from rotflex_jax.compare.table import Comparison, Row
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import sensor_noise
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.digest import check_apart
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
 from rotflex_jax.recording.quality import ACCEPTABLE
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, listed
 from rotflex_jax.runtime.xla import one_thread
 
 

@@ -10,8 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from rotflex_jax.compare.evaluation import require_one_sampling_period
-from rotflex_jax.compare.method import Fitted, Progress
+from rotflex_jax.compare.method import Fitted, Progress, require_one_sampling_period
 from rotflex_jax.compare.sparse_law import Piece, SparseLaw, Terms, costs, refined
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.compare.evaluation import Horizon
-from rotflex_jax.compare.method import Simulator
+from rotflex_jax.compare.method import Horizon, Simulator
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import bullets, card, folded, table
@@ -236,7 +235,7 @@ class Comparison:
 
     def plot(self) -> Any:
         """Measured and simulated outputs of the best method of each family, as a matplotlib Figure."""
-        from rotflex_jax.compare.figures import overlays  # matplotlib is loaded only where it draws
+        from rotflex_jax.compare.page import overlays  # matplotlib is loaded only where it draws
 
         return overlays(self)
 

@@ -3,8 +3,7 @@
 from rotflex_jax.control.assessment import ControlAssessment, assess, credible_models
 from rotflex_jax.control.c_code import controller_to_c
 from rotflex_jax.control.closed_loop import ClosedLoop, LimitCycle, Plant, close_loop
-from rotflex_jax.control.design import Controller, controller
-from rotflex_jax.control.motion import PlannedMotion
+from rotflex_jax.control.design import Controller, PlannedMotion, controller
 
 __all__ = [
     "ClosedLoop",

@@ -1,8 +1,9 @@
 """Recordings from files, from public data sets, and inputs to record with."""
 
 from rotflex_jax.data import datasets as datasets, excitation as excitation
-from rotflex_jax.data.benchmarks import Benchmark as Benchmark, benchmark as benchmark
 from rotflex_jax.data.datasets import (
+    Benchmark as Benchmark,
+    benchmark as benchmark,
     demo_recording as demo_recording,
     fetch as fetch,
     list_datasets as list_datasets,

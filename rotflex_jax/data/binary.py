@@ -1,21 +1,205 @@
-"""Binary files and DataFrames as tables; packages other than SciPy are imported on use."""
+"""Binary files, spreadsheets and DataFrames as tables; packages other than SciPy are imported on use.
+
+pyarrow tells it too, but ends the interpreter where the description is damaged.
+
+Source:
+    Apache Parquet, File format and parquet.thrift; Apache Thrift, Compact protocol.
+"""
 
 import math
+import os
 import zipfile
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Shaped
 
-from rotflex_jax.data.matlab import variables_of_mat
-from rotflex_jax.data.matlab_objects import MatlabObject, Timetable
-from rotflex_jax.data.parquet import columns_of_parquet
+from rotflex_jax.data.matlab import MatlabObject, Timetable, variables_of_mat
 from rotflex_jax.data.tables import MAX_BYTES, Table, check_size, distinct, unreadable
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.recording.quality import SHORTEST_RECORDING
+
+
+def table_from_xlsx(path: Path, max_bytes: int = MAX_BYTES) -> Table:
+    """The columns of the first sheet that has any; names in its first row, units in the next or nowhere.
+
+    Raises:
+        InputError: openpyxl is missing, the file is damaged or too large, or no sheet has names and numbers.
+    """
+    openpyxl: Any = optional("openpyxl", f"Reading {path.name}")
+    try:
+        with zipfile.ZipFile(path) as archive:  # a part that is larger than it says fails its checksum
+            check_size(path.name, sum(part.file_size for part in archive.infolist()), max_bytes)
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        sheets = [(name, _filled(book[name])) for name in book.sheetnames if hasattr(book[name], "iter_rows")]
+        book.close()
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file fails in many ways within openpyxl
+        raise unreadable(path, "a spreadsheet", error) from error
+    for name, rows in sheets:
+        if len(rows) > 1:
+            return _table(f"{path.name}, sheet {name}", rows)
+    raise InputError(f"{path.name} has no sheet with names of columns and numbers below; export it again.")
+
+
+def _filled(sheet: Any) -> list[tuple[int, tuple[Any, ...]]]:
+    """Rows that are not empty, with their numbers as the spreadsheet counts."""
+    rows = enumerate(sheet.iter_rows(values_only=True), 1)
+    return [(k, row) for k, row in rows if any(cell is not None for cell in row)]
+
+
+def _table(label: str, rows: list[tuple[int, tuple[Any, ...]]]) -> Table:
+    heading, rows = rows[0][1], rows[1:]
+    used = [k for k, cell in enumerate(heading) if cell is not None]
+    names = [str(heading[k]).strip() for k in used]
+    if all(isinstance(heading[k], int | float) for k in used):
+        raise InputError(
+            f"{label} has no header, its first row holds numbers; put the names of the columns there, such "
+            "as t, voltage, theta, alpha."
+        )
+    distinct(names, label)
+    cells = [[_cell(row, k) for k in used] for _, row in rows]
+    units: dict[str, str] = {}
+    if len(cells) > 1 and all(isinstance(c, str) for c in cells[0]) and "".join(cells[0]).strip():
+        units, cells, rows = dict(zip(names, cells[0], strict=True)), cells[1:], rows[1:]
+    columns = {name: _column([row[k] for row in cells]) for k, name in enumerate(names)}
+    return Table(label, columns, "row", rows[0][0], units)
+
+
+def _cell(row: tuple[Any, ...], k: int) -> Any:
+    value = row[k] if k < len(row) else None
+    return "" if value is None else value
+
+
+def _column(values: list[Any]) -> np.ndarray:
+    if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+        return np.array(values, float)
+    return np.array([str(v) for v in values])
+
+
+DEEPEST_STRUCTURE = 30
+"""Structures of the description within one another."""
+
+_BYTE_ARRAY, _FIXED_LENGTH = 6, 7  # physical types
+_TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _LIST, _SET, _MAP, _STRUCT = 1, 2, 3, 7, 8, 9, 10, 11, 12
+
+
+class ParquetColumn(NamedTuple):
+    """A column of one group of rows.
+
+    Attributes:
+        name: with those of the structures around it, joined by points.
+        size: when unpacked, words counted once [bytes].
+        is_text: whether its values have lengths of their own.
+    """
+
+    name: str
+    size: int
+    is_text: bool
+
+
+def columns_of_parquet(path: Path) -> list[ParquetColumn]:
+    """The columns of each group of rows.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the description at the end of the file is damaged.
+    """
+    with path.open("rb") as file:
+        start, size = file.read(4), file.seek(0, os.SEEK_END)
+        file.seek(max(size - 8, 0))
+        length, end = int.from_bytes(file.read(4), "little"), file.read(4)
+        if start != b"PAR1" or end != b"PAR1" or length > size - 12:
+            raise ValueError("it does not begin and end as one")
+        file.seek(size - 8 - length)
+        description = file.read(length)
+    found = []
+    try:
+        whole = _Description(description).structure(0)
+        widest = max([8, *(part.get(2, 0) for part in whole[2] if part.get(1) == _FIXED_LENGTH)])
+        for group in whole.get(4, []):
+            for column in group[1]:
+                about = column[3]
+                kind, count, size = about[1], about[5], about[6]
+                if min(count, size) < 0:
+                    raise ValueError("a column has a negative size")
+                size = max(size, count * (widest if kind == _FIXED_LENGTH else 8))
+                name = ".".join(part.decode() for part in about[3])
+                found.append(ParquetColumn(name, size, kind == _BYTE_ARRAY))
+    except (KeyError, IndexError, TypeError, AttributeError) as error:
+        raise ValueError("its description is damaged") from error
+    return found
+
+
+class _Description:
+    """Structures in the compact protocol: a dictionary for each, by the numbers of the fields."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, count: int) -> bytes:
+        """The next bytes."""
+        self.at += count
+        if self.at > len(self.data):
+            raise ValueError("its description is incomplete")
+        return self.data[self.at - count : self.at]
+
+    def natural(self) -> int:
+        """A number in groups of seven bits."""
+        value = 0
+        for shift in range(0, 70, 7):
+            byte = self.take(1)[0]
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                return value
+        raise ValueError("a number of its description is too long")
+
+    def whole(self) -> int:
+        """A number that may be negative."""
+        value = self.natural()
+        return (value >> 1) ^ -(value & 1)
+
+    def structure(self, depth: int) -> dict[int, Any]:
+        """The fields up to the end of the structure."""
+        if depth > DEEPEST_STRUCTURE:
+            raise ValueError("its description is nested too deeply")
+        found: dict[int, Any] = {}
+        number = 0
+        while head := self.take(1)[0]:
+            number = number + (head >> 4) if head >> 4 else self.whole()
+            kind = head & 15
+            found[number] = kind == _TRUE if kind in (_TRUE, _FALSE) else self.value(kind, depth)
+        return found
+
+    def value(self, kind: int, depth: int) -> Any:
+        """A value of a type; of truths in a list, one byte each."""
+        if kind in (_TRUE, _FALSE, _BYTE):
+            return self.take(1)[0]
+        if kind < _DOUBLE:
+            return self.whole()
+        if kind == _DOUBLE:
+            return self.take(8)
+        if kind == _BINARY:
+            return self.take(self.natural())
+        if kind == _STRUCT:
+            return self.structure(depth + 1)
+        if depth > DEEPEST_STRUCTURE:
+            raise ValueError("its description is nested too deeply")
+        if kind in (_LIST, _SET):
+            head = self.take(1)[0]
+            count = self.natural() if head >> 4 == 15 else head >> 4
+            return [self.value(head & 15, depth + 1) for _ in range(count)]
+        if kind == _MAP:
+            count = self.natural()
+            kinds = self.take(1)[0] if count else 0
+            return [
+                (self.value(kinds >> 4, depth + 1), self.value(kinds & 15, depth + 1)) for _ in range(count)
+            ]
+        raise ValueError(f"its description has a value of the unknown type {kind}")
 
 
 def read_mat(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:

@@ -17,22 +17,29 @@ import numpy as np
 from jaxtyping import Real
 
 from rotflex_jax.checks import real, shown
-from rotflex_jax.data.binary import table_from_frame, table_from_mat, table_from_npz, table_from_parquet
+from rotflex_jax.data.binary import (
+    table_from_frame,
+    table_from_mat,
+    table_from_npz,
+    table_from_parquet,
+    table_from_xlsx,
+)
 from rotflex_jax.data.logs import Channel, table_from_mcap, table_from_mdf, table_from_tdms, table_of_channels
-from rotflex_jax.data.resampling import TimedSignal, resampled, resampled_apart
-from rotflex_jax.data.spreadsheet import table_from_xlsx
 from rotflex_jax.data.tables import (
     MAX_BYTES,
     Table,
+    TimedSignal,
     check_size,
     name_and_unit,
+    resampled,
+    resampled_apart,
     table_from_text,
     unreadable,
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import single
 from rotflex_jax.recording.quality import Finding, acceptable, whole_numbers
+from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.samples import even_spacing, finite, real_numbers, sampling_period
 from rotflex_jax.text.files import write_file
 

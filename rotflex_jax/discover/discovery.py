@@ -6,11 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax import checks
-from rotflex_jax.discover.explanation import Explanation, remaining_failures
-from rotflex_jax.discover.latent_comparison import LatentTorqueComparison, compare_latent_torques
+from rotflex_jax.discover.conclusion import proposed
+from rotflex_jax.discover.explanation import (
+    Explanation,
+    LatentTorqueComparison,
+    compare_latent_torques,
+    model_tests,
+    remaining_failures,
+)
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult, learn_torque
-from rotflex_jax.discover.model_tests import model_tests
-from rotflex_jax.discover.proposal import proposed
 from rotflex_jax.discover.result import NEXT, SearchResult
 from rotflex_jax.discover.tables import (
     channel_headings,
@@ -25,10 +29,9 @@ from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.models.model_json import Saved, save
-from rotflex_jax.text.markup import bullets, card, folded, paragraph, picture, table
+from rotflex_jax.text.markup import as_json, bullets, card, folded, paragraph, picture, table, write_files
 from rotflex_jax.text.numbers import equation, plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import staircase
-from rotflex_jax.text.templates import as_json, write_files
 
 # Candidates of the ranking that a notebook lists.
 LISTED_CANDIDATES = 8

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.horizon import Horizons, SearchHorizon
 from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
-from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem
-from rotflex_jax.discover.refit import refit
+from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem, refit
 from rotflex_jax.discover.result import RunErrors, Stage
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import (
+    Horizons,
+    SearchHorizon,
     ValidatedHypothesis,
     ValidationSet,
     adapted_to_recordings,
@@ -26,11 +26,10 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import inference
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.dataset import padded_length, prepare
+from rotflex_jax.fit.dataset import Windows, padded_length, prepare
 from rotflex_jax.fit.held_constants import with_held_constants
 from rotflex_jax.fit.inference import Combination, RecordingSlopes, curvature, sandwich
-from rotflex_jax.fit.signs import check_signs
-from rotflex_jax.fit.windows import Windows
+from rotflex_jax.fit.plausibility import check_signs
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate

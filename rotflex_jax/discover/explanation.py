@@ -1,15 +1,246 @@
-"""What a report needs beyond the search: missing torques, a learned torque, remaining failures."""
+"""What a report needs beyond the search: residual tests, frequency responses, missing and learned torques."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
 
 import numpy as np
+import scipy
+from jaxtyping import Float
 
-from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.localise import locate
-from rotflex_jax.discover.model_tests import ModelTests
-from rotflex_jax.discover.result import SearchResult, Where
+from rotflex_jax.discover.result import SearchResult, Stage, Where
 from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.latent import LatentTorque, latent_torque
+from rotflex_jax.latent.torque import Progress
+from rotflex_jax.models.model import Model
+from rotflex_jax.models.residual_tests import (
+    FrequencyResponse,
+    ResidualTests,
+    frequency_response,
+    residual_tests,
+)
+from rotflex_jax.recording import Recording
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelTests:
+    """What the longest validation recording says of the baseline and of the final model.
+
+    Attributes:
+        recording: Which it is.
+        residuals: Name of the model -> tests of its innovations, what one-step predictions leave.
+        measured: Response of the measured outputs to the input.
+        simulated: Name of the model -> the same estimate of its free run.
+    """
+
+    recording: Recording
+    residuals: dict[str, ResidualTests]
+    measured: FrequencyResponse
+    simulated: dict[str, FrequencyResponse]
+
+
+def model_tests(found: SearchResult) -> ModelTests:
+    """Residual tests and frequency responses of the baseline and the final model.
+
+    Residuals are those of predictions, with the process noise that the data ask for: where a model is right
+    they are white and independent of the input. Frequency responses are of free runs over the recording.
+    """
+    i = max(range(len(found.validation)), key=lambda k: found.validation[k].N)
+    recording = found.validation[i]
+    stages = {"baseline": found.baseline} | ({"final model": found.final} if found.rounds else {})
+    measured = np.asarray(found.baseline.model.measured(recording), float)
+    residuals = {name: tests for name, s in stages.items() if (tests := _innovations(found, s, recording))}
+    runs = {name: np.asarray(s.simulated[i], float) for name, s in stages.items()}
+    simulated = {
+        name: frequency_response(recording.u, run, recording.Ts)
+        for name, run in runs.items()
+        if np.all(np.isfinite(run))
+    }
+    return ModelTests(
+        recording, residuals, frequency_response(recording.u, measured, recording.Ts), simulated
+    )
+
+
+def _innovations(found: SearchResult, stage: Stage, recording: Recording) -> ResidualTests | None:
+    """Tests of a stage's innovations; None where its predictions run away."""
+    channels, m = stage.model.mechanism.channels, recording.n_init
+    noise = [found.noise_floor.get(c) or stage.held_out_rmse_windows[c] for c in channels]
+    predicted = np.asarray(stage.model.predict(recording, stage.process_noise, noise), float)
+    e = (np.asarray(stage.model.measured(recording), float) - predicted)[m:]
+    if len(e) < 60 or not np.all(np.isfinite(e)):
+        return None
+    return residual_tests(e, recording.u[m:].astype(float), recording.Ts, channels)
+
+
+# Of a long recording only so much is smoothed [s].
+SHOWN_SECONDS = 30.0
+
+
+@dataclasses.dataclass(frozen=True)
+class LatentTorqueComparison:
+    """Latent torques of the same recordings.
+
+    Attributes:
+        before: What the baseline lacks.
+        after: What the final model lacks; None where nothing was added, or where it has play in a gear.
+    """
+
+    before: LatentTorque
+    after: LatentTorque | None
+
+
+def compare_latent_torques(
+    baseline: Stage, final: Stage | None, recordings: Sequence[Recording], progress: Progress | None = None
+) -> LatentTorqueComparison:
+    """Latent torques under a baseline and under the final model.
+
+    Args:
+        baseline: Before.
+        final: After; None where nothing was added.
+        recordings: Of each the first 30 s are used.
+        progress: Called with a line of text now and then.
+    """
+    shown = [r.slice(0, min(r.N, round(SHOWN_SECONDS / r.Ts))) for r in recordings]
+    if final is None or not all(e.slope_at_zero for e in final.model.mechanism.effects):
+        # Impacts of teeth have no slopes: a smoother would take an impact for a torque.
+        return LatentTorqueComparison(latent_torque(calibrated(baseline), shown, progress=progress), None)
+    last = calibrated(final)
+    first = with_effects_of(calibrated(baseline), last)
+    return LatentTorqueComparison(*(latent_torque(m, shown, progress=progress) for m in (first, last)))
+
+
+def calibrated(stage: Stage) -> Model:
+    """The model of a stage with the offsets that belong to its recordings."""
+    m = stage.model.mechanism
+    for e in stage.estimates:
+        port, effect, parameter = e.name.split(".")
+        if e.name not in m.parameter_names and effect in CATALOG:
+            m = m + CATALOG[effect](at=port, **{parameter: e.value})
+    return dataclasses.replace(stage.model, mechanism=m)
+
+
+def with_effects_of(small: Model, large: Model) -> Model:
+    """A model as a larger one with effects switched off, so that both share compiled code."""
+    own = small.mechanism
+    present = {(e.name, e.at) for e in own.effects}
+    m = large.mechanism
+    missing = [e for e in own.effects if (e.name, e.at) not in {(f.name, f.at) for f in m.effects}]
+    for e in missing:
+        m = m + e
+    values = dict(zip(own.parameter_names, own.values.tolist(), strict=True))
+    gates = tuple(1.0 if (e.name, e.at) in present else 0.0 for e in m.effects)
+    return Model(m.with_values(values), large.solver, gates)
+
+
+# A coefficient of less colours too little to matter.
+LEAST_COLOUR = 0.2
+# Chance of refusing an AR(1) where the errors are one, of each of the tests.
+FALSE_REFUSAL = 1e-3
+# Lags at which what an AR(1) leaves must be white.
+LAGS = 25
+# Samples that any of these tests need.
+LEAST_SAMPLES = 400
+
+
+def coloured_noise(
+    e: Float[np.ndarray, " N"], motion: Float[np.ndarray, "N M"], u: Float[np.ndarray, " N"], Ts: float
+) -> float | None:
+    """The coefficient of an AR(1) that explains an error, where nothing of the motion remains in it.
+
+        e(t) = a e(t-1) + w(t)
+
+    `w` must be white (Ljung and Box), independent of the input, and neither its mean nor its size may follow
+    the motion: F tests of regressions of w and of |w| on positions, speeds, their signs and squares.
+
+    Args:
+        e: Errors of free runs of one channel.
+        motion: Simulated signals and their derivatives.
+        u: Input.
+        Ts: Sampling period [s].
+
+    Returns:
+        `a`, or None where the errors are something else, or nearly white.
+
+    Source: G. M. Ljung and G. E. P. Box, Biometrika 65, 1978.
+    """
+    N = len(e) - 1
+    if N < LEAST_SAMPLES or not np.all(np.isfinite(e)) or np.ptp(e) == 0:
+        return None
+    x = e - e.mean()
+    a = float(x[1:] @ x[:-1] / (x[:-1] @ x[:-1]))
+    w = x[1:] - a * x[:-1]
+    if not LEAST_COLOUR < a < 1:
+        return None
+    tests = residual_tests(w[:, None], u[1:], Ts, ("error",), LAGS)
+    r = tests.autocorrelation[0, 1:]
+    ljung_box = N * (N + 2) * float(np.sum(r**2 / (N - np.arange(1, LAGS + 1))))
+    if scipy.stats.chi2.sf(ljung_box, LAGS - 1) < FALSE_REFUSAL:
+        return None
+    # Of 26 lags with 1 % each, four or more are outside once in 10,000 cases.
+    if tests.outside_input[0][tests.input_lags >= 0].sum() >= 4:
+        return None
+    z = motion[1:] / np.maximum(motion[1:].std(axis=0), 1e-300)
+    regressors = np.column_stack([z, np.sign(z), z**2])
+    if any(_depends(y, regressors) for y in (w, np.abs(w))):
+        return None
+    return a
+
+
+def _depends(y: Float[np.ndarray, " N"], regressors: Float[np.ndarray, "N K"]) -> bool:
+    """Whether a regression explains more than chance does, by an F test."""
+    X = regressors - regressors.mean(axis=0)
+    y = y - y.mean()
+    left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    K, N = int(np.linalg.matrix_rank(X)), len(y)
+    ratio = (float(y @ y) - float(left @ left)) / K / max(float(left @ left) / (N - K - 1), 1e-300)
+    return scipy.stats.f.sf(ratio, K, N - K - 1) < FALSE_REFUSAL
+
+
+def coloured_sensors(model: Model, recording: Recording, runs: Float[np.ndarray, "N C"]) -> dict[str, float]:
+    """Channel -> coefficient of an AR(1), for a model of whose errors nothing else remains.
+
+    Args:
+        model: That was fitted.
+        recording: One that it was not fitted to.
+        runs: Its free run over that recording.
+
+    Returns:
+        Empty where a channel has errors that are neither white nor an AR(1).
+    """
+    y = np.asarray(model.measured(recording), float)
+    # That of the run, since what is measured has the noise in it.
+    motion, first = np.column_stack([runs, np.gradient(runs, recording.Ts, axis=0)]), recording.n_init
+    found = {}
+    for channel, error in zip(model.mechanism.channels, (y - runs).T, strict=True):
+        given = error[first:], motion[first:], recording.u[first:].astype(float), recording.Ts
+        a = coloured_noise(*given)
+        if a is not None:
+            found[channel] = a
+        elif not _is_white(error[first:]):
+            return {}
+    return found
+
+
+def _is_white(e: Float[np.ndarray, " N"]) -> bool:
+    """Whether an error has little memory of itself."""
+    x = e - e.mean()
+    power = float(x @ x)
+    return power > 0 and abs(float(x[1:] @ x[:-1])) / power < LEAST_COLOUR + 2 / math.sqrt(len(e))
+
+
+def advice(coloured: dict[str, float]) -> tuple[str, ...]:
+    """What to do where sensors have coloured noise, in a sentence; nothing for none."""
+    if not coloured:
+        return ()
+    listed = " and ".join(f"{c} ({a:.2g})" for c, a in coloured.items())
+    return (
+        f"What remains is no torque: the free-run errors of {listed} are an AR(1) with that coefficient from "
+        "one sample to the next, whatever the motion. Sensor noise is taken for white here; look for a "
+        "filter or a drifting zero of the sensor, and judge the model by its free runs.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rotflex_jax.discover.assessment import NATS_PER_SAMPLE, NEAR_FLOOR
 from rotflex_jax.discover.evaluation import process_noise_gain
-from rotflex_jax.discover.horizon import Horizons
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -21,8 +19,7 @@ from rotflex_jax.discover.hypothesis import (
     with_candidate,
     without,
 )
-from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import refit
+from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.score_test import PairScore, ScoreTest
 from rotflex_jax.discover.selection import (
     TRAIN_NATS,
@@ -34,7 +31,8 @@ from rotflex_jax.discover.selection import (
 )
 from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis
+from rotflex_jax.discover.verdict import NATS_PER_SAMPLE, NEAR_FLOOR
 from rotflex_jax.effects import CATALOG
 
 # Candidates of which pairs are scored, and pairs that are refitted: the best, and those that gain most beyond

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from rotflex_jax import checks
-from rotflex_jax.discover.bias_correction import correct_discretisation_bias
 from rotflex_jax.discover.checkpoint import (
     AddedEffect,
     KeptStage,
+    beginning,
     digest_of_search,
     kept,
+    milestone,
     not_kept,
     read_stages,
     restored,
 )
-from rotflex_jax.discover.conditional import ConditionalInterval, conditional_note, excluding
+from rotflex_jax.discover.conclusion import assess_stages, end_state, signs, with_proposal
 from rotflex_jax.discover.discovery import Discovery
-from rotflex_jax.discover.end_state import assess_stages, end_state
 from rotflex_jax.discover.evaluation import (
     Evaluation,
     PairedEstimates,
@@ -33,8 +33,6 @@ from rotflex_jax.discover.evaluation import (
     paired_estimates,
     process_noise_gain,
 )
-from rotflex_jax.discover.fitted_sets import fitted_sets
-from rotflex_jax.discover.horizon import Horizons, SearchHorizon, as_free_run, at_horizon
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -43,14 +41,24 @@ from rotflex_jax.discover.hypothesis import (
     parameter_count,
     without,
 )
-from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.likelihood import (
+    LikelihoodProblem,
+    choose_process_noise,
+    correct_discretisation_bias,
+    refit,
+)
 from rotflex_jax.discover.localise import locate
-from rotflex_jax.discover.milestone import beginning, milestone
 from rotflex_jax.discover.pairs import find_pair, is_unexplained
-from rotflex_jax.discover.probabilities import Probabilities, probabilities
-from rotflex_jax.discover.proposal import with_proposal
-from rotflex_jax.discover.refit import choose_process_noise, refit
-from rotflex_jax.discover.result import HorizonGain, Ranked, Round, Stage
+from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
+from rotflex_jax.discover.result import (
+    ConditionalInterval,
+    HorizonGain,
+    Ranked,
+    Round,
+    Stage,
+    conditional_note,
+    excluding,
+)
 from rotflex_jax.discover.score_test import Score, ScoreTest, promising_at_both, score_test
 from rotflex_jax.discover.selection import (
     best_window_rmse,
@@ -62,7 +70,6 @@ from rotflex_jax.discover.selection import (
     runs_clearly_better,
     validate_from_best_states,
 )
-from rotflex_jax.discover.stand_in import signs
 from rotflex_jax.discover.stepwise import (
     Eliminated,
     assign_calibrations,
@@ -76,19 +83,25 @@ from rotflex_jax.discover.stepwise import (
     remaining_rivals,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, checked_candidates, scales
-from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
+from rotflex_jax.discover.validation import (
+    Horizons,
+    SearchHorizon,
+    ValidatedHypothesis,
+    ValidationSet,
+    as_free_run,
+    at_horizon,
+    validate,
+)
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import padded_length, prepare, process_noise_ports
-from rotflex_jax.fit.plausibility import Reach, Remark, at_bounds, beyond_recordings
-from rotflex_jax.fit.signs import check_signs
+from rotflex_jax.fit.plausibility import Reach, Remark, at_bounds, beyond_recordings, check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.digest import check_apart
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, listed
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 from rotflex_jax.runtime.xla import one_thread
 

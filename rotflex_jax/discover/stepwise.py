@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rotflex_jax.discover.horizon import Horizons, as_free_run
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
+    Whitener,
     embed_initial_state,
     is_physical,
     parameter_count,
@@ -18,8 +18,7 @@ from rotflex_jax.discover.hypothesis import (
     with_effect,
     without,
 )
-from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.refit import levenberg_marquardt, refit
+from rotflex_jax.discover.likelihood import LikelihoodProblem, levenberg_marquardt, refit
 from rotflex_jax.discover.selection import (
     FREE_RUN_BETTER,
     FREE_RUN_Z,
@@ -31,8 +30,13 @@ from rotflex_jax.discover.selection import (
     runs_clearly_better,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
-from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
-from rotflex_jax.discover.whitening import Whitener
+from rotflex_jax.discover.validation import (
+    Horizons,
+    ValidatedHypothesis,
+    ValidationSet,
+    as_free_run,
+    validate,
+)
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism.assembly import Layout
 

@@ -17,7 +17,7 @@ from rotflex_jax.checks import shown
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect, Scale
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.motion import motion
+from rotflex_jax.fit.plausibility import motion
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import own_states
 from rotflex_jax.mechanism.linear import inverse_mass

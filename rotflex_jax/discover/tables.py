@@ -5,10 +5,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from rotflex_jax.discover.assessment import Grade, grade
-from rotflex_jax.discover.coloured_noise import advice, coloured_sensors
+from rotflex_jax.discover.explanation import advice, coloured_sensors
 from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, Stage
-from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.discover.verdict import Grade, Verdict, grade
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.text.numbers import (
     multiple,

@@ -1,4 +1,9 @@
-"""Hypotheses on validation data: likelihood in blocks, free-run errors, runs that validate each other."""
+"""Hypotheses on validation data: likelihood in blocks, short free runs, the two horizons of a search.
+
+As in `Model.simulate_windows`, positions and speeds come from the first samples of each window. States that
+no sensor measures are given here, and come from a run over the whole recording there. A model of its own
+would be compiled for every candidate.
+"""
 
 import dataclasses
 import functools
@@ -8,17 +13,94 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.batched_predictor import ParameterSet
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
-from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_blocks
-from rotflex_jax.discover.refit import refit
-from rotflex_jax.discover.short_runs import ShortRuns
+from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_blocks, refit
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.windows import Windows
-from rotflex_jax.metrics import windowed_rmse
+from rotflex_jax.fit.dataset import Dataset, Windows
+from rotflex_jax.metrics import window_starts, windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
+
+# Of the fit of a window's first state to a few samples, which determine it well.
+FIRST_STATE_RULES = Rules(enough_share=1e-9, least=1e-6)
+MAX_FIRST_STATE_STEPS = 12
+
+
+class _FirstState(NamedTuple):
+    """First positions and speeds of one window."""
+
+    recording: int
+    window: int
+    samples: slice
+    state: Float[np.ndarray, " s"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ShortRuns:
+    """Free runs over the windows of some recordings.
+
+    Attributes:
+        predictor: Runs them.
+        dataset: The recordings.
+        windows: Where runs start again.
+    """
+
+    predictor: BatchedPredictor
+    dataset: Dataset
+    windows: Windows
+
+    def outputs(self, run: ParameterSet, directions: int) -> list[Float[np.ndarray, "_ C"]]:
+        """Outputs of each recording's runs; as measured where a sample does not count.
+
+        Args:
+            run: Parameters; of its first states (R, W, m) positions and speeds are where a fit starts, and
+                the others are kept. Its gain is not used.
+            directions: Of the compiled slopes: as many as fits of this structure have, one per coordinate of
+                a first state at least.
+        """
+        run = run._replace(K=np.zeros_like(run.K))
+        found = run._replace(x0=self._first_states(run, directions))
+        y_hat = self.dataset.data.y - self.predictor.innovations([found], self.windows.index)[0]
+        return [np.asarray(y_hat[r, : recording.N]) for r, recording in enumerate(self.dataset.recordings)]
+
+    def _first_states(self, run: ParameterSet, directions: int) -> Float[np.ndarray, "R W m"]:
+        """First states whose positions and speeds suit the first samples of each window best."""
+        size, (R, P) = self.windows.first_states.shape[-1], run.values.shape
+        x0_ways = np.eye(directions, run.x0.shape[-1])
+        x0_ways[size:] = 0.0
+        ways = Directions(np.zeros((directions, R, P)), x0_ways, np.zeros((directions, len(run.gates))))
+
+        def started_at(points: list[_FirstState]) -> ParameterSet:
+            x0 = run.x0.copy()
+            for p in points:
+                x0[p.recording, p.window, :size] = p.state
+            return run._replace(x0=x0)
+
+        def linearise(points: list[_FirstState]) -> list[NormalEquations]:
+            # Windows share each run.
+            e, J = self.predictor.slopes([started_at(points)], [ways], self.windows.index)
+            heads = ((J[0, :size, p.recording, p.samples], e[0, p.recording, p.samples]) for p in points)
+            return [NormalEquations.of(slopes.reshape(size, -1).T, w.ravel()) for slopes, w in heads]
+
+        found = minimise_together(
+            linearise,
+            self._rough_states(),
+            FIRST_STATE_RULES,
+            move=lambda p, step: p._replace(state=p.state + step),
+            max_steps=MAX_FIRST_STATE_STEPS,
+        )
+        return started_at([m.x for m in found]).x0
+
+    def _rough_states(self) -> list[_FirstState]:
+        out = []
+        for r, recording in enumerate(self.dataset.recordings):
+            for w, samples in self.windows.of(r):
+                first = slice(samples.start, samples.start + recording.n_init)
+                out.append(_FirstState(r, w, first, self.windows.first_states[r, w]))
+        return out
+
 
 # Of the fit of first states and calibrations. Most steps are nearly linear, so the damping is small from the
 # start, but not nothing: recordings need not determine every state.
@@ -303,3 +385,85 @@ def adapted_to_recordings(
 def _costs(h: Hypothesis, innovations: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Half the squared size of each row of innovations (H, R, N, C); infinite where a run diverges."""
     return np.nan_to_num(0.5 * np.sum(h.whitener(innovations, seen) ** 2, axis=(1, 2, 3)), nan=np.inf)
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchHorizon:
+    """Training and validation recordings at one horizon.
+
+    Attributes:
+        problem: The likelihood of the training recordings.
+        validation: The validation recordings.
+    """
+
+    problem: LikelihoodProblem
+    validation: ValidationSet
+
+
+@dataclasses.dataclass(frozen=True)
+class Horizons:
+    """Both horizons; the same compiled programs serve both, as windows are data.
+
+    Attributes:
+        prediction: Each sample from the ones before it, with the process noise that the data ask for.
+        free_run: From the voltage alone, starting again every few seconds.
+    """
+
+    prediction: SearchHorizon
+    free_run: SearchHorizon
+
+    @classmethod
+    def of(
+        cls, model: Model, train: LikelihoodProblem, validation: LikelihoodProblem | None, seconds: float
+    ) -> "Horizons":
+        """Both horizons of predictions.
+
+        Args:
+            model: The user's model.
+            train: Predictions of the training recordings.
+            validation: Predictions of the validation recordings; if None, each training recording validates
+                what was fitted to the others.
+            seconds: Length of a free run [s].
+        """
+        problems = (train, *([validation] if validation else []))
+        recordings = [r for p in problems for r in p.dataset.recordings]
+        number = max(len(window_starts(r, seconds)[0]) for r in recordings)
+        whole = [dataclasses.replace(p, windows=Windows.whole(p.dataset, number)) for p in problems]
+        cut = [p.of_free_runs(Windows.of_seconds(model, p.dataset, seconds, number)) for p in problems]
+        if validation is None:
+            sets = [ValidationSet.leave_one_out(p[0], seconds) for p in (whole, cut)]
+        else:
+            sets = [ValidationSet(p[1], seconds) for p in (whole, cut)]
+        return cls(SearchHorizon(whole[0], sets[0]), SearchHorizon(cut[0], sets[1]))
+
+    def validated(
+        self, prediction: Hypothesis, free_run: Hypothesis, near: ValidatedHypothesis | None = None
+    ) -> ValidatedHypothesis:
+        """One structure, fitted at both horizons, on validation data.
+
+        Args:
+            prediction: Fitted to predictions.
+            free_run: Fitted to free runs.
+            near: Another structure; see `validate`.
+        """
+        runs = validate(self.free_run.validation, free_run, near.free_run if near else None)
+        found = validate(self.prediction.validation, prediction, near, runs.adapted)
+        return dataclasses.replace(found, free_run=runs)
+
+
+def at_horizon(problem: LikelihoodProblem, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
+    """The parameters of a hypothesis at another horizon, from measured first states; not fitted.
+
+    Args:
+        problem: The same recordings at that horizon.
+        h: Its parameters.
+        intensity: Port -> process noise [(N m)^2 s]; a free run has none.
+    """
+    x0 = embed_initial_state(problem.supermodel, h.locations, problem.windows.first_states)
+    start = problem.with_process_noise(dataclasses.replace(h, x0=x0), intensity)
+    return problem.evaluated(start, problem.innovations([start])[0])
+
+
+def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
+    """A hypothesis of predictions as one of free runs; `problem` is that of free runs."""
+    return at_horizon(problem, h, dict.fromkeys(problem.ports, 0.0))

@@ -1,10 +1,167 @@
-"""The end states of a search. A new one is a member here, and a case of the rule in `end_state.py`."""
+"""How good a final model is (what is explained, what remains in units of the noise), and the verdicts.
 
-from collections.abc import Sequence
+A new verdict is a member here, and a case of the rule in `conclusion.py`.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MUTED
+from rotflex_jax.text.numbers import multiple, ratio
+
+# An error of at most this times the sensor noise counts as having reached it.
+NEAR_FLOOR = 1.5
+# Beyond this times the sensor noise much is left.
+FAR_FLOOR = 5.0
+# The model explains the recordings if process torques gain no more than this per measured value [nat],
+# and short held-out runs come as near to the sensor noise as `NEAR_FLOOR` says.
+NATS_PER_SAMPLE = 0.07
+
+
+class Grade(StrEnum):
+    """How far an error is from the noise of its sensor."""
+
+    NOISE = "noise"
+    NEAR = "near"
+    FAR = "far"
+
+
+def grade(times: float) -> Grade | None:
+    """The grade of an error; None where no noise is known.
+
+    Args:
+        times: Error over the standard deviation of the noise.
+
+    >>> [str(grade(t)) for t in (1.17, 3.0, 229.0)]
+    ['noise', 'near', 'far']
+    """
+    if math.isnan(times):
+        return None
+    return Grade.NOISE if times < NEAR_FLOOR else Grade.NEAR if times < FAR_FLOOR else Grade.FAR
+
+
+@dataclasses.dataclass(frozen=True)
+class Assessment:
+    """What the verdict rests on.
+
+    Attributes:
+        explained: Channel -> share of the baseline's squared error that the final model explains [%].
+        remaining: Channel -> error of short runs that is left, in multiples of the sensor noise.
+        torque_nats: What random torques still gain per measured value [nat]; 0 where the model is right.
+    """
+
+    explained: dict[str, float]
+    remaining: dict[str, float]
+    torque_nats: float
+
+    @property
+    def at_noise(self) -> bool:
+        """Whether the errors of all channels have reached the noise."""
+        return all(times < NEAR_FLOOR for times in self.remaining.values())
+
+    @property
+    def torque_free(self) -> bool:
+        """Whether predictions need no random torque."""
+        return self.torque_nats < NATS_PER_SAMPLE
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the model explains the recordings: both criteria hold."""
+        return self.at_noise and self.torque_free
+
+    @property
+    def grade(self) -> Grade | None:
+        """That of the channel that is furthest from its noise."""
+        known = [times for times in self.remaining.values() if not math.isnan(times)]
+        return grade(max(known)) if known else None
+
+    @property
+    def criterion(self) -> str:
+        """Which criterion decided, as a clause."""
+        unknown = [c for c, times in self.remaining.items() if math.isnan(times)]
+        if not self.at_noise:
+            if all(times < NEAR_FLOOR for c, times in self.remaining.items() if c not in unknown):
+                return f"the sensor noise of {' and '.join(unknown)} is not known, to judge what is left by"
+            worst = max(set(self.remaining) - set(unknown), key=lambda c: self.remaining[c])
+            return f"the error of {worst} in short runs is above {NEAR_FLOOR:g} times the sensor noise"
+        if not self.torque_free:
+            return (
+                f"short runs are at the noise, but predictions still ask for a random torque "
+                f"({self.torque_nats:.2g} nat per measured value, at most {NATS_PER_SAMPLE:g})"
+            )
+        return (
+            f"short runs are within {NEAR_FLOOR:g} times the sensor noise, and predictions ask for "
+            "no random torque"
+        )
+
+    @property
+    def explained_text(self) -> str:
+        """What is explained of each channel, in words; empty where nothing is."""
+        listed = [f"{c} {percent(share)}" for c, share in self.explained.items() if share > 0]
+        return f"{', '.join(listed)} of the baseline's squared error is explained" if listed else ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+
+        def finite(values: Mapping[str, float]) -> dict[str, float | None]:
+            return {c: v if math.isfinite(v) else None for c, v in values.items()}
+
+        return {
+            "explained_percent": finite(self.explained),
+            "remaining_over_noise": finite(self.remaining),
+            "random_torque_nats_per_value": self.torque_nats if math.isfinite(self.torque_nats) else None,
+            "grade": self.grade,
+            "criterion": self.criterion,
+        }
+
+
+def assess(
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    floor: Mapping[str, float],
+    nats: float,
+    samples: int,
+) -> Assessment:
+    """The end of a search by its errors.
+
+    Args:
+        before: Channel -> error of short runs of the baseline.
+        after: The same of the final model.
+        floor: Channel -> standard deviation of the sensor noise.
+        nats: Log-likelihood that random torques gain over the final model [nat].
+        samples: Validation samples.
+
+    >>> end = assess({"theta": 0.1}, {"theta": 0.002}, {"theta": 0.001}, 5.0, 1000)
+    >>> round(end.explained["theta"], 2), end.remaining, end.is_explained, end.grade
+    (99.96, {'theta': 2.0}, False, <Grade.NEAR: 'near'>)
+    """
+    shares = {c: 100 * (1 - (after[c] / e) ** 2) if e > 0 else math.nan for c, e in before.items()}
+    values = samples * max(1, len(floor))
+    remaining = {c: ratio(after[c], floor.get(c)) for c in after}
+    return Assessment(shares, remaining, nats / values if values else math.nan)
+
+
+def percent(share: float) -> str:
+    """A share near 100 % with as many digits as what is left of it is worth.
+
+    >>> percent(83.21), percent(99.871), percent(99.99999), percent(-3.0)
+    ('83.2 %', '99.87 %', '> 99.99 %', '0 %')
+    """
+    if share > 99.99:
+        return "> 99.99 %"
+    return f"{share:.2f} %" if share > 99 else f"{share:.1f} %" if share > 0 else "0 %"
+
+
+def in_noise(remaining: Mapping[str, float]) -> str:
+    """What remains, as it stands in a sentence.
+
+    >>> in_noise({"theta": 1.168, "alpha": 228.6})
+    'theta 1.17, alpha 229'
+    """
+    return ", ".join(f"{c} {multiple(times) or 'an unknown number of'}" for c, times in remaining.items())
 
 
 class Presentation(NamedTuple):

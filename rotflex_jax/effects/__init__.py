@@ -36,7 +36,7 @@ from rotflex_jax.effects.gear import Backlash, ElasticBacklash
 from rotflex_jax.effects.hysteresis import BoucWen, Dahl, LuGre
 from rotflex_jax.effects.inertia import Inertia, SecondMode
 from rotflex_jax.effects.learned import LearnedTorque
-from rotflex_jax.effects.motor import CurrentDrive, Heating, Motor
+from rotflex_jax.effects.motor import CurrentDrive, Heating, Motor, PositionServo
 from rotflex_jax.effects.sensors import (
     ChannelDelay,
     CrossTalk,
@@ -46,7 +46,6 @@ from rotflex_jax.effects.sensors import (
     SensorCubic,
     SensorGain,
 )
-from rotflex_jax.effects.servo import PositionServo
 from rotflex_jax.effects.springs import CubicSpring, JointPlay, QuadraticSpring, Spring
 
 __all__ = [

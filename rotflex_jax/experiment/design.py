@@ -11,20 +11,26 @@ from rotflex_jax import checks
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.discrimination import (
+    MAX_EVALUATIONS,
     Discrimination,
     DiscriminationProblem,
+    optimise_input,
     starts_with_other_shapes,
 )
-from rotflex_jax.experiment.input_optimisation import MAX_EVALUATIONS, optimise_input
 from rotflex_jax.experiment.result import Experiment, Rated, Segment
-from rotflex_jax.experiment.rival_fit import best_rival_fit, free_run_from_rest
-from rotflex_jax.experiment.rival_model import RivalModel, effect_location, rival_model
+from rotflex_jax.experiment.rival_fit import (
+    RivalModel,
+    best_rival_fit,
+    effect_location,
+    free_run_from_rest,
+    rival_model,
+)
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import models_of, sequential_experiment
 from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.validation import process_noise_of
+from rotflex_jax.mechanism.mechanism import process_noise_of
 from rotflex_jax.models.model import Model
 
 Progress = Callable[[str], None]

@@ -20,12 +20,11 @@ from scipy.signal import fftconvolve
 from rotflex_jax import checks
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment.rival_fit import LARGEST_STEP, MAX_STEPS, RULES
-from rotflex_jax.experiment.rival_model import with_calibrations
+from rotflex_jax.experiment.rival_fit import LARGEST_STEP, MAX_STEPS, RULES, with_calibrations
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
-from rotflex_jax.mechanism.validation import process_noise_of
+from rotflex_jax.mechanism.mechanism import process_noise_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, minimise
 from rotflex_jax.parameters import Transform

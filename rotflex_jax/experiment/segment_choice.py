@@ -9,8 +9,12 @@ from jaxtyping import Bool, Float
 
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment.discrimination import SMOOTH_MAXIMUM_EXPONENT
-from rotflex_jax.experiment.input_optimisation import PENALTY_WEIGHT, PENALTY_WIDTH, SMALLEST_ASCENT_STEP
+from rotflex_jax.experiment.discrimination import (
+    PENALTY_WEIGHT,
+    PENALTY_WIDTH,
+    SMALLEST_ASCENT_STEP,
+    SMOOTH_MAXIMUM_EXPONENT,
+)
 from rotflex_jax.experiment.result import Segment
 from rotflex_jax.experiment.rival_set import BATCH, Start
 from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST

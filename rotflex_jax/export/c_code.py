@@ -18,7 +18,7 @@ from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.linear import state_names
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.text.numbers import one_line
 
 # Characters: a longer expression gets a variable of its own even if it is used once.
 _LONGEST_EXPRESSION = 90

@@ -14,7 +14,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, simulate
 from rotflex_jax.models.model import Model
 from rotflex_jax.text.files import write_file
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.text.numbers import one_line
 
 # Amplitude of the input that a certificate is given on, by the unit of the input.
 _AMPLITUDES = {"V": 2.0, "rad": 0.6, "A": 0.5}

@@ -10,7 +10,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import effects_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.text.numbers import one_line
 
 _FUNCTIONS = {"sin", "cos", "tan", "exp", "log", "tanh", "min", "max", "sinh", "cosh", "arctan"}
 _SYMBOLS = {

@@ -25,7 +25,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.models.model import Model
 from rotflex_jax.text.files import write_file
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.text.numbers import one_line
 
 # Bytes of the archive depend on nothing but the model.
 _DATE = (1980, 1, 1, 0, 0, 0)

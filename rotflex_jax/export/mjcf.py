@@ -26,7 +26,7 @@ from rotflex_jax.export.joint_chain import (
 from rotflex_jax.joints.servos import FREE_FALL
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.text.numbers import one_line
 
 LONGEST_STEP = 1e-4
 """Step of the simulator that a file asks for [s], at most: larger ones are less accurate in dry friction."""

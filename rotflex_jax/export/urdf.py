@@ -22,7 +22,7 @@ from rotflex_jax.joints.servos import FREE_FALL
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.models.model import Model
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.text.numbers import one_line
 
 
 def to_urdf(

@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
+from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.fit.inference import RecordingSlopes
-from rotflex_jax.fit.windows import Windows
 
 # A direction of which no more than this share is left after a projection has none of its own.
 RANK_TOLERANCE = 1e-10

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports
+from rotflex_jax.fit.dataset import Dataset, Windows, prepare, process_noise_ports
 from rotflex_jax.fit.held_constants import with_held_constants
 from rotflex_jax.fit.inference import (
     Combination,
@@ -23,8 +23,14 @@ from rotflex_jax.fit.inference import (
     estimates,
     sandwich,
 )
-from rotflex_jax.fit.physical_ranges import physical_ranges
-from rotflex_jax.fit.plausibility import AT_BOUND, Reach, at_bounds, beyond_recordings
+from rotflex_jax.fit.plausibility import (
+    AT_BOUND,
+    Reach,
+    at_bounds,
+    beyond_recordings,
+    check_signs,
+    physical_ranges,
+)
 from rotflex_jax.fit.problem import (
     LARGEST_STEP,
     LikelihoodEquations,
@@ -33,11 +39,9 @@ from rotflex_jax.fit.problem import (
     runs_with_slopes,
 )
 from rotflex_jax.fit.result import Fit, FitOptions
-from rotflex_jax.fit.signs import check_signs
-from rotflex_jax.fit.windows import Windows
 from rotflex_jax.mechanism import Mechanism, kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.mechanism.validation import process_noise_of
+from rotflex_jax.mechanism.mechanism import process_noise_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import (
     Minimum,
@@ -48,8 +52,7 @@ from rotflex_jax.optimise.damped_least_squares import (
 )
 from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.digest import digest_of_recordings
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, digest_of_recordings, listed
 from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread
 
 if TYPE_CHECKING:

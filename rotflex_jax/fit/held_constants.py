@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from rotflex_jax.effects.base import Effect, Linear, Stamp
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.units import Units
+from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.parameters import Estimate, HeldConstant, Specification, specifications
 
 # Constants of a motor or a load are rarely known better than so: tolerances of data sheets are 5 to 12 %.

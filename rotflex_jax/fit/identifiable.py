@@ -21,17 +21,26 @@ from jaxtyping import Float
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import StackedRecordings, prepare
-from rotflex_jax.fit.directions import Direction, direction, kind_of, least_held, reduced
-from rotflex_jax.fit.exact_sensitivities import impulse_slopes, is_linear, null_space, random_values
 from rotflex_jax.fit.problem import RunLayout, runs_with_slopes
 from rotflex_jax.fit.result import Fit
+from rotflex_jax.fit.structural_identifiability import (
+    Direction,
+    direction,
+    impulse_slopes,
+    is_linear,
+    kind_of,
+    least_held,
+    null_space,
+    random_values,
+    reduced,
+)
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.mechanism import ROTOR
 from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, single
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, single
 from rotflex_jax.runtime.xla import double_precision
 from rotflex_jax.text.markup import bullets, card, paragraph
 

@@ -11,7 +11,7 @@ from rotflex_jax.basis.bank import require_basis
 from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import listed
+from rotflex_jax.recording.recording import listed
 
 # Singular values below this share of the largest one are rounding: the columns depend on each other.
 DEPENDENT_COLUMN_SHARE = 1e-12

@@ -21,12 +21,12 @@ from rotflex_jax.fit.dataset import (
     stack,
     with_common_constants,
 )
+from rotflex_jax.fit.plausibility import check_signs
 from rotflex_jax.fit.problem import (
     LARGEST_STEP,
     directions,
     normal_equations,
 )
-from rotflex_jax.fit.signs import check_signs
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
@@ -40,7 +40,7 @@ from rotflex_jax.optimise.damped_least_squares import (
 )
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread, spread
 

@@ -1,16 +1,165 @@
-"""Parameters whose size the recordings cannot speak for: at a bound, or far beyond what was recorded."""
+"""What is physically plausible: ranges of parameters, signs of channels, sizes the recordings speak for."""
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
+from jaxtyping import Float
 
-from rotflex_jax.effects.base import Effect, Sensing
-from rotflex_jax.fit.motion import motion
-from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.effects.base import Effect, Linear, Sensing
+from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism import Mechanism, linearise
+from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import Estimate, specifications
+from rotflex_jax.parameters import Estimate, Transform, specifications
 from rotflex_jax.recording import Recording
+
+
+def motion(
+    mechanism: Mechanism, y: Float[np.ndarray, "N C"], Ts: float, smooth: float = 0.03
+) -> dict[str, tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]]:
+    """Port -> (position, speed) by smoothing measured outputs over `smooth` seconds.
+
+    Ports that the measured positions do not determine are left out.
+    """
+    layout = Layout.of(mechanism.structure)
+    rows = np.array(layout.output_rows)
+    is_position = np.array([q.is_position for q in mechanism.quantities])
+    if not is_position.any():
+        return {}
+    width = max(2 * round(smooth / Ts / 2) + 1, 5)
+    width = min(width, len(y) - 1 + len(y) % 2)
+    C = rows[is_position, : layout.n]
+    position = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, axis=0))
+    speed = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0))
+    back, out = np.linalg.pinv(C), {}
+    for port, vector in mechanism.port_vectors.items():
+        p = np.array(vector) @ back
+        if np.allclose(p @ C, vector):
+            out[port] = (position @ p, speed @ p)
+    return out
+
+
+_DAMPING = "N m s/rad"
+
+
+def physical_ranges(m: Mechanism) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+    """Least and largest unconstrained value of each parameter.
+
+    They are the physical ranges that effects declare. A damping coefficient may fall below its own range as
+    far as others damp the same port: then it corrects them, as with a back-EMF constant that is trusted and
+    too large, and what stays is the damping of a machine. A start outside widens the range.
+
+    Args:
+        m: With the values at the start.
+    """
+    low, high = [], []
+    for effect in m.effects:
+        others = sum(_static_damping(e) for e in m.effects if e is not effect and e.at == effect.at)
+        for spec in specifications(effect).values():
+            corrects = isinstance(effect, Linear) and spec.unit == _DAMPING
+            low.append(spec.physical[0] - (max(others, 0.0) if corrects else 0.0))
+            high.append(spec.physical[1])
+    values, transform = m.values, Transform.of(m.parameter_specifications)
+    low, high = np.minimum(low, values), np.maximum(high, values)
+    # An end beyond a declared bound is never reached. A coordinate runs with its parameter but where that
+    # has only an upper bound, and no effect declares such a one.
+    ends = (low > transform.lower, low, -np.inf), (high < transform.upper, high, np.inf)
+    lowest, highest = (
+        np.where(inside, transform.unconstrain(np.where(inside, end, values)), none)
+        for inside, end, none in ends
+    )
+    return lowest, highest
+
+
+def _static_damping(effect: Effect) -> float:
+    """Damping of a linear effect at its port, a motor's through its current at constant speed too."""
+    if not isinstance(effect, Linear):
+        return 0.0
+    stamp = effect.stamp()
+    through = 0.0
+    if len(stamp.own):
+        own, torque = np.array(stamp.own, float), np.array(stamp.torque, float)
+        through = float(torque @ np.linalg.pinv(own) @ np.array(stamp.from_speed, float))
+    return float(stamp.damping) + through
+
+
+# Moves over each of these shares of the recording, of at most so many samples, are compared.
+MOVE_SHARES, MAX_SIGN_SAMPLES = (0.001, 0.003, 0.01, 0.03), 20_000
+# RecordingSamples of a block of the linear run.
+LINEAR_RUN_BLOCK = 64
+# A channel that moves against the model at all shares, correlated at least this much.
+OPPOSED_CORRELATION = -0.6
+
+
+def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
+    """Refuses recordings whose channels move against the model.
+
+    The linear part of the model, with the parameters that it has, runs under the recorded input. Rough
+    values will do, as only the direction of each move counts. A resonance that the model puts on the other
+    side of all excited frequencies reverses a channel as well: then a nearer start helps.
+
+    Args:
+        model: Before any fit.
+        recordings: To be fitted.
+
+    Raises:
+        InputError: Channels that move in the opposite direction.
+    """
+    against: set[str] = set()
+    worst = 0.0
+    for recording in recordings:
+        linear = linearise(model.at(recording).mechanism)
+        r = recording.slice(0, min(recording.N, MAX_SIGN_SAMPLES))
+        y, would = model.measured(r).astype(float), _response(linear.discretise(r.Ts), linear.C, r.u)
+        if not np.all(np.isfinite(would)):
+            continue
+        for channel, a, b in zip(model.mechanism.channels, y.T, would.T, strict=True):
+            found = [_correlation(a, b, max(round(share * r.N), 1)) for share in MOVE_SHARES]
+            if max(found) < OPPOSED_CORRELATION:
+                against.add(channel)
+                worst = min(worst, *found)
+    if not against:
+        return
+    every = against == set(model.mechanism.channels)
+    names = " and ".join(c for c in model.mechanism.channels if c in against)
+    what = "the input" if every else f"the column of {names}"
+    verb = "moves" if len(against) == 1 else "move"
+    raise InputError(
+        f"{names} {verb} against what the model would do under this input (correlation {worst:.2f}), as with "
+        f"a sign turned round; negate {what} if that is so, or give the model a start nearer to the machine."
+    )
+
+
+def _response(discrete: tuple[np.ndarray, np.ndarray], C: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Outputs (N, C) of a linear system from rest, a block of samples at a time."""
+    A, B = discrete
+    with np.errstate(all="ignore"):
+        powers = np.array([*itertools.accumulate([A] * LINEAR_RUN_BLOCK, np.matmul, initial=np.eye(len(A)))])
+        left, pushed = (
+            C @ powers[:-1],
+            powers[:-1] @ B,
+        )  # what a state and an input do later (L, C, n), (L, n)
+        lag = np.subtract.outer(np.arange(LINEAR_RUN_BLOCK), np.arange(LINEAR_RUN_BLOCK)) - 1
+        kernel = np.where(lag[..., None] >= 0, (pushed @ C.T)[lag], 0.0)  # (L, L, C)
+        blocks = np.pad(u, (0, -len(u) % LINEAR_RUN_BLOCK)).reshape(-1, LINEAR_RUN_BLOCK)
+        adds = blocks @ pushed[::-1]
+        states = np.array(
+            [*itertools.accumulate(adds[:-1], lambda x, new: powers[-1] @ x + new, initial=0 * B)]
+        )
+        y = np.tensordot(blocks, kernel, (1, 1)) + np.tensordot(states, left, (1, 2))
+    return y.reshape(-1, len(C))[: len(u)]
+
+
+def _correlation(a: np.ndarray, b: np.ndarray, step: int) -> float:
+    """Correlation of moves over a number of samples; zero where nothing moves."""
+    moves = [x[step:] - x[:-step] for x in (a, b)]
+    if min(np.ptp(m) for m in moves) == 0:
+        return 0.0
+    return float(np.corrcoef(moves[0], moves[1])[0, 1])
+
 
 # A size is beyond the recordings where they reach less than this share of it.
 BEYOND = 3.0

@@ -20,16 +20,15 @@ from jaxtyping import Float
 
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.fit.greybox import FitAttempt, FitPoint, FitStage, GreyBoxProblem, problem_of, report
 from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE
 from rotflex_jax.fit.problem import LikelihoodEquations
-from rotflex_jax.fit.profile_result import LEAST_LEVEL, Profile, Quantity
-from rotflex_jax.fit.result import Fit
-from rotflex_jax.fit.windows import Windows
+from rotflex_jax.fit.result import LEAST_LEVEL, Fit, Profile, Quantity
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.xla import double_precision, one_thread
 
 # Width of the row that holds the quantity, as a share of its standard deviation.

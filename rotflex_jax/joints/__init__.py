@@ -2,18 +2,20 @@
 
 from rotflex_jax.joints.flexible_link import flexible_link
 from rotflex_jax.joints.mjcf import load_mjcf
-from rotflex_jax.joints.public_machines import emps, rotary_arm, silverbox, two_dof_link
+from rotflex_jax.joints.public_machines import emps, rotary_arm, silverbox, single_inertia, two_dof_link
 from rotflex_jax.joints.rotary_flexible import (
+    SPRINGS,
+    SpringType,
     arm_inertia,
     flexible_joint,
     hub_inertia,
     paper,
     quanser_2002,
     quanser_2010,
+    spring_settings,
+    spring_stiffness,
 )
 from rotflex_jax.joints.servos import position_servo, xl330_pendulum
-from rotflex_jax.joints.single_inertia import single_inertia
-from rotflex_jax.joints.springs import SPRINGS, SpringType, spring_settings, spring_stiffness
 
 __all__ = [
     "paper",

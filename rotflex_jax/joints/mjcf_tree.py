@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.text.files import path_of
-from rotflex_jax.text.plain import one_line
+from rotflex_jax.text.numbers import one_line
 
 LARGEST_FILE = 10_000_000
 """Size of an MJCF file beyond which it is none [bytes]."""

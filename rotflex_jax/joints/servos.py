@@ -4,7 +4,7 @@ import dataclasses
 
 from rotflex_jax.effects import Gravity, Inertia, PositionServo
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.units import Units
+from rotflex_jax.mechanism.quantity import Units
 
 FREE_FALL = 9.80665
 """Acceleration of free fall [m/s^2]."""

@@ -6,10 +6,8 @@ under a Gaussian input, for any effect. `effect_kernels` are the contributions o
 `identified_kernels` the kernels of a fit.
 """
 
-from rotflex_jax.kernels.average import average_kernels
-from rotflex_jax.kernels.effects import EffectKernels, EffectShare, effect_kernels
-from rotflex_jax.kernels.identified import identified_kernels
-from rotflex_jax.kernels.local import local_kernels
+from rotflex_jax.kernels.average import EffectKernels, EffectShare, average_kernels, effect_kernels
+from rotflex_jax.kernels.local import identified_kernels, local_kernels
 from rotflex_jax.kernels.result import Agreement, Kernels
 from rotflex_jax.kernels.sensitivities import Modelled
 

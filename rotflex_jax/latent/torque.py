@@ -9,14 +9,21 @@ import numpy as np
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports, with_common_constants
-from rotflex_jax.latent.augmented_model import AugmentedStep, UnknownTorque, linearise_along, predicted_states
 from rotflex_jax.latent.result import LatentTorque, latent_torque_result
-from rotflex_jax.latent.smoother import InitialDistribution, IntensityEstimator, LinearTimeVaryingModel
+from rotflex_jax.latent.smoother import (
+    AugmentedStep,
+    InitialDistribution,
+    IntensityEstimator,
+    LinearTimeVaryingModel,
+    UnknownTorque,
+    linearise_along,
+    predicted_states,
+)
 from rotflex_jax.mechanism import Mechanism, kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import SHORTEST_TO_FIT, listed
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.xla import double_precision
 
 Progress = Callable[[str], None]

@@ -1,12 +1,122 @@
-"""What an output measures at its port: which time derivative of the position, in which unit.
+"""What an output measures at its port, and the units of machines that turn or do not turn.
+
+Effects speak of a turning port: angles in rad, torques in N m. A machine may say that its ports move
+otherwise, in metres under forces in newtons, or in volts under volts; then every unit follows by
+dimensions, and sentences speak of forces.
 
 A reading that is no linear combination of positions and speeds has a row of zeros here and its equation in
 `mechanism/simulate.py`. An acceleration is more: it depends on the torques, which no reading receives.
 """
 
 import enum
+import re
+from typing import NamedTuple
 
-from rotflex_jax.mechanism.units import Units
+_UNIT = re.compile(
+    r"kg m\^2|\(N m\)\^2|N m\b(?: s(?:\^\d)?(?![a-z]))?(?:/(?:rad|s|A|V)(?:\^\d)?)*|rad\b(?:/s(?:\^\d)?)?"
+)
+_VOLTS = re.compile(r"\b(m?)V\b")
+_ANGLE_TOO = re.compile(r" \([-+]?[\d.e+-]+ degrees\)")
+_WORDS = (("torque", "force"), ("turning", "moving"), ("turns", "moves"), ("turned", "moved"))
+
+
+class Units(NamedTuple):
+    """Units of the ports of a machine.
+
+    Attributes:
+        motion: Unit of a port's position.
+        effort: Unit of the force or torque.
+        motion_size: Typical size of its positions, relative to the radians of a small joint.
+        effort_size: The same for the force or torque, relative to newton metres.
+        input: Unit of the input that drives it, where that is no voltage: of a goal angle, of a current.
+    """
+
+    motion: str = "rad"
+    effort: str = "N m"
+    motion_size: float = 1.0
+    effort_size: float = 1.0
+    input: str = "V"
+
+    def unit(self, declared: str, of_input: bool = False) -> str:
+        """The unit of this machine for a unit that an effect declares.
+
+        Args:
+            declared: As the effect has it.
+            of_input: Whether its volts are the unit of the input, whatever that is.
+
+        >>> Units("m", "N").unit("N m s/rad"), Units("m", "N").unit("kg m^2")
+        ('N s/m', 'kg')
+        >>> Units(input="A").unit("N m/V", of_input=True), Units(input="rad").unit("V")
+        ('N m/A', 'V')
+        """
+        driven = of_input and self.input != "V"
+        if (self.motion, self.effort) == ("rad", "N m") and not driven:
+            return declared
+        powers = _powers(declared)
+        if driven and "V" in powers:
+            volts = powers.pop("V")
+            powers[self.input] = powers.get(self.input, 0) + volts
+        Q, E = powers.pop("rad", 0), powers.pop("N m", 0)
+        if (self.motion, self.effort, powers.get("s", 0), E, Q) == ("m", "N", 2, 1, -1):
+            powers, E, Q = {"kg": 1} | {k: v for k, v in powers.items() if k != "s"}, 0, 0
+        whole: dict[str, int] = {}
+        for name, power in ((self.effort, E), *powers.items(), (self.motion, Q)):
+            whole[name] = whole.get(name, 0) + power
+        return _written(whole)
+
+    def size(self, declared: str) -> float:
+        """Factor on a typical size that an effect declares, for this machine."""
+        powers = _powers(declared)
+        return self.effort_size ** powers.get("N m", 0) * self.motion_size ** powers.get("rad", 0)
+
+    def sentence(self, text: str, of_input: bool = False) -> str:
+        """What an effect says of itself, in the units and words of this machine.
+
+        Args:
+            text: As the effect says it.
+            of_input: Whether its volts are the unit of the input, whatever that is.
+
+        >>> Units("m", "N").sentence("the axis meets a torque of 20 N m whichever way it turns")
+        'the axis meets a force of 20 N whichever way it moves'
+        >>> Units(input="rad").sentence("voltages between -0.1 V and 0.2 V have no effect", of_input=True)
+        'inputs between -0.1 rad and 0.2 rad have no effect'
+        """
+        if of_input and self.input != "V":
+            text = _VOLTS.sub(lambda found: found.group(1) + self.input, text).replace("voltage", "input")
+        if self.motion == "rad":
+            return text
+        text = _ANGLE_TOO.sub("", text)
+        text = _UNIT.sub(lambda found: self.unit(found.group()), text)
+        for word, instead in _WORDS:
+            text = text.replace(word, instead)
+        return text
+
+
+TURNING = Units()
+
+
+def _powers(unit: str) -> dict[str, int]:
+    """Factors of a unit and their powers; an inertia as torque per angular acceleration.
+
+    >>> _powers("N m s^2/rad^2"), _powers("kg m^2")
+    ({'N m': 1, 's': 2, 'rad': -2}, {'N m': 1, 's': 2, 'rad': -1})
+    """
+    text = unit.replace("kg m^2", "N m s^2/rad").replace("(N m)^2", "Nm^2").replace("N m", "Nm")
+    powers: dict[str, int] = {}
+    for k, part in enumerate(text.split("/")):
+        for factor in part.split():
+            name, _, power = factor.strip("()").partition("^")
+            if name != "1":
+                name = "N m" if name == "Nm" else name
+                powers[name] = powers.get(name, 0) + (1 if k == 0 else -1) * int(power or 1)
+    return powers
+
+
+def _written(powers: dict[str, int]) -> str:
+    raised = lambda name, power: name if power == 1 else f"{name}^{power}"  # noqa: E731
+    above = " ".join(raised(n, p) for n, p in powers.items() if p > 0)
+    below = "".join("/" + raised(n, -p) for n, p in powers.items() if p < 0)
+    return (above or ("1" if below else "")) + below
 
 
 class Quantity(enum.Enum):

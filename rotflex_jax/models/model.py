@@ -17,13 +17,12 @@ from rotflex_jax.mechanism import Exponential, Mechanism, Solver, free_run, kalm
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, rest_state
 from rotflex_jax.mechanism.initial_state import initial_states
 from rotflex_jax.mechanism.linear import check_movable
-from rotflex_jax.mechanism.mechanism import check_mechanism
+from rotflex_jax.mechanism.mechanism import check_mechanism, process_noise_of
 from rotflex_jax.mechanism.simulate import first_state
-from rotflex_jax.mechanism.validation import process_noise_of
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import single
 from rotflex_jax.recording.quality import ACCEPTABLE
+from rotflex_jax.recording.recording import single
 from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 

@@ -17,7 +17,7 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
-from rotflex_jax.mechanism.units import Units
+from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, HeldConstant, specifications
 from rotflex_jax.text.files import path_of, write_file

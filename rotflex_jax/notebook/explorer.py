@@ -23,7 +23,7 @@ from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.listing import listed
+from rotflex_jax.recording.recording import listed
 from rotflex_jax.text.colours import BASELINE, FINAL, MEASURED, NO_DATA
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import plain_number, readable, unit_text

@@ -4,7 +4,7 @@ import sys
 import time
 from typing import Any
 
-from rotflex_jax.discover.milestone import Milestone, TimeLeft
+from rotflex_jax.discover.checkpoint import Milestone, TimeLeft
 from rotflex_jax.text.markup import card, paragraph, picture
 from rotflex_jax.text.svg import staircase
 

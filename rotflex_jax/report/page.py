@@ -7,9 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rotflex_jax.discover.assessment import FAR_FLOOR, NEAR_FLOOR, Grade, grade, percent
-from rotflex_jax.discover.explanation import Explanation
-from rotflex_jax.discover.latent_comparison import LatentTorqueComparison
+from rotflex_jax.discover.explanation import Explanation, LatentTorqueComparison
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.result import Ranked, SearchResult, Where
 from rotflex_jax.discover.tables import (
@@ -24,12 +22,14 @@ from rotflex_jax.discover.tables import (
     stage_labels,
     status_sentence,
 )
+from rotflex_jax.discover.verdict import FAR_FLOOR, NEAR_FLOOR, Grade, grade, percent
 from rotflex_jax.effects.labels import effect_label, effect_title, sentence
 from rotflex_jax.latent import LatentTorque
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.text.colours import stage_colours
+from rotflex_jax.text.markup import as_json, fill_template, write_files
 from rotflex_jax.text.numbers import (
     equation,
     multiple,
@@ -40,7 +40,6 @@ from rotflex_jax.text.numbers import (
     value_and_interval,
 )
 from rotflex_jax.text.plotting import by_section
-from rotflex_jax.text.templates import as_json, fill_template, write_files
 
 REPORTED_PACKAGES = ("rotflex_jax", "jax", "equinox", "optimistix", "numpy", "scipy", "matplotlib")
 

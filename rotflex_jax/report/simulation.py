@@ -9,15 +9,19 @@ from jaxtyping import Float
 
 from rotflex_jax import metrics
 from rotflex_jax.fit.result import Fit
-from rotflex_jax.models.frequency_response import FrequencyResponse, frequency_response
+from rotflex_jax.models.comparison import run_figure
 from rotflex_jax.models.model import Model
-from rotflex_jax.models.residual_tests import ResidualTests, residual_tests
-from rotflex_jax.models.run_figure import run_figure
+from rotflex_jax.models.residual_tests import (
+    FrequencyResponse,
+    ResidualTests,
+    frequency_response,
+    residual_tests,
+)
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.residuals import residual_figure, response_figure
+from rotflex_jax.text.markup import as_json, fill_template, write_files
 from rotflex_jax.text.numbers import plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.plotting import Picture, styled
-from rotflex_jax.text.templates import as_json, fill_template, write_files
 
 # The model's name in figures.
 NAME = "simulated"

@@ -15,11 +15,10 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.reproduce import models, records as sources
 from rotflex_jax.reproduce.adaptation import Adaptation, adapt
-from rotflex_jax.reproduce.machine import linear_joint, machine, machine_rows, symmetric_twin
 from rotflex_jax.reproduce.models import EvaluatedModel, KernelComparison, compare_kernels, grey_box, nmse
 from rotflex_jax.reproduce.plants import response
 from rotflex_jax.reproduce.records import Records
-from rotflex_jax.reproduce.settings import Settings
+from rotflex_jax.reproduce.settings import Settings, linear_joint, machine, machine_rows, symmetric_twin
 
 STEP_SIZES = {0: 1e-2, 1: 1e-2, 2: 2e-4}
 """By degree: about those of the experiment itself."""

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.basis import Delays, Orthonormal, Volterra
-from rotflex_jax.basis.pole_search import optimise_poles
-from rotflex_jax.basis.reach import ar1, minimum_nmse
+from rotflex_jax.basis.pole_search import ar1, minimum_nmse, optimise_poles
 from rotflex_jax.effects import Coulomb, DeadZone, VoltageOffset
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import fit, least_squares

@@ -23,7 +23,7 @@ from rotflex_jax.effects import (
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import SPRINGS, paper
-from rotflex_jax.joints.springs import ARM_ANCHORS, HUB_ANCHORS, SIDE, SpringType
+from rotflex_jax.joints.rotary_flexible import ARM_ANCHORS, HUB_ANCHORS, SIDE, SpringType
 from rotflex_jax.mechanism import Exponential, Mechanism, simulate
 
 LONGEST_SIMULATION_STEP = 2.5e-4

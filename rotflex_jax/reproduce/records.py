@@ -12,9 +12,8 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
-from rotflex_jax.reproduce.machine import linear_joint, machine, symmetric_twin
 from rotflex_jax.reproduce.plants import response
-from rotflex_jax.reproduce.settings import Settings
+from rotflex_jax.reproduce.settings import Settings, linear_joint, machine, symmetric_twin
 
 BUTTERWORTH_ORDER = 4
 """Order of the Butterworth filter."""

@@ -10,8 +10,13 @@ from rotflex_jax.report.figures.evidence import parameters, probabilities, ranki
 from rotflex_jax.report.figures.failure import profiles, residual_map
 from rotflex_jax.report.figures.registry import FIGURES
 from rotflex_jax.report.figures.residuals import residuals, responses
-from rotflex_jax.report.figures.runs import overlay, spectra
-from rotflex_jax.report.figures.torque import latent_over_motion, latent_over_time, learned_torque
+from rotflex_jax.report.figures.runs import (
+    latent_over_motion,
+    latent_over_time,
+    learned_torque,
+    overlay,
+    spectra,
+)
 from rotflex_jax.text.plotting import Picture
 
 __all__ = [

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.signal import savgol_filter
 
-from rotflex_jax.discover.conditions import half_width, missing_acceleration
+from rotflex_jax.discover.localise import half_width, missing_acceleration
 from rotflex_jax.discover.result import SearchResult, Where
 from rotflex_jax.discover.tables import channel_units
 from rotflex_jax.report.figures.registry import figure

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from rotflex_jax.discover.explanation import Explanation
 from rotflex_jax.discover.result import SearchResult
-from rotflex_jax.models.frequency_response import FrequencyResponse
-from rotflex_jax.models.residual_tests import ResidualTests
+from rotflex_jax.models.residual_tests import FrequencyResponse, ResidualTests
 from rotflex_jax.report.figures.registry import figure
 from rotflex_jax.text.colours import BASELINE, BASELINE_LINE, FAINT, FINAL, MEASURED, MUTED
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks

@@ -1,4 +1,4 @@
-"""Signs that an effect stands in for something that the catalogue lacks.
+"""What a search concludes: the verdict, effects that only stand in for another one, the next experiment.
 
 Where the final model leaves more than sensor noise, something else is wrong with it, and an effect may have
 been added because it imitates a part of that. Three signs, none of which the search decides by:
@@ -10,18 +10,134 @@ been added because it imitates a part of that. Three signs, none of which the se
 In a model that explains its recordings none of them says anything: what is left there is noise.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from rotflex_jax.discover.horizon import SearchHorizon
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.result import Round, SearchResult, Stage
+from rotflex_jax.discover.score_test import Score
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.discover.validation import SearchHorizon, ValidatedHypothesis
+from rotflex_jax.discover.verdict import Assessment, Verdict, assess, in_noise
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects.labels import effect_phrase
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.fit.coordinates import orthogonal_to
+from rotflex_jax.recording import Recording
+
+
+def assess_stages(
+    baseline: Stage, final: Stage, floor: dict[str, float], validation: Sequence[Recording]
+) -> Assessment:
+    """The final model by its errors on validation data; arguments as in `end_state`."""
+    errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
+    return assess(*errors, floor, final.process_noise_nats, sum(r.N for r in validation))
+
+
+def end_state(
+    baseline: Stage,
+    rounds: Sequence[Round],
+    final: Stage,
+    floor: dict[str, float],
+    ranking: Sequence[Score],
+    test: Sequence[Recording],
+) -> tuple[Verdict, str]:
+    """The verdict, and a sentence that gives its reason.
+
+    Args:
+        baseline: Stage before any was added.
+        rounds: What was added.
+        final: Stage after the last round.
+        floor: Standard deviation of the sensor noise per channel.
+        ranking: Scores of the baseline.
+        test: Held-out recordings.
+    """
+    end = assess_stages(baseline, final, floor, test)
+    seconds = final.window_seconds
+    reached = f"the held-out error over {seconds:g} s is {in_noise(end.remaining)} times the sensor noise"
+    names = " and ".join(effect_phrase(r.effect, r.port) for r in rounds)
+    share = f"; {end.explained_text}" if rounds and end.explained_text else ""
+    explain, others = "explain", "some of them from others (listed with each)"
+    if len(rounds) == 1:
+        explain, others = "explains", "this from others (listed with it)"
+    visible = [s for s in ranking if s.excited]
+    invisible = len(ranking) - len(visible)
+    if not end.is_explained:
+        found = f"{names} found, but something" if rounds else "Something"
+        why = "" if not end.at_noise else f"; {end.criterion}"
+        return Verdict.UNEXPLAINED, f"{found} remains that no candidate explains: {reached}{why}{share}."
+    if any(r.equivalent for r in rounds):
+        return Verdict.AMBIGUOUS, (
+            f"{names} {explain} the recording, but it cannot distinguish {others}: {reached}{share}."
+        )
+    if rounds:
+        return Verdict.FOUND, f"{names} {explain} the recording: {reached}{share}."
+    if ranking and invisible > len(ranking) / 2:
+        return Verdict.NOT_EXCITED, (
+            f"Nothing was found, but {invisible} of {len(ranking)} candidates could not have shown in this "
+            f"recording: move the machine more, over more speeds and voltages."
+        )
+    hidden = f"; {invisible} of {len(ranking)} candidates could not have shown" if invisible else ""
+    return Verdict.NOTHING_MISSING, f"Nothing is missing: {reached}{hidden}."
+
+
+Found = TypeVar("Found", bound=SearchResult)
+
+# Length of a proposal, and of the recording to which the rival is fitted [s]; a ranking needs no more.
+PROPOSAL_SECONDS = 10.0
+
+
+def with_proposal(found: Found) -> Found:
+    """The result with the standard input that best distinguishes the first two that look alike, if any."""
+    if found.verdict != Verdict.AMBIGUOUS:
+        return found
+    try:
+        return dataclasses.replace(found, proposal=proposed(found, seconds=PROPOSAL_SECONDS, improve=False))
+    except InputError as error:  # no reason to lose what was found
+        return dataclasses.replace(found, notes=(*found.notes, f"No next experiment is proposed: {error}"))
+
+
+def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
+    """The next experiment for the first effect of a result that has an equal.
+
+    Args:
+        found: What a search found.
+        changes: Arguments of `next_experiment` to use instead of those of the recordings.
+    """
+    pairs = [((r.effect, r.port), r.equivalent[0]) for r in found.rounds if r.equivalent]
+    if not pairs:
+        return None
+    recordings = (*found.train, *found.validation)
+    longest = max(recordings, key=lambda r: r.N)
+    first, second = pairs[0]
+    settings: dict[str, Any] = {
+        "limits": seen_limits(recordings),
+        "Ts": longest.Ts,
+        "noise": found.noise_floor,
+        "process_noise": found.final.process_noise,
+        "reference": longest.u[: round(PROPOSAL_SECONDS / longest.Ts)],
+    }
+    return next_experiment(found.model, first, second, **(settings | changes))
+
+
+def seen_limits(recordings: tuple[Recording, ...]) -> Limits:
+    """What the machine has borne already: largest voltage, slew and deflection of the recordings."""
+    r = max(recordings, key=lambda r: float(np.max(np.abs(r.u))))
+    slew = max(float(np.max(np.abs(np.diff(r.u)))) / r.Ts for r in recordings)
+    deflection = max(float(np.max(np.abs(r.y[:, -1]))) for r in recordings)
+    single = len(r.channels) < 2
+    return Limits(
+        voltage=float(np.max(np.abs(r.u))),
+        slew=slew,
+        deflection=np.inf if single else deflection,
+        margin=0.0,
+    )
+
 
 # Root mean square of the change of size between windows, over the size, that an effect of the machine stays
 # below, and least root mean square that it changes free runs by, over the error that is left.
