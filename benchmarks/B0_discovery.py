@@ -212,7 +212,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--wrong-worlds", type=int, default=0, metavar="COUNT", help="so many wrong worlds, instead"
     )
-    parser.add_argument("--oracles", action="store_true", help="of all known records anew, no search")
+    parser.add_argument("--oracles", action="store_true", help="of all known records once more, no search")
     parser.add_argument("--fresh", action="store_true", help="do not reuse records in the file")
     parser.add_argument("--out", type=Path, default=None, help="results file")
     return parser.parse_args()

@@ -1,4 +1,4 @@
-"""B14: the methods that come with the arena, each as a stranger's would be, on one small set of records.
+"""B14: the methods that come with the arena, each called like a user's method, on one small set of records.
 
     python benchmarks/B14_arena.py --seed 20261
     python benchmarks/B14_arena.py --entrants refit_bic --fresh
@@ -82,7 +82,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=SEED, help="what they are drawn from")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="length of a record [s]")
     parser.add_argument("--limit", type=float, default=LIMIT, help="most time for an answer [s]")
-    parser.add_argument("--fresh", action="store_true", help="also those that are in the file")
+    parser.add_argument("--fresh", action="store_true", help="the named ones again, if they are in the file")
     parser.add_argument("--out", type=Path, default=PATH, help="results file")
     a = parser.parse_args()
     settings = {"seed": a.seed, "records": a.records, "seconds": a.seconds, "limit": a.limit}
@@ -91,8 +91,11 @@ def main() -> int:
         results = json.loads(a.out.read_text())
         if results["settings"] != settings and not a.fresh:
             raise SystemExit(f"{a.out} has {results['settings']}, not {settings}; give --fresh or the same.")
+        # Answers to other records go with the settings; else only those of the named entrants do.
+        dropped = a.entrants.split(",") if results["settings"] == settings else list(results["methods"])
         if a.fresh:
-            results |= {"settings": settings, "methods": {}}
+            kept = {n: m for n, m in results["methods"].items() if n not in dropped}
+            results |= {"settings": settings, "methods": kept}
     results["runs"].append({**B0.provenance(), "arguments": sys.argv[1:]})
     say = lambda line: print(line, flush=True)  # noqa: E731
     problems = drawn(a.records, a.seed, a.seconds, say)

@@ -270,9 +270,10 @@ def summary(rows: list[dict]) -> str:
         decided = sum(r["verdict"] == "decided" for r in told)
         lines += [
             "",
-            f"{len(told)} cases of 40 wanted. The loop decided {decided}, {wrong} of them wrongly; of "
-            f"{played} standard inputs {wrong_standard} decided wrongly. Median of the ratios "
-            f"{np.median(ratios):.1f}; median seconds {np.median([r['seconds'] for r in told]):.1f} beside "
+            f"{len(told)} cases of 40 planned. The loop decided {decided}, {wrong} of them wrongly; of "
+            f"{played} standard inputs {wrong_standard} decided wrongly (undecided ones are among them). "
+            f"Median of the ratios {np.median(ratios):.1f}; median seconds "
+            f"{np.median([r['seconds'] for r in told]):.1f} beside "
             f"{np.median([fastest(r)['seconds'] for r in told]):.1f}.",
         ]
     if lost:

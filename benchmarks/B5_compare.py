@@ -2,7 +2,7 @@
 
     python benchmarks/B5_compare.py                            what is not done yet, of all data sets
     python benchmarks/B5_compare.py emps rotary_arm            of these
-    python benchmarks/B5_compare.py emps --methods sindy arx   these methods anew
+    python benchmarks/B5_compare.py emps --methods sindy arx   these methods again
     python benchmarks/B5_compare.py --draw                     tables and figures only, of what is done
 
 Needs the recordings of `rotflex data fetch`, or a folder named by `ROTFLEX_DATA`; what is missing is left
@@ -137,7 +137,7 @@ def summary() -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("sets", nargs="*", metavar="SET", help=f"{', '.join(SETS)}; all if none is named")
-    parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), help="Run these anew.")
+    parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), help="Run these again.")
     parser.add_argument("--draw", action="store_true", help="Learn nothing.")
     given = parser.parse_args()
     if unknown := set(given.sets) - set(SETS):

@@ -21,6 +21,7 @@ DATA = (
     "report/templates/simulation.html.j2",
     "compare/templates/comparison.html.j2",
     "batch/templates/summary.html.j2",
+    "arena/templates/arena.html.j2",
     "reproduce/templates/reproduce.html.j2",
     "export/templates/fmi3.c",
 )

@@ -2,9 +2,11 @@
 
 import json
 import math
+import os
 import pickle
 import sys
 import textwrap
+import time
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +73,13 @@ def test_silence_raises_no_alarm_and_names_nothing():
     assert (s.right, s.named, s.withheld, s.worlds) == ((2, 6), (0, 3), (0, 1), (0, 1))
     assert (s.alarms, s.wrong) == ((0, 2), 0)
     assert s.calibration is None and s.brier is None
+
+
+def test_probabilities_too_small_to_count_have_no_calibration():
+    s = scored([said(p={COULOMB: 0.001})] * 6)
+    assert s.calibration is None and s.brier is not None
+    json.dumps(s.summary(), allow_nan=False)
+    assert "nan" not in scoring.cells(s)
 
 
 def test_one_name_always_is_an_alarm_wherever_it_is_not_true():
@@ -280,6 +289,48 @@ def test_a_method_that_fails_is_scored_so_and_goes_on(stranger, three):
             with pytest.raises(ArenaFailure, match=phrase):
                 method.answer(three[0].given(), 3.0)
         assert method.answer(three[0].given(), 60.0).unexplained
+
+
+def test_a_method_that_does_not_start_again_fails_on_that_record_only(tmp_path, three):
+    file = tmp_path / "once.py"
+    text = "import os\n\ndef answer(train, validation):\n    os._exit(7)\n"
+    file.write_text(text)
+    with Apart(f"{file}:answer") as method:
+        with pytest.raises(ArenaFailure, match="status 7"):
+            method.answer(three[0].given(), 60.0)
+        file.write_text("number = 5\n")
+        with pytest.raises(ArenaFailure, match="does not start again"):
+            method.answer(three[0].given(), 60.0)
+        file.write_text(text.replace("os._exit(7)", "return 'unexplained'"))
+        assert method.answer(three[0].given(), 60.0).unexplained
+    file.write_text("number = 5\n")
+    with Apart(f"{file}:answer") as method, pytest.raises(InputError, match="no function"):
+        method.answer(three[0].given(), 60.0)
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="there are no process groups")
+def test_what_a_method_started_is_stopped_with_it(tmp_path, three):
+    file, alive = tmp_path / "parent.py", tmp_path / "alive"
+    file.write_text(
+        textwrap.dedent(f"""
+        import os, subprocess, sys, time
+
+        CHILD = "import time, pathlib\\nwhile True: pathlib.Path({str(alive)!r}).touch(); time.sleep(0.05)"
+
+        def answer(train, validation):
+            subprocess.Popen([sys.executable, "-c", CHILD])
+            while not os.path.exists({str(alive)!r}):
+                time.sleep(0.02)
+            os._exit(7)
+        """)
+    )
+    with Apart(f"{file}:answer") as method:
+        with pytest.raises(ArenaFailure, match="status 7"):
+            method.answer(three[0].given(), 60.0)
+        time.sleep(0.1)
+        alive.unlink()
+        time.sleep(0.5)
+        assert not alive.exists()
 
 
 def test_a_stranger_is_scored_by_one_command(stranger, tmp_path, monkeypatch, capsys, three):

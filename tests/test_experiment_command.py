@@ -51,6 +51,7 @@ def test_bad_input_is_one_sentence(run, changes, match, capsys):
         (["--continue", "none.json"], "no recording of its"),
         (["--continue", "none.json", "run.csv"], "cannot be read"),
         (["--continue", "none.json", "run.csv", "--voltage", "5"], "leave them out"),
+        (["--continue", "none.json", "run.csv", "--travel", "5"], "leave them out"),
         (["run.csv"], "belongs to --continue"),
         (["--between", "delay@input", "lag@input", "--voltage", "5"], "--fit is missing"),
         (["--fit", "run.csv", "--voltage", "5"], "--between is missing"),
@@ -75,6 +76,17 @@ def test_a_state_that_is_none_is_said_in_a_sentence(run, tmp_path, capsys):
         (tmp_path / "state.json").write_text(text)
         assert called("--continue", tmp_path / "state.json", run) == 2
         assert match in capsys.readouterr().err
+
+
+def test_no_state_and_no_recording_is_written_over(run, tmp_path, capsys):
+    command = ["--fit", run, "--between", "delay@input", "lag@input", "--voltage", 6, "--state"]
+    for state, kept in ((run, run), (tmp_path / "s.json", tmp_path / "s_001.csv")):
+        kept.touch()
+        before = kept.read_bytes()
+        assert called(*command, state) == 2
+        told = capsys.readouterr().err
+        assert "is there already" in told or "written over" in told
+        assert kept.read_bytes() == before
 
 
 @pytest.mark.slow

@@ -166,7 +166,8 @@ def test_workflows_keep_no_password_and_run_what_exists(name: str) -> None:
     assert all((ROOT / script).is_file() for script in scripts), scripts
     if name == "release":
         assert jobs["publish"]["permissions"] == {"id-token": "write"}
-        assert jobs["publish"]["needs"] == "build"
+        assert set(jobs["publish"]["needs"]) == {"build", "checks"}
+        assert "bash .ci/run" in [step.get("run") for step in jobs["checks"]["steps"]]
     else:
         chosen = jobs["slice"]["strategy"]["matrix"]["include"]
         assert {job["versions"] for job in chosen} == {"lowest", "newest"}

@@ -11,7 +11,7 @@ import rotflex_jax as rf
 from rotflex_jax.discover import search
 from rotflex_jax.discover.verdict import NEAR_FLOOR, Assessment, in_noise
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording.recording import shared_samples
+from rotflex_jax.recording.recording import check_apart, shared_samples
 
 NAN = float("nan")
 
@@ -39,6 +39,17 @@ def test_pieces_of_one_recording_are_told_by_their_samples() -> None:
     apart = [(whole, spun(seed=2)), whole.split(0.5), (piece(0, 900), piece(800, N)), (changed, whole)]
     for a, b in (*apart, (still.slice(0, 900), still.slice(50, 950))):
         assert shared_samples(a, b) == 0
+
+
+def test_parts_of_a_signal_that_repeats_itself_are_apart() -> None:
+    """Two seconds of motion over and over, without noise: the parts know which of them comes first."""
+    whole = spun()
+    n = whole.N // 2
+    again = dataclasses.replace(whole, u=np.tile(whole.u[:n], 2), y=np.tile(whole.y[:n], (2, 1)))
+    first, second = again.split(0.5)
+    check_apart([first], [second], "to fit and to validate", "they must differ")
+    with pytest.raises(InputError, match="repeats itself"):
+        check_apart([first], [again], "to fit and to validate", "they must differ")
 
 
 def test_a_recording_cut_by_a_sample_validates_and_tests_nothing() -> None:

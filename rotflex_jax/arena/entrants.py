@@ -1,4 +1,4 @@
-"""Methods that come with the arena: the search, regressions, refits, evolution, each as a stranger's."""
+"""Methods of the arena itself: the search, regressions, refits, evolution; called like a user's method."""
 
 import functools
 from collections.abc import Callable, Sequence

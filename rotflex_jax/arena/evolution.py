@@ -252,7 +252,7 @@ def evolved(train: Sequence[Recording], validation: Sequence[Recording], model: 
     """All effects at once in one model, its numbers by CMA-ES on short free runs; what is not needed leaves.
 
     Without each effect in turn the error on validation data says whether it is needed. Those that are not are
-    switched off and the evolution goes on with the others, twice.
+    switched off, three times; after the first two the evolution goes on with the others.
 
     Args:
         train: Recordings to fit.

@@ -184,7 +184,7 @@ MACHINES: dict[str, Machine] = {
     "flexible_arm": Machine("rotary_arm", "rotary_arm", lambda r: [halves(r[0])], {"flexible": True}),
     "two_dof_link_1": Machine("two_dof_link", "two_dof_link", _link(1), {"stage": 1}),
     "two_dof_link_2": Machine("two_dof_link", "two_dof_link", _link(2), {"stage": 2}),
-    # Position servos: no model of their firmware yet, see the head of this file.
+    # Position servos: no model of their firmware yet.
     "bam_xl330": Machine("bam_xl330", "bam_xl330", _by_gain),
     "so101": Machine("so101", "so101", _elbow),
 }

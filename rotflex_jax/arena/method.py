@@ -6,6 +6,7 @@ import math
 import os
 import pickle
 import queue
+import signal
 import struct
 import subprocess
 import sys
@@ -253,6 +254,7 @@ class Apart:
     def __init__(self, name: str) -> None:
         self.name = name
         self.process: subprocess.Popen[bytes] | None = None
+        self.started = False
         self.replies: queue.Queue[tuple[str, Any]] = queue.Queue()
 
     def __enter__(self) -> Self:
@@ -264,6 +266,10 @@ class Apart:
     def _stop(self) -> None:
         process, self.process = self.process, None
         if process is not None:
+            # With all that the method started itself; macOS refuses a group of which only the dead are left.
+            if hasattr(os, "killpg"):
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.killpg(process.pid, signal.SIGKILL)
             process.kill()
             process.wait()
             for pipe in (process.stdin, process.stdout):
@@ -285,6 +291,7 @@ class Apart:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": path},
+            start_new_session=True,  # a group of its own, to be stopped as a whole
         )
         self.replies = queue.Queue()
         assert self.process.stdout is not None
@@ -294,6 +301,7 @@ class Apart:
         if word != "ready":
             self._stop()
             raise InputError(sentence if word == "refused" else f"{self.name} cannot be used: {sentence}")
+        self.started = True
 
     def _reply(self, limit: float, what: str) -> tuple[str, Any]:
         try:
@@ -306,7 +314,13 @@ class Apart:
 
     def _ask(self, request: tuple[str, bytes], limit: float) -> Any:
         if self.process is None:
-            self._start()
+            try:
+                self._start()
+            except (InputError, OSError) as problem:
+                if not self.started:
+                    raise
+                # It could be imported once: what is wrong now is of this record, and others may go on.
+                raise ArenaFailure(f"The process of the method does not start again: {problem}") from problem
         process = self.process
         assert process is not None and process.stdin is not None
         try:

@@ -295,8 +295,9 @@ class MethodScore:
 
     @property
     def calibration(self) -> float | None:
-        """Expected calibration error of the probabilities; None where none was given."""
-        return calibration_error(self.events) if self.events else None
+        """Expected calibration error of the probabilities; None where none of `LEAST` or more was given."""
+        error = calibration_error(self.events)
+        return None if math.isnan(error) else error
 
     @property
     def brier(self) -> float | None:
@@ -407,7 +408,7 @@ def score(
     with_measured: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Scores:
-    """MethodScore methods that look for missing effects on records whose truth they cannot see.
+    """Score methods that look for missing effects on records whose truth they cannot see.
 
     A method is a function `method(train, validation, model)` of lists of recordings and the textbook model;
     it returns `"nothing missing"`, `"unexplained"`, a list of effects such as `["coulomb@hub"]`, or a mapping

@@ -87,7 +87,7 @@ def fleet(
     reading = {"outputs": {c: c for c in units}, "units": units, **reading}
     task = SearchTask(Path(), reading, split, _pickled(model, search), places, pages)
     common = storage.digest_of_search(model, search, split, reading, places)
-    batch = BatchProgress(sources, task, common, storage.created(folder), progress)
+    batch = BatchProgress(sources, task, common, storage.created(folder, pages), progress)
     try:
         with closing(_carried_out(batch.unfinished(), scheduler, workers)) as results:
             for number, found in results:

@@ -37,7 +37,7 @@ def digest_of_search(
         (__version__, physics, model.solver, model.gates, _named(search), share, sorted(reading.items()))
     )
     files = [Path(place).read_bytes() for place in places if place.endswith(".py")]
-    written = code_text(s for s in subjects(model, search) if of_main(s))
+    written = code_text((search, *(s for s in subjects(model, search) if of_main(s))))
     return digest_of(text.encode(), written.encode(), *files)
 
 
@@ -94,11 +94,11 @@ def write(folder: Path, record: Record) -> None:
     """Writes a result, and before it its model and its page; each completely or not at all."""
     record = {"schema": RESULT_SCHEMA, **record}
     model, page, name = record.pop("model"), record.pop("page", None), f"{record['name']}.json"
-    if model is not None:
-        write_file(folder / MODELS / name, model)
-    if page is not None:
-        (folder / PAGES).mkdir(exist_ok=True)
-        write_file(page_of(folder, record["name"]), page)
+    for path, text in ((folder / MODELS / name, model), (page_of(folder, record["name"]), page)):
+        if text is None:  # what an earlier search left is not of this one
+            path.unlink(missing_ok=True)
+        else:
+            write_file(path, text)
     write_file(folder / RESULTS / name, json.dumps(record, indent=1) + "\n")
 
 
@@ -133,8 +133,8 @@ def _is_whole(known: Record) -> bool:
     return right and row.verdict in verdicts
 
 
-def created(folder: str | os.PathLike[str]) -> Path:
-    """The folder of the results, created if needed.
+def created(folder: str | os.PathLike[str], pages: bool = False) -> Path:
+    """The folder of the results, created if needed, with a place for pages where there will be some.
 
     Raises:
         InputError: It cannot be.
@@ -144,7 +144,7 @@ def created(folder: str | os.PathLike[str]) -> Path:
             f"Argument `folder` must be a path, but is {shown(folder)}; give for instance 'fleet'."
         )
     try:
-        for part in (RESULTS, MODELS):
+        for part in (RESULTS, MODELS, *([PAGES] if pages else [])):
             (Path(folder) / part).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(

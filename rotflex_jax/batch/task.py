@@ -209,7 +209,10 @@ def _page(found: Any) -> str | None:
         return None
     from rotflex_jax.report.page import render  # matplotlib is loaded only where it draws
 
-    return render(found, Explanation(remaining=remaining_failures(found)))
+    try:
+        return render(found, Explanation(remaining=remaining_failures(found)))
+    except Exception:  # the result of the search is worth more than its page
+        return None
 
 
 def subjects(model: Model, search: Search) -> tuple[Any, ...]:

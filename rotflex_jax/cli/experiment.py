@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,16 @@ def experiment(
     again with --continue STATE.json RECORDING, until it says what is true or that nothing would tell.
     """
     if go_on is not None:
-        _continued(go_on, recording, columns, save, json_file, (fit, between, voltage, state))
+        first_command = (fit, between, voltage, state, add, plot, further)
+        numbers = (
+            (slew, math.inf),
+            (travel, math.inf),
+            (deflection, math.inf),
+            (error, 0.01),
+            (max_seconds, 60.0),
+        )
+        changed = [value for value, default in numbers if value != default]
+        _continued(go_on, recording, columns, save, json_file, (*first_command, *changed))
         return
     if recording is not None:
         raise InputError(
@@ -62,6 +72,16 @@ def experiment(
     given.check_distinct(fit, [])
     for file in (save, plot, json_file, state):
         given.check_writable(json_file=file)
+    if state is not None:
+        if plot is not None or seconds != 20.0:
+            raise InputError(
+                "--plot or --seconds was given, but with --state neither has a meaning; leave it out."
+            )
+        if state.exists():
+            raise InputError(
+                f"{state} is there already; go on with --continue {state}, or name another state."
+            )
+        _check_voltage_file(state, save, 1, fit)
     if plot is not None and plot.suffix not in FIGURE_ENDINGS:
         raise InputError(
             f"{plot} has the ending {plot.suffix or '(none)'}, but a figure is written as "
@@ -160,8 +180,8 @@ def _continued(
         )
     if any(value is not None for value in beside):
         raise InputError(
-            "--continue was given with --fit, --between, --voltage or --state, but the state has these; "
-            "leave them out."
+            "--continue was given with an option of the first command (as --fit, --between, --voltage or "
+            "--travel), but the state has these; leave them out."
         )
     for file in (save, json_file):
         given.check_writable(json_file=file)
@@ -170,6 +190,7 @@ def _continued(
     e = SequentialExperiment.load(state)
     if e.verdict:
         raise InputError(f"{state} has ended ({e.verdict}); begin another experiment with --state.")
+    _check_voltage_file(state, save, len(e.history) + 2, (recording,))
     _, columns = columns.of(e.rivals.models[0])
     from rotflex_jax.runtime.xla import enable_fast_start
 
@@ -184,7 +205,7 @@ def _report(e: Any, state: Path, save: Path | None, json_file: Path | None) -> N
     """Keep the state, write the next voltage, say how it stands."""
     result, voltage = e.result(), None
     if e.planned is not None:
-        voltage = save or state.with_name(f"{state.stem}_{len(e.history) + 1:03d}.csv")
+        voltage = save or _voltage_file(state, len(e.history) + 1)
         e.planned.save_csv(voltage)
     e.save(state)
     told = result.to_dict() | {
@@ -203,6 +224,18 @@ def _report(e: Any, state: Path, save: Path | None, json_file: Path | None) -> N
         )
     if json_file is not None:
         write_file(json_file, json.dumps(told, indent=2) + "\n")
+
+
+def _voltage_file(state: Path, count: int) -> Path:
+    """Where the voltage of a segment goes unless a file is named."""
+    return state.with_name(f"{state.stem}_{count:03d}.csv")
+
+
+def _check_voltage_file(state: Path, save: Path | None, count: int, read: Sequence[Path]) -> None:
+    """Refuse to write a voltage over the state, a recording that is read, or a file that nobody named."""
+    file = save or _voltage_file(state, count)
+    if file.resolve() in {path.resolve() for path in (state, *read)} or (save is None and file.exists()):
+        raise InputError(f"The next voltage would be written over {file}; name another file with --save.")
 
 
 def _write_files(found: Any, save: Path | None, plot: Path | None) -> None:

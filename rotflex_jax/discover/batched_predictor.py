@@ -153,6 +153,10 @@ class BatchedPredictor:
     data: StackedRecordings
     constants: Float[np.ndarray, "R B"] | None = None
     compiled: set[Any] = dataclasses.field(default_factory=set)
+    # Samples as programs take them, by the identity of the windows, which are kept with them.
+    _placed: dict[int, tuple[Any, ProgramSamples]] = dataclasses.field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def restrict(self, parameter_set: ParameterSet, model: ReducedModel) -> ParameterSet:
         """A parameter set with what the recordings know, without what a reduced model leaves out.
@@ -244,14 +248,10 @@ class BatchedPredictor:
         self.compiled.update(new)
         return [done[i] for i in range(len(jobs))]
 
-    @functools.cached_property
-    def _placed(self) -> dict[int, tuple[Int[np.ndarray, "R N"], ProgramSamples]]:
-        """Samples as programs take them, by the identity of the windows, which are kept with them."""
-        return {}
-
     def on_device(self, window: Int[np.ndarray, "R N"]) -> ProgramSamples:
         """The recordings as programs take them, arrays of JAX; to be called in double precision."""
-        if id(window) not in self._placed:
+        found = self._placed.get(id(window))
+        if found is None:
             N, seen = window.shape[1], self.data.seen > 0
             more = program_length(N) - N
             fill = lambda a: np.pad(a, ((0, 0), (0, more), (0, 0))[: a.ndim])  # noqa: E731
@@ -259,8 +259,8 @@ class BatchedPredictor:
             data = StackedRecordings(fill(u), fill(y), fill(counts), Ts)
             count = np.where(seen.any(axis=1), N - np.argmax(seen[:, ::-1], axis=1), 0)
             samples = ProgramSamples(data, np.pad(window, ((0, 0), (0, more)), "edge"), count)
-            self._placed[id(window)] = window, jax.tree.map(jnp.asarray, samples)
-        return self._placed[id(window)][1]
+            found = self._placed[id(window)] = window, jax.tree.map(jnp.asarray, samples)
+        return found[1]
 
 
 def _on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:

@@ -34,7 +34,7 @@ class Milestone(str):
         floor: Channel -> noise of the sensor [unit of the channel].
         units: Channel -> unit in which people read it.
         factors: Channel -> what its own unit is in that one.
-        kept: What a search needs to go on from this model, in plain JSON types; see `checkpoint`.
+        kept: What a search needs to go on from this model, in plain JSON types.
     """
 
     kept: dict[str, Any]
@@ -115,8 +115,8 @@ class TimeLeft:
     """How long a search goes on, from how long its own steps took; follows its lines of progress.
 
     Nothing is known of a step before one of its kind was measured: the first ones compile programs, and how
-    long that takes depends on the machine. How many rounds there will be nobody knows, so that the estimate
-    is for the case that the round at work is the last one.
+    long that takes depends on the machine. The number of rounds is not known beforehand, so the estimate is
+    for the case that this round is the last.
 
     Args:
         clock: Seconds, from any beginning.
@@ -140,8 +140,8 @@ class TimeLeft:
     def seconds(self) -> float | None:
         """Time left [s] if this round is the last; None where nothing measured tells it.
 
-        That is so where no step of a kind to come was measured yet, and where the one at work takes longer
-        than the last one of its kind.
+        That is so where a step still to come is of a kind that was not measured yet, and where the present
+        one takes longer than the last one of its kind.
         """
         if self._kind is None:
             return None

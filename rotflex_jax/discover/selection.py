@@ -169,7 +169,7 @@ def choose(
 ) -> tuple[ValidatedHypothesis | None, list[ValidatedHypothesis]]:
     """The best admissible candidate and those not distinguished from it; arguments as in `admissible`.
 
-    Of admissible ones that nothing distinguishes from the best, the one with the fewest parameters is chosen.
+    Of admissible ones that are like the best (`_alike`), the one with the fewest parameters is chosen.
     A rival need not pass every test that the winner passed: where the effect is small, which of the two
     passes is chance. It is enough that it gains something and that nothing distinguishes it from the winner.
     """
@@ -181,7 +181,7 @@ def choose(
     simpler = [t for t in able if _contained(t, winner) and not _clearly_better(winner, t, current)]
     if simpler:
         winner = max(simpler, key=lambda t: shares[t.location])
-    # Which of two that nothing distinguishes leads is chance; the one with fewer parameters goes first.
+    # Which of two that are alike leads is chance; the one with fewer parameters goes first.
     fewer = [t for t in able if t.parameter_count < winner.parameter_count and not _related(t, winner)]
     if alike := [t for t in fewer if _alike(winner, t, current, noise)]:
         winner = min(alike, key=lambda t: (t.parameter_count, -shares[t.location]))
@@ -266,7 +266,11 @@ def _alike(
     current: ValidatedHypothesis,
     noise: Float[np.ndarray, " C"],
 ) -> bool:
-    """Whether a rival does what the winner does, as far as a model that leaves so much can tell."""
+    """Whether a rival does what the winner does, as far as a model that leaves so much can tell.
+
+    Where errors are above twice the noise, one that gains nearly as much counts as alike even if the
+    likelihood distinguishes it.
+    """
     if not distinguished(winner, rival):
         return True
     if _free_runs_apart(winner, rival) or not np.any(best_window_rmse(winner) > 2 * noise):

@@ -195,7 +195,7 @@ class Segment:
         setting: Its parameters in words.
         nats: Entry (h, r): log-likelihood by which h is expected to win over r if h is true, after
             `repeats` of it and for the worst of a few draws of the parameters [nat].
-        expected_error: Bound of the probability of a wrong answer after them, at most 0.5.
+        expected_error: Bound of the probability of a wrong answer after them, at most that before them.
         probabilities: Of the models before it.
         repeats: How often it is repeated in these numbers.
         peaks: Channel -> largest predicted |output|.
@@ -265,7 +265,7 @@ class Segment:
             f"{len(self.u) * self.Ts:g} s\n"
             f"  after {self.repeats:g} of it a wrong answer has at most the probability "
             f"{self.expected_error:.2g}\n"
-            f"  voltage to {np.max(np.abs(self.u)):.3g} V, {peaks} predicted; best of {self.tried} inputs"
+            f"  voltage to {np.max(np.abs(self.u)):.3g} V, {peaks} rad predicted; best of {self.tried} inputs"
         )
 
 
@@ -345,9 +345,10 @@ class SequentialResult:
         """The verdict in a sentence."""
         if self.verdict == "decided":
             others = " or ".join(n for n in self.rivals if n != self.best)
+            percent = min(100 * self.probabilities[self.best], 99.99)
             return (
-                f"It is {self.best} rather than {others}: probability "
-                f"{100 * self.probabilities[self.best]:.4g} % after {self.seconds:g} s on the rig."
+                f"It is {self.best} rather than {others}: probability {percent:.4g} % "
+                f"after {self.seconds:g} s on the rig."
             )
         if self.verdict == "not distinguishable":
             return self.reason

@@ -140,6 +140,8 @@ class FileRig(Rig):
         self.folder, self.limits, self.continues = Path(folder), checked_limits(limits), bool(continues)
         if not self.folder.is_dir():
             raise InputError(f"{self.folder} is no folder; make it first, or name one that is there.")
+        if (old := next(iter(sorted(self.folder.glob("recording_*.csv"))), None)) is not None:
+            raise InputError(f"{old} is there already and would count as an answer; name an empty folder.")
         self.Ts = checks.positive(Ts, "Ts", "s", "0.002")
         self.patience, self.columns, self._count = checks.positive(patience, "patience"), columns, 0
 
@@ -149,7 +151,10 @@ class FileRig(Rig):
         answer = self.folder / f"recording_{self._count:03d}.csv"
         voltage_file(self.folder / f"voltage_{self._count:03d}.csv", u, self.Ts)
         ends = time.monotonic() + self.patience
-        while not answer.exists():
+        size = -1
+        # A file that still grows is being written.
+        while not answer.exists() or (now := answer.stat().st_size) == 0 or now != size:
+            size = answer.stat().st_size if answer.exists() else -1
             if time.monotonic() > ends:
                 raise InputError(
                     f"{answer} did not appear within {self.patience:g} s; play the voltage beside it and put "

@@ -324,7 +324,7 @@ class SegmentChoice:
             input=label(top)[0],
             setting=label(top)[1],
             nats=worst,
-            expected_error=float(min(0.5, math.exp(self.bound(worst)))),
+            expected_error=float(min(1.0 - e.probabilities.max(), math.exp(self.bound(worst)))),
             probabilities=tuple(e.probabilities.tolist()),
             repeats=repeats[0],
             peaks=dict(zip(self.r.structure.channels, peaks.tolist(), strict=True)),

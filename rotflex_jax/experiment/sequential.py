@@ -279,7 +279,10 @@ class SequentialExperiment:
         if self.planned is None:
             raise InputError("A recording was given, but no segment is planned; plan the next one first.")
         run = _checked(recording, self.planned, self.rivals)
-        r, runs = self.rivals, self.runs
+        r, runs, N = self.rivals, self.runs, len(run.u)
+        known = [old.y[a : a + N] for old in runs for a in range(0, len(old.u), N)]
+        if np.ptp(run.y, axis=0).any() and any(np.array_equal(run.y, y) for y in known):
+            raise InputError("This recording was given before; give one of the voltage that is planned now.")
         own = [r.first_unknowns(run)] if not runs or not self.settings.continues else []
         if own:
             runs = (*runs, run)

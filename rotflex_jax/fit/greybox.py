@@ -707,8 +707,8 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
     problem = _problem(fitted.model, recordings, asked.first, asked.max_steps, None, None, lambda _: None)
     if fitted.data and digest_of_recordings(recordings) != fitted.data:
         raise InputError(
-            "Recordings were given that the fit was not made from, but a profile fits the same data again "
-            "with one quantity held; give those that were fitted, in their order, or fit these first."
+            "Recordings, or settings of them such as n_init, differ from those of the fit, but a profile "
+            "fits the same data again with one quantity held; give those that were fitted, or fit these."
         )
     windows = problem.horizons(asked.window_seconds)[-1]
     point = problem.start([m.parameter_names.index(n) for n in asked.local], windows)

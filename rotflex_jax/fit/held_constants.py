@@ -11,7 +11,7 @@ from jaxtyping import Float
 from rotflex_jax.effects.base import Effect, Linear, Stamp
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.quantity import Units
-from rotflex_jax.parameters import Estimate, HeldConstant, Specification, specifications
+from rotflex_jax.parameters import HALF_WIDTH_95, Estimate, HeldConstant, Specification, specifications
 
 # Constants of a motor or a load are rarely known better than so: tolerances of data sheets are 5 to 12 %.
 TOLERANCE = 0.05
@@ -62,7 +62,7 @@ def with_held_constants(mechanism: Mechanism, estimates: Sequence[Estimate]) -> 
     moved = _moved(mechanism, free)
     found = []
     for e in estimates:
-        half = 1.96 * e.std
+        half = HALF_WIDTH_95 * e.std
         strong = [
             HeldConstant(c, now[c], by_name[c].unit, changes[e.name])
             for c, changes in moved.items()

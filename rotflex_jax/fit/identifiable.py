@@ -1,9 +1,9 @@
 """What a machine and a recording of it can know: structural and practical identifiability.
 
 Structural: which combinations of parameters no recording determines, whatever its length and noise. For a
-linear machine by exact arithmetic (`exact_sensitivities.py`), for any other by the rank of the sensitivities
-of free runs at random parameters and inputs. Practical: which combinations one recording determines badly, by
-the eigenvectors of its information about the logarithms of the parameters.
+linear machine by exact arithmetic (`structural_identifiability.py`), for any other by the rank of the
+sensitivities of free runs at random parameters and inputs. Practical: which combinations one recording
+determines badly, by the eigenvectors of its information about the logarithms of the parameters.
 
 All sensors that a machine might have are outputs of one compiled run, so that what another one would add is
 a matter of rows.

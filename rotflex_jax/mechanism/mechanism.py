@@ -363,7 +363,8 @@ class Mechanism:
             old = dict(zip(self.parameter_names, self.values, strict=True))
             for name in self.followers:
                 # Beside a value of what it follows it may stand as it was: the whole vector by name.
-                if self.followers[name] not in values and values.get(name, old[name]) != old[name]:
+                own = values.get(name, old[name])
+                if own != old[name] and own != values.get(self.followers[name]):
                     self._refuse_follower(name)
             values = list((old | dict(values)).values())
         if not hasattr(values, "__len__") or len(values) != len(self.parameter_names):
