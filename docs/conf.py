@@ -80,6 +80,7 @@ nitpick_ignore_regex = [
     # Small types of results, told where they are used.
     ("py:class", r"rotflex_jax\.discover\.\w+\.(Assessment|ConditionalInterval|HorizonGain)"),
     ("py:class", r"rotflex_jax\.discover\.\w+\.(ModelTests|RunErrors)"),
+    ("py:class", r"rotflex_jax\.(arena|experiment)\.\w+\.(Event|Share|SequentialStep)"),
     ("py:class", r"rotflex_jax\.latent\.\w+\.(Drift|PeriodicTorque)"),
     ("py:class", r"rotflex_jax\.(fit|mechanism|runtime)\.\w+\.(LoadRows|Performance|Remark)"),
 ]

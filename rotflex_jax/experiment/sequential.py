@@ -468,13 +468,12 @@ def experiment_until(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SequentialResult:
-    r"""Experiment until it is decided which of several models is true.
+    """Experiment until it is decided which of several models is true.
 
     A segment is chosen, played and recorded; each model is fitted to all that was recorded; and the
     probabilities follow from the averaged likelihoods,
 
-    .. math::
-        p_h \propto p_h^0 \int p(y \mid \vartheta, h)\, p(\vartheta \mid h)\, d\vartheta .
+        p_h ~ p_h0 * integral of p(y | parameters, h) p(parameters | h) over the parameters.
 
     It stops when one has at least the probability `1 - error`: if one of the models is true, a wrong one is
     then named with at most the probability `error`, averaged over the probabilities beforehand (Wald's test;
