@@ -19,7 +19,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit import least_squares
 from rotflex_jax.joints import paper
 from rotflex_jax.kernels import Kernels, average_kernels, effect_kernels, identified_kernels, local_kernels
-from rotflex_jax.kernels.result import kernel_figure
+from rotflex_jax.kernels.figure import kernel_figure
 from rotflex_jax.kernels.sensitivities import output_derivatives
 from rotflex_jax.mechanism import Exponential, Mechanism, free_run, simulate
 from rotflex_jax.mechanism.assembly import rest_state

@@ -17,7 +17,8 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.latent import latent_torque, smoother
-from rotflex_jax.latent.result import binned_mean, latent_maps, latent_time
+from rotflex_jax.latent.figure import latent_maps, latent_time
+from rotflex_jax.latent.result import binned_mean
 from rotflex_jax.latent.smoother import (
     AugmentedStep,
     InitialDistribution,

@@ -116,6 +116,6 @@ def test_a_shaken_arm_is_read_from_a_recording() -> None:
 
 
 def rf_time_axes(found: LatentTorque) -> list:
-    from rotflex_jax.latent.result import latent_time
+    from rotflex_jax.latent.figure import latent_time
 
     return latent_time(found).axes

@@ -1,16 +1,14 @@
-"""A controller in the loop with a model, whose every effect acts, or with a machine that is an object."""
+"""A controller in the loop: with a model, whose every effect acts, or with a machine that is an object."""
 
 import dataclasses
 import functools
-import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from rotflex_jax.checks import number, seed as checked_seed, shown
@@ -23,9 +21,10 @@ from rotflex_jax.mechanism.simulate import read_outputs
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
-from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, MEASURED, MUTED
-from rotflex_jax.text.numbers import readable, unit_text
-from rotflex_jax.text.plotting import blank, legend_above, styled, thinned
+from rotflex_jax.text.numbers import readable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COMMANDS_KEPT = 128
 """Commands before the present one that an amplifier may still be working on."""
@@ -183,6 +182,8 @@ class ClosedLoop:
 
     def plot(self, *others: "ClosedLoop") -> "Figure":
         """Position, error, voltage and observed load over time, beside other runs; a notebook shows it."""
+        from rotflex_jax.control.figure import loop_figure  # draws, and is loaded on request
+
         return loop_figure(self, *others)
 
 
@@ -386,37 +387,3 @@ def _result(
     E: np.ndarray,
 ) -> ClosedLoop:
     return ClosedLoop(controller, motion, Y, position, u, motion.states + E[:, :-1], E[:, -1])
-
-
-@styled
-def loop_figure(run: ClosedLoop, *others: ClosedLoop) -> Figure:
-    """Position, error, voltage and observed load of runs over time."""
-    figure = blank(10.0, 6.4)
-    axes = figure.subplots(4, 1, sharex=True)
-    controller = run.controller
-    per, unit = readable(1.0, run.unit)
-    t = run.t
-    axes[0].plot(*thinned(t, per * run.motion.reference), color=MEASURED, lw=2.2, label="reference")
-    colours = (FINAL, BASELINE, *FURTHER)
-    for k, each in enumerate((run, *others)):
-        style = {"color": colours[k % len(colours)], "lw": 1.0}
-        label = f"compensation: {each.controller.compensate}" if k < 2 else None
-        axes[0].plot(*thinned(each.t, per * each.position), label=label, **style)
-        axes[1].plot(*thinned(each.t, per * each.error), **style)
-        axes[2].plot(*thinned(each.t, each.voltage), **style)
-        axes[3].plot(*thinned(each.t, each.load), **style)
-    for way in (-1, 1):
-        if any(each.saturated for each in (run, *others)):
-            axes[2].axhline(way * controller.limit, color=MUTED, lw=0.7)
-    axes[0].set_ylabel(f"{controller.port} [{unit}]")
-    axes[1].set_ylabel(f"error [{unit}]")
-    axes[2].set_ylabel(f"{controller.input_name} [{controller.model.mechanism.units.input}]")
-    effort = unit_text(controller.model.mechanism.units.effort)
-    axes[3].set_ylabel(f"{controller.states[-1]} [{effort}]")
-    axes[3].set_xlabel("time [s]")
-    for ax in axes:
-        ax.margins(x=0)
-    if math.isfinite(run.rms):
-        axes[1].axhline(0.0, color=MUTED, lw=0.7, zorder=1)
-    legend_above(figure, axes)
-    return figure

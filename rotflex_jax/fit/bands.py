@@ -1,4 +1,4 @@
-"""Bands around a free run: where a measurement would lie, what widens them, and their figure.
+"""Bands around a free run: where a measurement would lie, and what widens them.
 
     y - y_hat ~ N(0, sum of parts),   part_p = S V S',  S = J_p + J_x dx0/dp
 
@@ -9,14 +9,13 @@ process torques, the sensor, and what the model lacks, as large as free runs ove
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
@@ -30,42 +29,11 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed, single
 from rotflex_jax.runtime.xla import double_precision
-from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, MEASURED, NOISE
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import plain_number, readable
-from rotflex_jax.text.plotting import blank, legend_above, styled, thinned
 
-
-@styled
-def bands_figure(bands: "Bands") -> Figure:
-    """Error of the free run inside its band on the left, standard deviations by each cause on the right."""
-    figure = blank(10.0, 2.4 * len(bands.channels) + 0.5)
-    grid = figure.subplots(len(bands.channels), 2, squeeze=False, sharex=True)
-    t = bands.recording.t
-    colours = (FINAL, BASELINE, *FURTHER, NOISE)
-    for c, (left, right) in enumerate(grid):
-        scale, unit = readable(1.0, bands.units[c])
-        middle = bands.middle[:, c]
-        low, high = bands.lower[:, c] - middle, bands.upper[:, c] - middle
-        e = bands.recording.channel(bands.channels[c]).astype(float) - middle
-        left.plot(*thinned(t, scale * e), color=MEASURED, lw=0.8, label="measured less free run")
-        for end, label in ((low, f"band of {100 * bands.level:g} %"), (high, None)):
-            left.plot(*thinned(t, scale * end), color=FINAL, lw=1.0, label=label)
-        most = 4 * scale * float(np.median(high - low))
-        left.set_ylim(*np.clip(left.get_ylim(), -most, most))
-        left.set_ylabel(f"{bands.channels[c]} [{unit}]")
-        for (name, part), colour in zip(bands.parts.items(), colours, strict=False):
-            right.semilogy(
-                *thinned(t, scale * np.maximum(part[:, c], 1e-12)), color=colour, lw=1.0, label=name
-            )
-        largest = scale * max(float(part[:, c].max()) for part in bands.parts.values())
-        right.set_ylim(1e-3 * largest, 2 * largest)
-        right.set_ylabel(f"standard deviation [{unit}]")
-    for ax in grid[-1]:
-        ax.set_xlabel("time [s]")
-    legend_above(figure, grid.ravel(), columns=4)
-    return figure
-
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PARTS = (
     "parameters",
@@ -153,6 +121,8 @@ class Bands:
 
     def plot(self) -> "Figure":
         """The band around the free run with what was measured, and its parts over time."""
+        from rotflex_jax.fit.bands_figure import bands_figure  # takes long to import
+
         return bands_figure(self)
 
     def _repr_html_(self) -> str:

@@ -24,7 +24,8 @@ from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.fit.greybox import FitAttempt, FitPoint, FitStage, GreyBoxProblem, problem_of, report
 from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE
 from rotflex_jax.fit.problem import LikelihoodEquations
-from rotflex_jax.fit.result import LEAST_LEVEL, Fit, Profile, Quantity
+from rotflex_jax.fit.profile_result import LEAST_LEVEL, Profile, Quantity
+from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording

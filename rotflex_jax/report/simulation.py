@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from rotflex_jax import metrics
 from rotflex_jax.fit.result import Fit
-from rotflex_jax.models.comparison import run_figure
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.residual_tests import (
     FrequencyResponse,
@@ -17,6 +16,7 @@ from rotflex_jax.models.residual_tests import (
     frequency_response,
     residual_tests,
 )
+from rotflex_jax.models.run_figure import run_figure
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.residuals import residual_figure, response_figure
 from rotflex_jax.text.markup import as_json, fill_template, write_files

@@ -8,7 +8,7 @@ from jaxtyping import Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rotflex_jax.kernels.result import kernel_figure
+from rotflex_jax.kernels.figure import kernel_figure
 from rotflex_jax.reproduce.experiment import Reproduction
 from rotflex_jax.reproduce.models import EvaluatedModel, least_nmse
 from rotflex_jax.reproduce.plants import SCENARIOS

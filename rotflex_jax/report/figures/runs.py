@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from rotflex_jax.discover.explanation import Explanation
-from rotflex_jax.discover.learned_torque import learned_figure
+from rotflex_jax.discover.learned_torque_figure import learned_figure
 from rotflex_jax.discover.result import SearchResult, Stage
 from rotflex_jax.discover.tables import channel_units
-from rotflex_jax.latent.result import latent_maps, latent_time
+from rotflex_jax.latent.figure import latent_maps, latent_time
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.registry import figure
