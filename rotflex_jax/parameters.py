@@ -135,7 +135,7 @@ def _bound_reached(value: float, std: float, spec: Specification) -> str:
 
 
 class HeldConstant(NamedTuple):
-    """A trusted constant on which an estimate hangs.
+    """A trusted constant on which an estimate depends.
 
     Attributes:
         name: Its full name.
@@ -177,12 +177,12 @@ class Estimate:
 
     @property
     def remark(self) -> str:
-        """Its note, and the trusted constants on which its interval hangs, in words."""
+        """Its note, and the trusted constants on which its interval depends, in words."""
         return "; ".join(filter(None, (self.note, self.given_words)))
 
     @property
     def given_words(self) -> str:
-        """The trusted constants on which its interval hangs, in words; empty where there are none."""
+        """The trusted constants on which its interval depends, in words; empty where there are none."""
         if not self.given:
             return ""
         named = [f"{c.name} {c.value:.4g} {c.unit}".rstrip() for c in self.given[:_NAMED_CONSTANTS]]
@@ -207,7 +207,7 @@ class Estimate:
         return cls(name, value, std, (value - half, value + half), spec.unit, note="; ".join(remarks))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types; `given` only where the interval hangs on trusted constants."""
+        """Plain JSON types; `given` only where the interval depends on trusted constants."""
         return {
             "value": self.value,
             "std": None if math.isnan(self.std) else self.std,

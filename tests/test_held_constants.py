@@ -1,4 +1,4 @@
-"""Intervals that hang on a trusted constant say so; constants of a motor that are one number may be tied."""
+"""Intervals that depend on a trusted constant say so; constants of a motor that are one may be tied."""
 
 import json
 
@@ -54,7 +54,7 @@ def test_a_damper_that_is_wrong_by_another_constant_says_on_which_it_hangs(untie
     words = f"given {EMF} 0.00767 V s/rad"
     assert words in str(untied) and words in untied._repr_html_() and words in found.remark
     assert json.loads(json.dumps(found.to_dict()))["given"][0]["name"] == EMF
-    # It hangs on the torque constant too, but that is free; a deflection's damper hangs on no motor.
+    # It depends on the torque constant too, but that is free; a deflection's damper depends on no motor.
     assert K_T not in {c.name for e in untied.parameters for c in e.given}
     assert EMF not in {c.name for c in untied["joint.viscous.coefficient"].given}
 

@@ -308,9 +308,8 @@ class Apart:
             return self.replies.get(timeout=limit)
         except queue.Empty:
             self._stop()
-            return "failed", _late(
-                limit
-            ) if what == "answer" else f"It took longer than {limit:g} s to {what}."
+            late = _late(limit) if what == "answer" else f"It took longer than {limit:g} s to {what}."
+            return "failed", late
 
     def _ask(self, request: tuple[str, bytes], limit: float) -> Any:
         if self.process is None:

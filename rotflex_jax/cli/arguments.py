@@ -484,6 +484,12 @@ def reads_files(command: Command) -> Command:
     return inside
 
 
+def was_given(context: typer.Context, name: str) -> bool:
+    """Whether an option was written on the command line, and not left at its default."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name != "DEFAULT"
+
+
 def _counts(texts: Sequence[str]) -> float | dict[str, float] | None:
     """`4096` is for all channels, `theta=4096` for one."""
     if not texts:

@@ -66,8 +66,7 @@ def check(
 
     With --joint also which parameters of that model the recording can determine.
     """
-    source = context.get_parameter_source("joint")
-    named = source is not None and source.name != "DEFAULT"
+    named = given.was_given(context, "joint")
     given.check_distinct(files, [])
     joint = given.joint_for(files, joint, columns)
     model = by_name.model(joint)

@@ -7,17 +7,34 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from rotflex_jax.cli import arguments as given, terminal
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import digits
 
+# Options that the first command of an experiment has, and its state from there on.
+FIRST_COMMAND = (
+    "fit",
+    "between",
+    "voltage",
+    "slew",
+    "travel",
+    "deflection",
+    "state",
+    "add",
+    "plot",
+    "further",
+)
+FIRST_COMMAND += ("error", "max_seconds")
 FIGURE_ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 
 
 @given.reads_files
 def experiment(
+    context: typer.Context,
     recording: given.Played = None,
     fit: given.AmbiguousFiles = None,
     between: given.Between = None,
@@ -46,16 +63,8 @@ def experiment(
     again with --continue STATE.json RECORDING, until it says what is true or that nothing would tell.
     """
     if go_on is not None:
-        first_command = (fit, between, voltage, state, add, plot, further)
-        numbers = (
-            (slew, math.inf),
-            (travel, math.inf),
-            (deflection, math.inf),
-            (error, 0.01),
-            (max_seconds, 60.0),
-        )
-        changed = [value for value, default in numbers if value != default]
-        _continued(go_on, recording, columns, save, json_file, (*first_command, *changed))
+        first = any(given.was_given(context, name) for name in FIRST_COMMAND)
+        _continued(go_on, recording, columns, save, json_file, first)
         return
     if recording is not None:
         raise InputError(
@@ -169,7 +178,7 @@ def experiment(
 
 
 def _continued(
-    state: Path, recording: Path | None, columns: Any, save: Path | None, json_file: Path | None, beside: Any
+    state: Path, recording: Path | None, columns: Any, save: Path | None, json_file: Path | None, first: bool
 ) -> None:
     """One step of an experiment that stops by itself: what was recorded in, the next voltage out."""
     from rotflex_jax.experiment.sequential import SequentialExperiment
@@ -178,7 +187,7 @@ def _continued(
         raise InputError(
             f"--continue was given {state}, but no recording of its last voltage; name that too."
         )
-    if any(value is not None for value in beside):
+    if first:
         raise InputError(
             "--continue was given with an option of the first command (as --fit, --between, --voltage or "
             "--travel), but the state has these; leave them out."

@@ -509,13 +509,12 @@ def _add_pair(state: SearchState) -> bool:
     if state.tests is None or not is_unexplained(state.horizons, state.current):
         return False
     state.say(beginning("pairs", "scoring pairs of candidates"))
-    pair, tried = find_pair(
-        state.horizons, state.current, state.tests, state.is_plausible, state.say, state.tried
-    )
+    tests = _score_tests(state, state.current)
+    pair, tried = find_pair(state.horizons, state.current, tests, state.is_plausible, state.say, state.tried)
     state.tried += tried
     if pair is None:
         return False
-    nats = {x.location: x.nats for x in state.tests[0].listed}
+    nats = {x.location: x.nats for x in tests[0].listed}
     _add(
         state,
         pair.found,

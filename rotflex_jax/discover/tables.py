@@ -47,7 +47,7 @@ class ErrorRow:
 class ParameterRow:
     """One parameter in all stages: (value, interval) each, None where the stage lacks it.
 
-    `given` are the trusted constants on which the interval of the last stage hangs, in words.
+    `given` are the trusted constants on which the interval of the last stage depends, in words.
     """
 
     name: str

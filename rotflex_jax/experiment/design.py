@@ -25,6 +25,7 @@ from rotflex_jax.experiment.rival_fit import (
     free_run_from_rest,
     rival_model,
 )
+from rotflex_jax.experiment.rival_set import noise_std
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import models_of, sequential_experiment
 from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs
@@ -166,7 +167,7 @@ def next_experiment(
     starts, looks = checks.whole(starts, "starts", 0), checks.whole(looks, "looks", 1)
     reference = None if reference is None else checks.signal(reference, "reference")
     N, P = sample_counts(seconds, Ts)
-    sd = _noise_std(fitted, model, noise)
+    sd = noise_std([model], noise, fitted.mechanism.channels)
     process_noise = process_noise_of(fitted.mechanism, process_noise)
     say("fitting each effect to the other")
     pair = _rival_pair(fitted, a, b, process_noise, sd, Ts, reference, limits)
@@ -308,21 +309,6 @@ def sample_counts(seconds: float, Ts: float) -> tuple[int, int]:
         )
     N = round(seconds / Ts)
     return N, min(N, round(DESIGN_PERIOD / Ts))
-
-
-def _noise_std(model: Model, given: Any, noise: Mapping[str, float] | None) -> np.ndarray:
-    """Standard deviation of the sensor noise per channel (C,)."""
-    channels = model.mechanism.channels
-    known = given.noise if noise is None and isinstance(given, Fit) else noise
-    given_all = isinstance(known, Mapping) and set(known) == set(channels)
-    values = [checks.real(known[c]) for c in channels] if isinstance(known, Mapping) and given_all else []
-    if not (values and all(0 < v < np.inf for v in values)):
-        raise InputError(
-            f"The sensor noise was given as {known if given_all else checks.shown(known)}, but every channel "
-            f"({', '.join(channels)}) needs a positive standard deviation; give "
-            "noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
-        )
-    return np.array(values)
 
 
 def _parameter_variations(model: Fit | Model | Mechanism, rival: RivalModel) -> list[np.ndarray]:

@@ -151,10 +151,10 @@ class FileRig(Rig):
         answer = self.folder / f"recording_{self._count:03d}.csv"
         voltage_file(self.folder / f"voltage_{self._count:03d}.csv", u, self.Ts)
         ends = time.monotonic() + self.patience
-        size = -1
+        size = 0
         # A file that still grows is being written.
-        while not answer.exists() or (now := answer.stat().st_size) == 0 or now != size:
-            size = answer.stat().st_size if answer.exists() else -1
+        while (now := answer.stat().st_size if answer.exists() else 0) == 0 or now != size:
+            size = now
             if time.monotonic() > ends:
                 raise InputError(
                     f"{answer} did not appear within {self.patience:g} s; play the voltage beside it and put "

@@ -340,7 +340,7 @@ class RivalSet:
         for k, run in enumerate(runs):
             pick = np.concatenate([machine, m + r * k + np.arange(r)])
             here = place if k == len(runs) - 1 else 0
-            w, J, state, slope = self._run(h, unknowns[pick], run, here, padded_length(len(run.u), first))
+            w, J, state, slope = self._run(h, unknowns[pick], run, here, filled_length(len(run.u), first))
             J = J.reshape(w.size, -1)
             information[np.ix_(pick, pick)] += J.T @ J
             gradient[pick] += J.T @ w.ravel()
@@ -461,10 +461,10 @@ class RivalSet:
         return self._each(_input_slopes, (*start, u, weight))
 
 
-def padded_length(N: int, first: int) -> int:
+def filled_length(N: int, first: int) -> int:
     """The length that a recording of N samples is filled up to.
 
-    >>> [padded_length(N, 500) for N in (500, 501, 2001)]
+    >>> [filled_length(N, 500) for N in (500, 501, 2001)]
     [500, 2000, 8000]
     """
     length = first
@@ -552,7 +552,7 @@ def rival_set(
         mean.append(transform.unconstrain(v)[pick])
         listed = [names[i] for i in pick]
         covariance.append(_known_covariance(source, listed, v[pick], specs, transform, pick, uncertainty))
-    sd = _noise([g for _, g in items], noise, first.channels)
+    sd = noise_std([g for _, g in items], noise, first.channels)
     return RivalSet(
         labels,
         tuple(reduced),
@@ -643,8 +643,14 @@ def _known_covariance(
     return out
 
 
-def _noise(given: list[Any], noise: Mapping[str, float] | None, channels: tuple[str, ...]) -> np.ndarray:
-    """Standard deviation of the sensor noise per channel: as given, or the least of the fits."""
+def noise_std(
+    given: Sequence[Any], noise: Mapping[str, float] | None, channels: tuple[str, ...]
+) -> Float[np.ndarray, " C"]:
+    """Standard deviation of the sensor noise per channel: as given, or the least of the fits.
+
+    Raises:
+        InputError: It is known of neither, or not of every channel.
+    """
     if noise is None:
         fits = [g for g in given if isinstance(g, Fit)]
         noise = {c: min(f.noise[c] for f in fits) for c in channels} if fits else None

@@ -1,4 +1,4 @@
-"""On which trusted constants the interval of an estimate hangs, from the equations of motion alone."""
+"""The trusted constants on which the interval of an estimate depends, from the equations of motion alone."""
 
 import dataclasses
 import math
@@ -30,7 +30,7 @@ class _Place(NamedTuple):
 
 
 def with_held_constants(mechanism: Mechanism, estimates: Sequence[Estimate]) -> tuple[Estimate, ...]:
-    """The same estimates, each with the trusted constants on which its interval hangs (`given`).
+    """The same estimates, each with the trusted constants on which its interval depends (`given`).
 
         G(p + dp, c + dc) = (1 + d dlambda) G(p, c)
 

@@ -145,7 +145,7 @@ def flexible_joint(
     The free torque constant stands for its product with the efficiency, which nobody knows well: a measured
     joint of the maker gives 0.0097 N m/A for 0.0077, and with a back-EMF constant that follows it a negative
     damping of the hub. So the two constants are tied only where the motor says so (`tied=True`); otherwise
-    the back-EMF constant is trusted, and an estimate of the hub's damping says how it hangs on that.
+    the back-EMF constant is trusted, and an estimate of the hub's damping says how it depends on that.
 
     Args:
         hub_inertia: With motor and gears, as the hub feels it [kg m^2].
