@@ -214,7 +214,7 @@ def test_what_makes_no_sense_is_refused():
     with pytest.raises(rf.InputError, match="for 2 recordings, but 1 were given"):
         rf.profile(local, recording(), CONSTANT)
     for other in (recording(2 * NOISE), [recording(), recording()], recording().slice(1, N)):
-        with pytest.raises(rf.InputError, match="the fit was not made from"):
+        with pytest.raises(rf.InputError, match="differ from those of the fit"):
             rf.profile(fitted(), other, CONSTANT)
 
 
