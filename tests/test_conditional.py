@@ -7,7 +7,7 @@ import pytest
 from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
-from rotflex_jax.discover import search
+from rotflex_jax.discover import summary
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.result import conditional_note, excluding
 from rotflex_jax.parameters import Estimate, Specification
@@ -46,7 +46,7 @@ def test_what_has_no_interval_excludes_nothing() -> None:
 
 
 def test_a_result_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = search.estimates
+    true = summary.estimates
 
     def shifted(problem: LikelihoodProblem, h: object) -> tuple[Estimate, ...]:
         """As if free runs had their own best inertia."""
@@ -58,7 +58,7 @@ def test_a_result_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = spun().split(0.7)
     plain = rf.discover(SPINDLE, *parts, candidates=PAIRS, rounds=0)
     assert plain.conditional == () and plain.to_dict()["conditional_intervals"] == []
-    monkeypatch.setattr(search, "estimates", shifted)
+    monkeypatch.setattr(summary, "estimates", shifted)
     found = rf.discover(SPINDLE, *parts, candidates=PAIRS, rounds=0)
     (entry,) = json.loads(json.dumps(found.to_dict()))["conditional_intervals"]
     assert entry["free_run"]["ci95"][0] > entry["prediction"]["ci95"][1]

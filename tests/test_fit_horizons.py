@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.discover.hypothesis import is_physical
-from rotflex_jax.discover.search import SearchState
+from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.fit import fit
 from rotflex_jax.fit.inference import RecordingSlopes, curvature, nats_that_count

@@ -8,7 +8,7 @@ import pytest
 from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
-from rotflex_jax.discover import search
+from rotflex_jax.discover import search_state
 from rotflex_jax.discover.verdict import NEAR_FLOOR, Assessment, in_noise
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import check_apart, shared_samples
@@ -101,7 +101,7 @@ def test_a_calibration_has_its_gain_at_either_horizon(monkeypatch: pytest.Monkey
     model = SPINDLE + rf.effects.Coulomb(at="shaft")
     found = {}
     for horizon in ("prediction", "free_run"):
-        monkeypatch.setattr(search, "runs_clearly_better", lambda *_, h=horizon: h == "free_run")
+        monkeypatch.setattr(search_state, "runs_clearly_better", lambda *_, h=horizon: h == "free_run")
         found[horizon] = rf.discover(model, *parts, candidates=PAIRS[1:], rounds=0)
         assert found[horizon].final.horizon == horizon
     gains = {}

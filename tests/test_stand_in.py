@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_problem import HUB, NOISE, problem, recordings, records, start, supermodel
 
-from rotflex_jax.discover import conclusion, search
+from rotflex_jax.discover import conclusion, summary
 from rotflex_jax.discover.conclusion import (
     LEAST_CHANGE,
     SCATTER,
@@ -149,6 +149,6 @@ def test_one_effect_in_the_place_of_several_has_the_signs_of_its_part(monkeypatc
         in_place_of={merged: HUB},
     )
     asked = {}
-    monkeypatch.setattr(search, "signs", lambda *a: asked.update(gains=a[2]) or {HUB: ("it is small",)})
-    assert search._stand_ins(state)[merged] == ("it is small",)
+    monkeypatch.setattr(summary, "signs", lambda *a: asked.update(gains=a[2]) or {HUB: ("it is small",)})
+    assert summary.stand_ins(state)[merged] == ("it is small",)
     assert asked["gains"][HUB] == 4.0

@@ -1,0 +1,209 @@
+"""What a search has found so far: the models after each round, at both horizons, and what led to them."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rotflex_jax.discover.checkpoint import (
+    AddedEffect,
+    KeptStage,
+    beginning,
+    kept,
+    milestone,
+    not_kept,
+    read_stages,
+    restored,
+)
+from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
+from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.result import HorizonGain
+from rotflex_jax.discover.score_test import Score, ScoreTest, score_test
+from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
+from rotflex_jax.discover.stepwise import fit_baseline
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.validation import (
+    Horizons,
+    SearchHorizon,
+    ValidatedHypothesis,
+    ValidationSet,
+    as_free_run,
+)
+from rotflex_jax.fit.plausibility import Reach, beyond_recordings
+from rotflex_jax.models.model import Model
+
+Progress = Callable[[str], None]
+
+
+@dataclasses.dataclass
+class SearchState:
+    """What a search has found so far.
+
+    Attributes:
+        model: The user's model.
+        horizons: The training and validation recordings as predictions and as free runs.
+        say: Called with lines of progress.
+        current: The best model so far, fitted at both horizons.
+        ranking: Scores of all candidates beside the baseline, of predictions and of free runs.
+        scores: Effects that were added, in order -> the penalised score that put them forward [nat].
+        rivals: Effects that were added -> those that were not distinguished from them.
+        passed: Baseline and the models after each round.
+        worth: What the last test of need gave each effect and calibration [nat].
+        order: Effects and calibrations of the machine, in order.
+        own: Calibrations that belong to the training recordings alone.
+        notes: Remarks for a reader.
+        gains: Effects that were added -> what they gained at both horizons.
+        final: The model that is reported, with the parameters of `reported`.
+        tried: Models fitted and validated at both horizons on the way.
+        alternatives: Models fitted and validated at the reported horizon beside the final one.
+        merged: The final model with one effect in the place of several, where it has one.
+        in_place_of: That effect -> the one of several whose place in the order it took.
+        machine: Calibrations that belong to the machine.
+        tests: Score tests of the model of `tested`, of predictions and of free runs.
+        tested: The model whose score tests were made last.
+        resumed: After how many rounds of a search that was stopped this one went on.
+        digest: Of all that the models depend on.
+    """
+
+    model: Model
+    horizons: Horizons
+    say: Progress
+    current: ValidatedHypothesis
+    digest: str = ""
+    resumed: int = 0
+    ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
+    scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
+    rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
+    passed: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
+    worth: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
+    order: list[EffectLocation] = dataclasses.field(default_factory=list)
+    own: list[EffectLocation] = dataclasses.field(default_factory=list)
+    notes: tuple[str, ...] = ()
+    gains: dict[EffectLocation, tuple[HorizonGain, HorizonGain | None]] = dataclasses.field(
+        default_factory=dict
+    )
+    final: Hypothesis | None = None
+    tried: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
+    alternatives: list[ValidatedHypothesis] = dataclasses.field(default_factory=list)
+    merged: ValidatedHypothesis | None = None
+    in_place_of: dict[EffectLocation, EffectLocation] = dataclasses.field(default_factory=dict)
+    machine: list[EffectLocation] = dataclasses.field(default_factory=list)
+    tests: tuple[ScoreTest, ScoreTest] | None = None
+    tested: Hypothesis | None = None
+
+    @functools.cached_property
+    def reach(self) -> Reach:
+        """How far the signals of the training recordings go."""
+        return Reach.of(self.model, self.problem.dataset.recordings)
+
+    def is_plausible(self, h: Hypothesis, location: EffectLocation) -> bool:
+        """Whether the parameters of an effect are physical, and of sizes that the recordings reach."""
+        s = self.problem.supermodel
+        if not is_physical(s, h, location):
+            return False
+        m = s.clean(h.mean_values(s), h.locations)
+        return not beyond_recordings(m, self.reach, [m.effect(*location)])
+
+    @property
+    def problem(self) -> LikelihoodProblem:
+        """The likelihood of predictions of the training recordings."""
+        return self.horizons.prediction.problem
+
+    @property
+    def validation(self) -> ValidationSet:
+        """Predictions of the validation recordings."""
+        return self.horizons.prediction.validation
+
+    @property
+    def noise_floor(self) -> dict[str, float]:
+        """Channel -> standard deviation of what the sensor adds by itself."""
+        return dict(zip(self.model.mechanism.channels, self.problem.noise.tolist(), strict=True))
+
+    @property
+    def reported(self) -> SearchHorizon:
+        """The horizon whose parameters a user gets: that of predictions, unless free runs are clearly better.
+
+        Where the model is complete both give the same within their scatter, and predictions have the narrower
+        intervals.
+        """
+        runs = self.current.free_run
+        if runs is None or not runs_clearly_better(runs.window_rmse, self.current.window_rmse):
+            return self.horizons.prediction
+        return self.horizons.free_run
+
+    def at(self, horizon: SearchHorizon, found: ValidatedHypothesis) -> ValidatedHypothesis:
+        """A validated structure with the parameters of one horizon."""
+        return found.free_run if horizon is self.horizons.free_run and found.free_run else found
+
+    def reached(self, label: str, added: Sequence[AddedEffect] = ()) -> None:
+        """Report the error of the current model, after effects were added."""
+        channels, recording = self.model.mechanism.channels, self.validation.problem.dataset.recordings[0]
+        units = {c: recording.units[recording.channels.index(c)] for c in channels}
+        line = milestone(label, channels, units, best_window_rmse(self.current), self.problem.noise)
+        if (runs := self.current.free_run) is not None:
+            stage = KeptStage(kept(self.current.hypothesis), kept(runs.hypothesis), tuple(added))
+            line.kept = stage.to_dict(self.digest)
+        self.say(line)
+
+    def score_tests(self, beside: ValidatedHypothesis) -> tuple[ScoreTest, ScoreTest]:
+        """Score tests of predictions and of free runs beside a model; those made last are kept."""
+        assert beside.free_run
+        if self.tests is None or self.tested is not beside.hypothesis:
+            self.tested = beside.hypothesis
+            self.tests = (
+                score_test(self.problem, beside.hypothesis),
+                score_test(self.horizons.free_run.problem, beside.free_run.hypothesis),
+            )
+        return self.tests
+
+    def rank(self) -> tuple[list[Score], list[Score]]:
+        """Scores of all candidates beside the current model, of predictions and of free runs."""
+        listed, runs = (test.listed for test in self.score_tests(self.current))
+        if not self.ranking:
+            by_runs = {x.location: x.nats for x in runs}
+            self.ranking = [(x, by_runs[x.location]) for x in listed]
+        return listed, runs
+
+    def add(self, found: ValidatedHypothesis, added: Sequence[AddedEffect]) -> None:
+        """One model more, with the effects that led to it."""
+        for effect in added:
+            self.scores[effect.location] = effect.score
+            self.rivals[effect.location] = list(effect.rivals)
+            self.gains[effect.location] = effect.gains
+        self.current = dataclasses.replace(found, location=None, parameter_count=0)
+        self.passed.append(self.current)
+        self.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
+
+
+def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -> SearchState:
+    """The user's model, fitted and validated."""
+    say(beginning("baseline", "fitting the model as it is"))
+    h = fit_baseline(horizons.prediction.problem)
+    problem = horizons.free_run.problem
+    current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
+    state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
+    state.reached("as it is")
+    return state
+
+
+def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:
+    """What a search that was stopped had found, validated again."""
+    stages = read_stages(path, digest)
+    say(f"going on after {len(stages) - 1} finished rounds")
+    # All of them before any is reported: what is reported is what a file of rounds so far keeps.
+    found: list[ValidatedHypothesis] = []
+    for stage in stages:
+        try:
+            h = restored(horizons.prediction.problem, stage.prediction)
+            runs = restored(horizons.free_run.problem, stage.free_run)
+        except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError):
+            raise not_kept(path) from None
+        found.append(horizons.validated(h, runs, found[-1] if found else None))
+    first, *later = found
+    state = SearchState(model, horizons, say, first, digest, len(later), passed=[first], tried=[first])
+    if later:
+        state.rank()
+    state.reached("as it is")
+    for reached, stage in zip(later, stages[1:], strict=True):
+        state.add(reached, stage.added)
+    return state

@@ -1,0 +1,271 @@
+"""What a search reports: nested models evaluated, what is left of the baseline localised, and the verdict."""
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+
+from rotflex_jax.discover.checkpoint import beginning
+from rotflex_jax.discover.conclusion import assess_stages, end_state, signs
+from rotflex_jax.discover.discovery import Discovery
+from rotflex_jax.discover.evaluation import (
+    Evaluation,
+    PairedEstimates,
+    difference_notes,
+    disagreement,
+    estimates,
+    evaluate,
+    own_estimates,
+    paired_estimates,
+    process_noise_gain,
+)
+from rotflex_jax.discover.hypothesis import Hypothesis, without
+from rotflex_jax.discover.likelihood import choose_process_noise, refit
+from rotflex_jax.discover.localise import locate
+from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
+from rotflex_jax.discover.result import (
+    ConditionalInterval,
+    Ranked,
+    Round,
+    Stage,
+    Where,
+    conditional_note,
+    excluding,
+)
+from rotflex_jax.discover.search_state import SearchState
+from rotflex_jax.discover.selection import helps
+from rotflex_jax.discover.stepwise import calibration_notes, nested_models
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.validation import ValidatedHypothesis, at_horizon, validate
+from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.fit.plausibility import Remark, at_bounds, beyond_recordings
+from rotflex_jax.recording import Recording
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluatedModels:
+    """The final model of a search and those that led to it, on validation and test data.
+
+    Attributes:
+        stages: Baseline and the models after each effect.
+        final: The last of them, at the horizon that is reported.
+        pairs: Its parameters fitted to training and to validation data.
+        remarks: On its parameters.
+        rounds: What was added, in order.
+        where: When the error of the baseline is large.
+        test: Recordings that had no say.
+    """
+
+    stages: tuple[Stage, ...]
+    final: ValidatedHypothesis
+    pairs: Sequence[PairedEstimates]
+    remarks: tuple[Remark, ...]
+    rounds: tuple[Round, ...]
+    where: tuple[Where, ...]
+    test: tuple[Recording, ...]
+
+
+def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedModels:
+    """Every nested model evaluated, and the error of the baseline localised."""
+    state.say(beginning("finish", "simulating the validation recordings"))
+    reported, model, order = state.reported, state.model, state.order
+    problem, validation, final = reported.problem, reported.validation, state.final
+    assert final
+    passed = [state.at(reported, v).hypothesis for v in state.passed]
+    models = nested_models(problem, final, order, state.own, passed)
+    near = state.at(reported, state.current)
+    validated = [validate(validation, h, near) for h in models]
+    stages = []
+    for k, v in enumerate(validated):
+        stage = evaluate(problem, validation, model.solver, v, order[:k])
+        stage = _with_process_noise(state, stage, v.hypothesis)
+        stages.append(evaluation.of_stage(stage, v, order[:k]))
+    train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
+    longest, channels = max((*train, *held_back), key=lambda r: r.N), model.mechanism.channels
+    seconds, noise = validation.window_seconds, problem.noise
+    residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
+    pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
+    m = stages[-1].model.mechanism
+    remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
+    explained = assess_stages(stages[0], stages[-1], state.noise_floor, held_back).is_explained
+    return EvaluatedModels(
+        stages=tuple(stages),
+        final=validated[-1],
+        pairs=pairs,
+        remarks=remarks,
+        rounds=_rounds(state, stages, pairs, remarks, {} if explained else stand_ins(state)),
+        where=locate(longest, residual, channels, noise, model.mechanism, window_seconds=seconds),
+        test=evaluation.recordings,
+    )
+
+
+def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> Discovery:
+    """The verdict, with all that was found.
+
+    Args:
+        state: What was found.
+        evaluated: The models of it.
+        started: When the search began, by `time.perf_counter` [s].
+    """
+    baseline, final = evaluated.stages[0], evaluated.stages[-1]
+    supermodel, remarks = state.problem.supermodel, evaluated.remarks
+    held_back = state.validation.problem.dataset.recordings
+    conditional = _conditional(state)
+    scores = [s for s, _ in state.ranking]
+    verdict, sentence = end_state(baseline, evaluated.rounds, final, state.noise_floor, scores, held_back)
+    return Discovery(
+        verdict=verdict,
+        sentence=sentence,
+        train=state.problem.dataset.recordings,
+        validation=held_back,
+        test=evaluated.test,
+        baseline=baseline,
+        rounds=evaluated.rounds,
+        ranking=tuple(
+            Ranked(*s.location, s.nats, s.excited, s.orthogonal_fraction, s.detection_limit, runs)
+            for s, runs in state.ranking
+        ),
+        where=evaluated.where,
+        noise_floor=state.noise_floor,
+        elapsed_s=time.perf_counter() - started,
+        notes=(
+            *_resumed(state.resumed),
+            *conditional_note(conditional),
+            *calibration_notes(supermodel, evaluated.final, state.own),
+            *difference_notes(supermodel, evaluated.pairs),
+            *state.notes,
+            *(f"{remark.sentence}." for remark in remarks),
+        ),
+        remarks=remarks,
+        probabilities=_probabilities(state, verdict is not Verdict.UNEXPLAINED),
+        conditional=conditional,
+    )
+
+
+def _probabilities(state: SearchState, is_explained: bool) -> Probabilities:
+    """Probabilities of the sets that were fitted, the one that is reported first."""
+    reported, horizons = state.reported, state.horizons
+    sets = fitted_sets(horizons, state.tried, state.alternatives, reported, state.machine)
+    if state.merged:
+        sets = fitted_sets(horizons, (), [state.merged], reported, ()) + sets
+    return probabilities(sets, is_explained=is_explained)
+
+
+def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
+    """Parameters of the machine on which predictions and free runs of the final structure do not agree."""
+    horizons, s = state.horizons, state.problem.supermodel
+    if (runs := state.current.free_run) is None:
+        return ()
+    own = {s.mechanism.parameter_names[i] for i in state.current.hypothesis.local}
+    each = (
+        [e for e in estimates(at.problem, found.hypothesis) if e.name not in own]
+        for at, found in ((horizons.prediction, state.current), (horizons.free_run, runs))
+    )
+    return excluding(*each)
+
+
+def _resumed(count: int) -> tuple[str, ...]:
+    """That a search went on from what another one had found, in a sentence."""
+    if not count:
+        return ()
+    found = "one round" if count == 1 else f"{count} rounds"
+    return (
+        f"The search went on after {found} of one that was stopped; the time, and the sets of effects that "
+        "have a probability, are those of the rest.",
+    )
+
+
+def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stage:
+    """A stage with the process noise that predictions with its parameters ask for."""
+    problem = state.problem
+    if stage.horizon == "prediction":
+        return stage
+    h = at_horizon(problem, h, state.current.hypothesis.process_noise)
+    h = choose_process_noise(problem, h, wide=True)
+    gain = process_noise_gain(problem, h)
+    return dataclasses.replace(stage, process_noise=h.process_noise, process_noise_nats=gain)
+
+
+def _rounds(
+    state: SearchState,
+    stages: Sequence[Stage],
+    pairs: Sequence[PairedEstimates],
+    remarks: Sequence[Remark],
+    stands_in: Mapping[EffectLocation, tuple[str, ...]],
+) -> tuple[Round, ...]:
+    """What was added, in order, each effect with the stage that it led to.
+
+    Args:
+        state: What was found.
+        stages: Models, each with one effect more.
+        pairs: The last one fitted to different recordings.
+        remarks: On parameters of the last one.
+        stands_in: Signs that effects of an unexplained model stand in for something else.
+    """
+    mechanism = stages[-1].model.mechanism
+    return tuple(
+        Round(
+            effect=location.effect,
+            port=location.port,
+            equivalent=tuple(state.rivals.get(location, [])),
+            parameters=own_estimates(stage, location),
+            stage=stage,
+            score=state.scores.get(location, state.worth.get(location, 0.0)),
+            held_out_gain_nats=_gain_of_predictions(state, location, stage, before),
+            sentence=mechanism.sentence(mechanism.effect(*location)),
+            equation=mechanism.effect(*location).equation,
+            doubts=(
+                *_doubts(state, location, pairs),
+                *_beyond(remarks, location),
+                *stands_in.get(location, ()),
+            ),
+            prediction=state.gains.get(location, (None, None))[0],
+            free_run=state.gains.get(location, (None, None))[1],
+        )
+        for location, before, stage in zip(state.order, stages, stages[1:], strict=False)
+    )
+
+
+def stand_ins(state: SearchState) -> dict[EffectLocation, tuple[str, ...]]:
+    """Signs that effects stand in for something else, of the final model at both horizons."""
+    gains = {p: at.gain + at.training_gain for p, (at, _) in state.gains.items()}
+    found = signs((state.horizons.prediction, state.horizons.free_run), state.current, gains)
+    # One effect in the place of several has the signs of the one whose place in the order it took.
+    return found | {new: found[old] for new, old in state.in_place_of.items() if old in found}
+
+
+def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: Stage, before: Stage) -> float:
+    """Log-likelihood of predictions that an effect gains on validation data [nat]; NaN if unknown."""
+    if stage.horizon == "prediction":
+        return stage.log_likelihood - before.log_likelihood
+    if location in state.gains:
+        return state.gains[location][0].gain
+    current, s = state.current, state.problem.supermodel
+    if location not in current.hypothesis.locations:
+        return float("nan")
+    # A calibration of a model whose parameters are those of free runs.
+    less = refit(state.problem, [without(s, current.hypothesis, location)], alternations=1)[0]
+    return current.log_likelihood - validate(state.validation, less, current).log_likelihood
+
+
+def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
+    """Which numbers of an effect the recordings do not speak for."""
+    head = f"{location.port}.{location.effect}."
+    return tuple(
+        r.sentence for r in remarks if r.kind == "beyond the recordings" and r.parameter.startswith(head)
+    )
+
+
+def _doubts(
+    state: SearchState, location: EffectLocation, pairs: Sequence[PairedEstimates]
+) -> tuple[str, ...]:
+    """Why an effect that is distinguished from others may still stand in for something else, in words."""
+    if location not in state.gains:  # a calibration, which has shown by other means that the machine has it
+        return ()
+    reasons = []
+    prediction, runs = state.gains[location]
+    if not helps(prediction):
+        reasons.append("predictions on validation data are no better with it")
+    if runs is not None and not helps(runs):
+        reasons.append("free runs over validation data are no better with it")
+    differs = disagreement(pairs, location)
+    return (*reasons, differs) if differs else tuple(reasons)
