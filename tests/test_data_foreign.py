@@ -9,7 +9,7 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.cli.app import main
 from rotflex_jax.data.datasets import DATASETS, fetch
-from rotflex_jax.data.files import is_foreign
+from rotflex_jax.data.foreign import is_foreign
 from rotflex_jax.data.registry import BY_HAND
 from rotflex_jax.errors import InputError
 

@@ -12,7 +12,7 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment import rival_set as rivals_module
+from rotflex_jax.experiment import rival_set
 from rotflex_jax.experiment.rival_set import CALIBRATION_SPREAD, STATE_SPREAD
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import SequentialExperiment, sequential_experiment
@@ -219,15 +219,15 @@ def test_going_on_from_a_file_is_the_same_as_not_having_stopped(tmp_path):
 
 
 def test_other_parameters_compile_nothing(pair):
-    before = [len(p) for p in (rivals_module._run_with_slopes, rivals_module._outputs)]
+    before = [len(p) for p in (rival_set._run_with_slopes, rival_set._outputs)]
     settings = {"noise": NOISE, "segment_seconds": 0.4, "improve": False}
     e = sequential_experiment([known(0.03) + fx.Coulomb(at="hub"), known(0.03)], LIMITS, TS, **settings)
     e = e.with_next_segment()
     e = e.with_recording(np.zeros((40, 1)) + 1e-3).with_next_segment()
-    first = [len(p) for p in (rivals_module._run_with_slopes, rivals_module._outputs)]
+    first = [len(p) for p in (rival_set._run_with_slopes, rival_set._outputs)]
     e = sequential_experiment([known(0.02) + fx.Coulomb(at="hub"), known(0.02)], LIMITS, TS, **settings)
     e.with_next_segment().with_recording(np.zeros((40, 1))).with_next_segment()
-    assert [len(p) for p in (rivals_module._run_with_slopes, rivals_module._outputs)] == first
+    assert [len(p) for p in (rival_set._run_with_slopes, rival_set._outputs)] == first
     assert first != before
 
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import rotflex_jax as rf
 from rotflex_jax import effects as fx
 from rotflex_jax.cli.app import main
-from rotflex_jax.cli.arguments import Columns
+from rotflex_jax.cli.recordings import Columns
 from rotflex_jax.discover.batched_predictor import ParameterSet
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import build, scales

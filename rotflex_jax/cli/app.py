@@ -19,6 +19,7 @@ from rotflex_jax.cli.batch import check_each, search_each
 from rotflex_jax.cli.data import check, data_app
 from rotflex_jax.cli.experiment import experiment
 from rotflex_jax.cli.models import export, simulate
+from rotflex_jax.cli.recordings import Columns, joint_for, reads_files
 from rotflex_jax.cli.reproduce import reproduce
 from rotflex_jax.cli.stopping import STOPPED, RoundsSoFar
 from rotflex_jax.errors import InputError
@@ -90,7 +91,7 @@ def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.Jso
     _discover(by_name.joint("paper"), [train], [test], report, json_file)
 
 
-@given.reads_files
+@reads_files
 def discover(
     files: given.Files,
     joint: given.JointName = "paper",
@@ -106,7 +107,7 @@ def discover(
     scheduler: given.Scheduler = None,
     workers: given.Workers = None,
     *,
-    columns: given.Columns,
+    columns: Columns,
 ) -> None:
     """Find the effects that the model lacks, with evidence on data the fit never saw.
 
@@ -118,7 +119,7 @@ def discover(
     given.check_distinct(files, [*(held_out or []), *(test or [])])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
-    model, columns = columns.of(by_name.model(given.joint_for(files, joint, columns)))
+    model, columns = columns.of(by_name.model(joint_for(files, joint, columns)))
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers, calibrate)
         return
@@ -130,7 +131,7 @@ def discover(
     _discover(model, train, validation, report, json_file, save_model, test=no_say, **options)
 
 
-@given.reads_files
+@reads_files
 def compare(
     files: given.Files,
     methods: given.Methods = None,
@@ -141,7 +142,7 @@ def compare(
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,
     *,
-    columns: given.Columns,
+    columns: Columns,
 ) -> None:
     """Compare methods on the same data by their free runs over held-out data."""
     share = given.check_split(split, held_out or [])
@@ -151,7 +152,7 @@ def compare(
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."
         )
-    model, columns = columns.of(by_name.model(given.joint_for(files, joint, columns)))
+    model, columns = columns.of(by_name.model(joint_for(files, joint, columns)))
     names = methods if methods is None else methods.split(",")
     from rotflex_jax.compare import QUICK
     from rotflex_jax.compare.method import selected_methods

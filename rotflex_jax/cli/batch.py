@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.cli.recordings import Columns, as_options
 from rotflex_jax.errors import InputError
 from rotflex_jax.text.files import write_file
 
@@ -33,7 +34,7 @@ def check_each(each: bool, only: Mapping[str, Any], never: Mapping[str, Any]) ->
 def search_each(
     model: Any,
     files: Sequence[Path],
-    columns: given.Columns,
+    columns: Columns,
     share: float,
     folder: Path | None,
     json_file: Path | None,
@@ -62,20 +63,20 @@ def search_each(
             workers=workers,
             split=share,
             pages=True,
-            progress=lambda line: step(given.as_options(line)),
+            progress=lambda line: step(as_options(line)),
             **options,
             **columns.reading(),
         )
     if len(result.failed) == len(files):
         raise InputError(
             f"No search of {len(files)} gave an answer; the first, {result.rows[0].name}: "
-            f"{given.as_options(result.rows[0].reason)}"
+            f"{as_options(result.rows[0].reason)}"
         )
     text = json.dumps(result.to_dict(), indent=2)
     if json_file == given.STDOUT:
         print(text)
     else:
-        terminal.print_fleet(result, given.as_options)
+        terminal.print_fleet(result, as_options)
         if json_file is not None:
             write_file(json_file, text + "\n")
     terminal.message(f"Summary: {result.page}", error=json_file == given.STDOUT)

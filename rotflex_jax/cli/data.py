@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.cli.recordings import Columns, joint_for, reads_files
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 
@@ -54,13 +55,13 @@ def data_fetch(
             terminal.message(str(path))
 
 
-@given.reads_files
+@reads_files
 def check(
     context: typer.Context,
     files: given.Files,
     joint: given.JointName = "paper",
     *,
-    columns: given.Columns,
+    columns: Columns,
 ) -> None:
     """Say what is in a recording and what is wrong with it; takes seconds.
 
@@ -68,7 +69,7 @@ def check(
     """
     named = given.was_given(context, "joint")
     given.check_distinct(files, [])
-    joint = given.joint_for(files, joint, columns)
+    joint = joint_for(files, joint, columns)
     model = by_name.model(joint)
     model, columns = columns.of(model)
     from rotflex_jax.fit.plausibility import check_signs

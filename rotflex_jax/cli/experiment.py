@@ -10,6 +10,7 @@ from typing import Any
 import typer
 
 from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.cli.recordings import Columns, reads_files
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
@@ -32,7 +33,7 @@ FIRST_COMMAND += ("error", "max_seconds")
 FIGURE_ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 
 
-@given.reads_files
+@reads_files
 def experiment(
     context: typer.Context,
     recording: given.Played = None,
@@ -55,7 +56,7 @@ def experiment(
     error: given.ErrorProbability = 0.01,
     max_seconds: given.MostSeconds = 60.0,
     *,
-    columns: given.Columns,
+    columns: Columns,
 ) -> None:
     """Design the input that distinguishes two effects which a recording cannot.
 

@@ -4,12 +4,13 @@ import json
 from pathlib import Path
 
 from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.cli.recordings import Columns, reads_files
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 
 
-@given.reads_files
+@reads_files
 def simulate(
     file: given.OneFile,
     joint: given.JointName = "paper",
@@ -19,7 +20,7 @@ def simulate(
     save_model: given.ModelFile = None,
     report: given.SimulationReport = None,
     *,
-    columns: given.Columns,
+    columns: Columns,
 ) -> None:
     """Simulate a recording in free run and compare with what was measured."""
     given.check_distinct([file], fit or [])

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax.cli import arguments as given, terminal
+from rotflex_jax.cli.recordings import Columns, reads_files
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 
 
-@given.reads_files
+@reads_files
 def reproduce(
     out: given.PageFolder = Path("rotflex-reproduce"),
     data: given.PaperData = None,
@@ -24,7 +25,7 @@ def reproduce(
     split: given.Share = None,
     json_file: given.JsonFile = None,
     *,
-    columns: given.Columns,
+    columns: Columns,
 ) -> None:
     """Run the experiment of the paper this started from: its figures, its model, and better ones."""
     from rotflex_jax.reproduce.settings import Settings
@@ -80,9 +81,7 @@ def _pairs(texts: list[str]) -> dict[str, str]:
     return pairs
 
 
-def _recordings(
-    columns: given.Columns, data: list[str], held_out: list[Path], share: float
-) -> tuple[Any, ...]:
+def _recordings(columns: Columns, data: list[str], held_out: list[Path], share: float) -> tuple[Any, ...]:
     """Recordings to fit and held-out ones; nothing for a simulation."""
     if not data:
         if columns.Ts is not None:

@@ -1,12 +1,7 @@
-"""Recordings from files and DataFrames, and back into text.
-
-Objects of other packages are recognised by their attributes `u`, `y`, `sampling_time`, and if present
-`state_initialization_window_length` and `name`; those packages are not imported.
-"""
+"""Recordings from files and DataFrames, and back into text."""
 
 import csv
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from io import StringIO
@@ -14,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Real
 
-from rotflex_jax.checks import real, shown
+from rotflex_jax.checks import shown
 from rotflex_jax.data.binary import (
     table_from_frame,
     table_from_mat,
@@ -24,6 +18,19 @@ from rotflex_jax.data.binary import (
     table_from_parquet,
     table_from_xlsx,
 )
+from rotflex_jax.data.columns import (
+    OTHER_NAMES,
+    angle,
+    column_of,
+    counts_per_turn,
+    deflection,
+    input_unit,
+    named_outputs,
+    time_stamps,
+    timing,
+    unused_sensors,
+)
+from rotflex_jax.data.foreign import from_foreign, is_foreign
 from rotflex_jax.data.logs import Channel, table_from_mcap, table_from_mdf, table_from_tdms, table_of_channels
 from rotflex_jax.data.tables import (
     MAX_BYTES,
@@ -38,9 +45,9 @@ from rotflex_jax.data.tables import (
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.quality import Finding, acceptable, whole_numbers
+from rotflex_jax.recording.quality import Finding, acceptable
 from rotflex_jax.recording.recording import single
-from rotflex_jax.recording.samples import even_spacing, finite, real_numbers, sampling_period
+from rotflex_jax.recording.samples import real_numbers
 from rotflex_jax.text.files import write_file
 
 READERS: dict[str, Callable[[Path, int], Table]] = {
@@ -173,109 +180,6 @@ def readable_file(source: Any) -> Path:
     return path
 
 
-FOREIGN_NAMES = {
-    "Ts": ("sampling_time", "Ts", "dt"),
-    "n_init": ("state_initialization_window_length", "n_init"),
-}
-"""Attribute of a recording -> names that other packages give it."""
-
-
-def is_foreign(source: Any) -> bool:
-    """Whether an object holds an input and outputs.
-
-    >>> from types import SimpleNamespace
-    >>> is_foreign(SimpleNamespace(u=[1.0], y=[2.0])), is_foreign("run.csv")
-    (True, False)
-    """
-    # A table with columns u and y has these attributes too.
-    table = isinstance(source, Mapping | Recording) or hasattr(source, "columns")
-    return not table and hasattr(source, "u") and hasattr(source, "y")
-
-
-def from_foreign(
-    source: Any,
-    channels: str | Sequence[str] | None = None,
-    units: Mapping[str, str] | None = None,
-    Ts: float | None = None,
-    accept: str | Sequence[str] = (),
-) -> Recording:
-    """A recording from an object with `u` and `y`.
-
-    Such objects name neither channels nor units, so give them; one output is called `output` otherwise,
-    several `output_1`, `output_2` and so on, without a unit.
-
-    Args:
-        source: the object.
-        channels: names of the outputs, in order.
-        units: channel to unit.
-        Ts: sampling period [s], where the object has none.
-        accept: faults to accept, as in `Recording`.
-
-    Returns:
-        The recording; its `n_init` is the object's, if it has one.
-
-    Raises:
-        InputError: no sampling period, or as `Recording`.
-
-    >>> from types import SimpleNamespace
-    >>> k = np.arange(100)
-    >>> run = SimpleNamespace(u=np.sin(k), y=np.cos(k), sampling_time=0.01, name="train",
-    ...     state_initialization_window_length=20)
-    >>> from_foreign(run, channels="position", units={"position": "m"}).n_init
-    20
-    """
-    label = str(getattr(source, "name", "") or type(source).__name__)
-    known = {key: _first(source, names) for key, names in FOREIGN_NAMES.items()}
-    period = known["Ts"] if Ts is None else Ts
-    if period is None:
-        raise InputError(f"{label} has no sampling_time, but a recording needs one; give Ts= in seconds.")
-    y = real_numbers(source.y, f"{label}: `y`")
-    width = 1 if y.ndim < 2 else y.shape[1]
-    numbered = ["output"] if width == 1 else [f"output_{k + 1}" for k in range(width)]
-    given = numbered if channels is None else [channels] if isinstance(channels, str) else list(channels)
-    return Recording(
-        u=real_numbers(source.u, f"{label}: `u`"),
-        y=y,
-        Ts=float(np.asarray(period)),
-        channels=given,
-        units=[(units or {}).get(name, "") for name in given],
-        n_init=known["n_init"],
-        source=label,
-        accept=accept,
-    )
-
-
-def _first(source: Any, names: Sequence[str]) -> Any:
-    """The first of these attributes that is not None."""
-    return next((v for n in names if (v := getattr(source, n, None)) is not None), None)
-
-
-OTHER_NAMES = {"t": ("time",), "theta": ("θ",), "alpha": ("α",)}
-"""What the columns of the joint may be called as well."""
-
-JOINT_SENSORS = ("theta", "alpha", "speed")
-"""Columns that a joint may have as sensors."""
-
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-"""Unit of a time -> seconds."""
-
-TIME_WORDS = {
-    "sec": "s",
-    "second": "s",
-    "seconds": "s",
-    "msec": "ms",
-    "milliseconds": "ms",
-    "µs": "us",
-    "μs": "us",
-}
-"""Other ways to write them."""
-
-ANGLE_UNITS = {
-    "rad": {"rad", "rads", "radian", "radians"},
-    "deg": {"deg", "degs", "degree", "degrees", "°"},
-}
-
-
 def load(
     source: Any,
     *,
@@ -351,7 +255,8 @@ def load(
     table = read_table(source, sys.maxsize if "huge" in accepted else max_bytes, time)
     u_name = table.find("voltage" if input is None else input)
     chosen = {
-        channel: table.find(name, *OTHER_NAMES.get(name, ())) for channel, name in _outputs(outputs).items()
+        channel: table.find(name, *OTHER_NAMES.get(name, ()))
+        for channel, name in named_outputs(outputs).items()
     }
     if u_name in chosen.values():
         raise InputError(
@@ -366,15 +271,15 @@ def load(
     apart = len(own) > 1 and any(not np.array_equal(table.columns[c], table.columns[own[0]]) for c in own)
     stamps = [] if Ts is not None and time is None else [(clock, "time=")]
     table.check([(u_name, "input="), *((name, "outputs=") for name in chosen.values()), *stamps])
-    u = _column(table, u_name, "input=", {"mv": "volts"})
-    per_turn = _counts(counts, tuple(chosen), degrees)
+    u = column_of(table, u_name, "input=", {"mv": "volts"})
+    per_turn = counts_per_turn(counts, tuple(chosen), degrees)
     y = {}
     for channel, name in chosen.items():
-        values = _column(table, name, "outputs=", {})
+        values = column_of(table, name, "outputs=", {})
         per = per_turn.get(channel)
         unit = (units or {}).get(channel, "rad")
         if unit.startswith("rad"):
-            y[channel] = _angle(table, channel, name, values, degrees, per, accepted)
+            y[channel] = angle(table, channel, name, values, degrees, per, accepted)
         elif degrees or per is not None:
             raise InputError(
                 f"{table.label}: column {name!r} was to be converted to rad, but its unit is given as "
@@ -388,8 +293,8 @@ def load(
                 f"{len(values)}, but they must be measured together; cut both to the same ones."
             )
     if arm_absolute:
-        y = _deflection(y)
-    remarks = _unused(table, tuple(y), {u_name, clock, *chosen.values()})
+        y = deflection(y)
+    remarks = unused_sensors(table, tuple(y), {u_name, clock, *chosen.values()})
     if apart:
         if resample is None:
             raise InputError(
@@ -399,7 +304,7 @@ def load(
             )
         any_unit = "units" in accepted
         stamps_of = {
-            c: _stamps(table, c, time_unit, len(table.columns[c]), any_unit) for c in dict.fromkeys(own)
+            c: time_stamps(table, c, time_unit, len(table.columns[c]), any_unit) for c in dict.fromkeys(own)
         }
         signals = [
             TimedSignal(
@@ -412,15 +317,15 @@ def load(
         remarks.append(told)
     elif resample is None:
         together = np.column_stack(list(y.values()))
-        start, period = _timing(table, clock, time, Ts, time_unit, len(u), "units" in accepted)
+        start, period = timing(table, clock, time, Ts, time_unit, len(u), "units" in accepted)
     else:
         together = np.column_stack(list(y.values()))
-        t = _stamps(table, clock, time_unit, len(u), "units" in accepted)
+        t = time_stamps(table, clock, time_unit, len(u), "units" in accepted)
         at = f"{table.label}: the time {clock!r}", table.where, table.first
         start, period, u, together, told = resampled(t, u, together, resample, *at)
         remarks.append(told)
     try:
-        other = (units or {}).get(u_name) or _input_unit(table, u_name)
+        other = (units or {}).get(u_name) or input_unit(table, u_name)
         recording = Recording(
             u=u,
             input_name="voltage" if other is None else name_and_unit(u_name)[0],
@@ -446,23 +351,6 @@ def load(
     return recording
 
 
-def _unused(table: Table, channels: Sequence[str], used: set[str]) -> list[Finding]:
-    """What is said of sensors of a joint that the file has too, where one alone is read."""
-    if len(channels) != 1 or channels[0] not in JOINT_SENSORS:
-        return []
-    there = {c: table.find(c, *OTHER_NAMES.get(c, ())) for c in JOINT_SENSORS}
-    left = {c: name for c, name in there.items() if name in table.columns and name not in used}
-    if not left:
-        return []
-    sensors = [c for c in JOINT_SENSORS if c in left or c in channels]
-    others = ", ".join(map(repr, left.values()))
-    message = (
-        f"{table.label}: {channels[0]} alone is read, though the file has {others} too; for a search with "
-        f"all of them give a joint with these sensors, --joint paper:sensors={'+'.join(sensors)}."
-    )
-    return [Finding("unused", next(iter(left)), message, "warning")]
-
-
 def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     """Writes a recording as text that `load` reads: time, input, outputs.
 
@@ -483,177 +371,3 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     formats = ["%.15g"] + ["%.17g"] * (columns.shape[1] - 1)
     np.savetxt(text := StringIO(), columns, fmt=formats, delimiter=",", header=header, comments="")
     return write_file(path, text.getvalue())
-
-
-def _outputs(outputs: Any) -> dict[str, str]:
-    """Channel name to column name."""
-    if outputs is None:
-        return {"theta": "theta", "alpha": "alpha"}
-    chosen: dict[str, Any]
-    if isinstance(outputs, Mapping):
-        chosen = dict(outputs)
-    else:
-        names = list(outputs) if isinstance(outputs, list | tuple) else [outputs]
-        chosen = dict(zip(("theta", "alpha"), names, strict=False)) if len(names) <= 2 else {}
-    if not chosen or len(set(map(str, chosen.values()))) < len(chosen):
-        raise InputError(
-            f"Argument `outputs` must name the column of theta, then that of alpha, but is "
-            f"{outputs!r}; for other channels give a mapping such as {{'position': 'column'}}."
-        )
-    return chosen
-
-
-def _column(table: Table, name: str, argument: str, wrong: Mapping[str, str]) -> Real[np.ndarray, " N"]:
-    values = table.column(name, argument)
-    label = f"{table.label}: column {name!r}"
-    for unit in _words(table, name) & set(wrong):
-        raise InputError(
-            f"{label} is in {unit} by its {_unit_source(name, unit)}, but {wrong[unit]} are needed; "
-            + ("pass time_unit='ms'." if unit == "ms" else "convert and rename it.")
-        )
-    numbers = real_numbers(values, label, table.where, table.first)
-    finite(numbers, label, table.where, table.first)
-    return numbers
-
-
-def _words(table: Table, name: str) -> set[str]:
-    """The words of a name and of its unit, in small letters."""
-    return set(re.split(r"[^a-z°]+", f"{name} {table.units.get(name, '')}".lower()))
-
-
-def _unit_source(name: str, unit: str) -> str:
-    """Where the unit of a column comes from."""
-    return "name" if unit in name.lower() else "line of units"
-
-
-def _input_unit(table: Table, name: str) -> str | None:
-    """The unit of the input where the file says that it is another than volts."""
-    unit = name_and_unit(name)[1] or table.units.get(name, "").strip(" []()")
-    if not unit and "current" in _words(table, name):
-        return "A"
-    return None if unit.lower() in ("", "v", "volt", "volts", "-", "–", "1") else unit
-
-
-def _counts(counts: Any, channels: Sequence[str], degrees: bool) -> dict[str, float]:
-    """Channel -> counts of one turn."""
-    if counts is None:
-        return {}
-    each: dict[str, Any] = dict(counts) if isinstance(counts, Mapping) else dict.fromkeys(channels, counts)
-    if degrees and not isinstance(counts, Mapping):
-        raise InputError(
-            f"Arguments counts={counts} and degrees=True were both given, but a column holds one of the two; "
-            "give one, or the counts of the channels that have them, such as counts={'theta': 4096}."
-        )
-    for channel, value in each.items():
-        if channel not in channels:
-            raise InputError(
-                f"Argument `counts` names the channel {channel!r}, but the recording has "
-                f"{', '.join(channels)}; name one of these."
-            )
-        if not 1 <= real(value) < 1e12:
-            raise InputError(
-                f"Argument `counts` must be the counts of one turn, a number from 1 on, but is {shown(value)}"
-                "; give for instance 4096, four times the lines of an encoder that is counted at every edge."
-            )
-    return {channel: float(value) for channel, value in each.items()}
-
-
-def _angle(
-    table: Table,
-    channel: str,
-    name: str,
-    values: Real[np.ndarray, " N"],
-    degrees: bool,
-    counts: float | None,
-    accepted: Sequence[str],
-) -> Real[np.ndarray, " N"]:
-    """An output in radians: from counts, from degrees, or as it is."""
-    if counts is not None:
-        return values * (2 * np.pi / counts)
-    behind = set(re.split(r"[^a-z°]+", name_and_unit(name)[1].lower()))
-    if behind & ANGLE_UNITS["deg"]:  # the header says so, right behind the name
-        degrees = True
-    else:
-        _check_angle_unit(table, name, degrees)
-    if degrees and whole_numbers(values) and "units" not in accepted:
-        # Of a joint, in degrees: no encoder is so coarse, and no arm bends so far.
-        most = 90.0 if channel == "alpha" else 1000.0
-        if np.ptp(values) > most:
-            raise InputError(
-                f"{table.label}: column {name!r} holds whole numbers from {values.min():g} to "
-                f"{values.max():g}, as the counts of an encoder are, but degrees=True was given; give the "
-                "counts of one turn in its place, counts=4096 for instance, or accept=('units',)."
-            )
-    return np.deg2rad(values) if degrees else values
-
-
-def _deflection(y: dict[str, Real[np.ndarray, " N"]]) -> dict[str, Real[np.ndarray, " N"]]:
-    """The arm's angle in the room as its deflection from the hub."""
-    if not {"theta", "alpha"} <= set(y):
-        raise InputError(
-            f"Argument arm_absolute=True needs the channels theta and alpha, but the outputs are "
-            f"{', '.join(y)}; leave it out, or name both."
-        )
-    return {channel: x - y["theta"] if channel == "alpha" else x for channel, x in y.items()}
-
-
-def _check_angle_unit(table: Table, name: str, degrees: bool) -> None:
-    given, other = ("deg", "rad") if degrees else ("rad", "deg")
-    words = _words(table, name)
-    if words & ANGLE_UNITS[other] and not words & ANGLE_UNITS[given]:
-        word = min(words & ANGLE_UNITS[other])
-        raise InputError(
-            f"{table.label}: column {name!r} is in {other} by its {_unit_source(name, word)}, but "
-            f"degrees={degrees} was given; pass degrees={not degrees}, or correct what the file says."
-        )
-
-
-def _stamps(
-    table: Table, name: str, time_unit: str | None, samples: int, any_unit: bool
-) -> Real[np.ndarray, " N"]:
-    """The times of all samples [s]."""
-    if time_unit is not None and time_unit not in TIME_UNITS:
-        raise InputError(
-            f"Argument `time_unit` must be one of {', '.join(TIME_UNITS)}, but is {time_unit!r}; give "
-            "for instance time_unit='ms'."
-        )
-    behind = name_and_unit(name)[1].lower()
-    unit = time_unit or TIME_WORDS.get(behind, behind if behind in TIME_UNITS else None)
-    t = _column(table, name, "time=", {} if any_unit or unit else {"ms": "seconds"})
-    if len(t) != samples:
-        raise InputError(
-            f"{table.label}: the time {name!r} has {len(t)} stamps for {samples} samples, but each sample "
-            "needs one; name the right column with time=."
-        )
-    return t.astype(float) * TIME_UNITS[unit] if unit and unit != "s" else t.astype(float)
-
-
-def _timing(
-    table: Table,
-    name: str,
-    time: str | None,
-    Ts: float | None,
-    time_unit: str | None,
-    samples: int,
-    any_unit: bool,
-) -> tuple[float, float]:
-    """Time of the first sample and sampling period [s], from the column, the argument or both."""
-    if Ts is not None:
-        Ts = sampling_period(Ts)
-    if time is None and name not in table.columns:
-        if Ts is None:
-            table.column("t", "time=, or give the sampling period with Ts=")
-        return 0.0, float(Ts or 0.0)
-    t = _stamps(table, name, time_unit, samples, any_unit)
-    label = f"{table.label}: the time {name!r}"
-    measured = even_spacing(t, label, table.where, table.first)
-    if Ts is not None and abs(measured - Ts) > 0.01 * Ts:
-        raise InputError(
-            f"{label} advances by {measured:g} s, but Ts={Ts:g} was given; leave Ts out, or correct it."
-        )
-    if measured >= 0.5 and not any_unit and time_unit is None:
-        raise InputError(
-            f"{label} advances by {measured:g} per sample, too slow for a joint: it looks like "
-            "milliseconds; pass time_unit='ms', or time_unit='s' if these are seconds."
-        )
-    return float(t[0]), measured

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.common_structure import noise_std
 from rotflex_jax.experiment.discrimination import (
     MAX_EVALUATIONS,
     Discrimination,
@@ -25,7 +26,6 @@ from rotflex_jax.experiment.rival_fit import (
     free_run_from_rest,
     rival_model,
 )
-from rotflex_jax.experiment.rival_set import noise_std
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import models_of, sequential_experiment
 from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs

@@ -19,9 +19,10 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE, rival_set
 from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, plain_limits
 from rotflex_jax.experiment.rig import Rig, checked_limits
-from rotflex_jax.experiment.rival_set import UNKNOWN_SHARE, RivalPosterior, RivalSet, RunData, rival_set
+from rotflex_jax.experiment.rival_set import RivalPosterior, RivalSet, RunData
 from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
 from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.fit.greybox import fit

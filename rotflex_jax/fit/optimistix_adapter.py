@@ -23,7 +23,7 @@ from rotflex_jax.optimise.damped_least_squares import Minimum, Status
 from rotflex_jax.parameters import Specification, Transform
 
 if TYPE_CHECKING:
-    from rotflex_jax.fit.greybox import FitPoint, FitStage, GreyBoxProblem
+    from rotflex_jax.fit.greybox_problem import FitPoint, FitStage, GreyBoxProblem
 
 Minimiser = optx.AbstractLeastSquaresSolver
 

@@ -21,7 +21,8 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import Windows
-from rotflex_jax.fit.greybox import FitAttempt, FitPoint, FitStage, GreyBoxProblem, problem_of, report
+from rotflex_jax.fit.greybox import problem_of, report
+from rotflex_jax.fit.greybox_problem import FitAttempt, FitPoint, FitStage, GreyBoxProblem
 from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE
 from rotflex_jax.fit.problem import LikelihoodEquations
 from rotflex_jax.fit.profile_result import LEAST_LEVEL, Profile, Quantity

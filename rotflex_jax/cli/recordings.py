@@ -1,0 +1,283 @@
+"""Recordings as the commands read them: columns, units and sensors that the options name."""
+
+import dataclasses
+import functools
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rotflex_jax.cli.arguments import (
+    Accept,
+    ArmAbsolute,
+    Counts,
+    Degrees,
+    InputColumn,
+    Intersample,
+    OutputColumns,
+    Resample,
+    SamplingPeriod,
+    TimeColumn,
+    TimeUnit,
+)
+from rotflex_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from rotflex_jax.models.model import Model
+    from rotflex_jax.recording import Recording
+
+# Joints that can have one sensor alone.
+ONE_SENSOR = ("paper", "quanser_2002", "quanser_2010")
+
+# Substeps within which a smooth input is followed.
+SMOOTH_SUBSTEPS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """How to read a recording: the options that all commands with files share, see `reads_files`."""
+
+    input: InputColumn = None
+    outputs: OutputColumns = None
+    degrees: Degrees = False
+    Ts: SamplingPeriod = None
+    time: TimeColumn = None
+    accept: Accept = None
+    counts: Counts = None
+    arm_absolute: ArmAbsolute = False
+    time_unit: TimeUnit = None
+    resample: Resample = None
+    intersample: Intersample = "held"
+    mechanism: Any = None  # whose channels are read where the options name none
+
+    def __post_init__(self) -> None:
+        if self.Ts is not None and self.time is not None:
+            raise InputError(
+                "--Ts and --time were both given, but the sampling period comes either from a "
+                "column or from a number; give one of the two."
+            )
+        if self.Ts is not None and not self.Ts > 0:
+            raise InputError(
+                f"--Ts was given {self.Ts:g}, but a sampling period is a positive number of "
+                "seconds; give for instance --Ts 0.002."
+            )
+        if self.intersample not in ("held", "smooth"):
+            raise InputError(
+                f"--intersample was given {self.intersample!r}, but the input between its samples is held or "
+                "smooth; give one of the two."
+            )
+
+    def of(self, model: "Model") -> "tuple[Model, Columns]":
+        """The model with the input between its samples as it was given, and how to read its recordings."""
+        if self.intersample == "smooth":
+            solver = model.solver
+            if not hasattr(solver, "between"):
+                raise InputError(
+                    f"--intersample smooth was given, but the model has the integrator "
+                    f"{type(solver).__name__}, which has no choice; leave it out."
+                )
+            substeps = max(SMOOTH_SUBSTEPS, getattr(solver, "substeps", 1))
+            smooth: Any = dataclasses.replace(solver, between="smooth", substeps=substeps)  # pyright: ignore
+            model = dataclasses.replace(model, solver=smooth)
+        return model, dataclasses.replace(self, mechanism=model.mechanism)
+
+    def load(self, file: Path) -> "Recording":
+        """The recording in a file."""
+        if not file.exists():
+            raise InputError(f"{file} does not exist; give the path of a recording.")
+        from rotflex_jax.data import load
+
+        try:
+            recording = load(file, **self.reading())
+        except InputError as error:
+            raise InputError(as_options(str(error))) from None
+        driven = "" if self.mechanism is None else self.mechanism.units.input
+        if driven and recording.input_unit != driven and "units" not in recording.accept:
+            raise InputError(
+                f"{recording.source}: the input {recording.input_name!r} is in {recording.input_unit}, but "
+                f"the model is driven in {driven}; name the column of that with --input, give a model with "
+                "such an input (--model FILE.py:NAME, for a current one with CurrentDrive), or "
+                "--accept units."
+            )
+        return recording
+
+    def reading(self) -> dict[str, Any]:
+        """The same as arguments of `rotflex_jax.load`."""
+        from rotflex_jax.mechanism.linear import output_units
+
+        units = {} if self.mechanism is None else output_units(self.mechanism)
+        channels = _channels(self.outputs or (), tuple(units))
+        if self.mechanism is not None and self.mechanism.units.input != "V":
+            units |= {self.input or "voltage": self.mechanism.units.input}
+        return {
+            "input": self.input,
+            "outputs": channels,
+            "units": units,
+            "degrees": self.degrees,
+            "Ts": self.Ts,
+            "time": self.time,
+            "accept": tuple(self.accept or ()),
+            "counts": _counts(self.counts or ()),
+            "arm_absolute": self.arm_absolute,
+            "time_unit": self.time_unit,
+            "resample": _period(self.resample),
+        }
+
+    def sensor_alone(self, file: Path) -> str | None:
+        """The one sensor of a joint that the options name, or that a file has; None where it is not one."""
+        from rotflex_jax.data.columns import OTHER_NAMES
+        from rotflex_jax.data.files import read_table
+        from rotflex_jax.joints.rotary_flexible import SENSORS
+
+        if self.outputs:
+            found = [text.partition("=")[0] for text in self.outputs]
+            return found[0] if len(found) == 1 and found[0] in SENSORS else None
+        try:
+            table = read_table(file)
+        except (InputError, OSError):
+            return None  # whoever loads it says why
+        found = [c for c in SENSORS if table.find(c, *OTHER_NAMES.get(c, ())) in table.columns]
+        return found[0] if found and (len(found) == 1 or "alpha" not in found) else None
+
+    def load_all(self, files: Sequence[Path]) -> "list[Recording]":
+        """The recordings in files, and those of public data sets that are named in the place of a file."""
+        found: list[Recording] = []
+        for file in files:
+            if public_name(file) is None:
+                found.append(self.load(file))
+                continue
+            if dataclasses.replace(self, mechanism=None, intersample="held", accept=None) != Columns():
+                raise InputError(
+                    f"{file} is a public data set whose columns and units are known, but an option says how "
+                    "to read it; leave that option out."
+                )
+            from rotflex_jax.data.datasets import load_dataset
+
+            found += load_dataset(str(file))
+        return found
+
+    def load_parts(
+        self, files: Sequence[Path], held_out: Sequence[Path], share: float
+    ) -> "tuple[list[Recording], list[Recording]]":
+        """Recordings to fit and held-out ones: files of their own, or the end of each file."""
+        train = self.load_all(files)
+        if held_out:
+            return train, self.load_all(held_out)
+        parts = [recording.split(share) for recording in train]
+        return [a for a, _ in parts], [b for _, b in parts]
+
+
+Command = Callable[..., None]
+
+
+def reads_files(command: Command) -> Command:
+    """A command whose argument `columns` is made of the options that say how files are read."""
+    options = {f.name: f for f in dataclasses.fields(Columns) if f.name != "mechanism"}
+    types = {name: f.type for name, f in options.items()}
+
+    @functools.wraps(command)
+    def inside(**arguments: Any) -> None:
+        command(columns=Columns(**{name: arguments.pop(name) for name in options}), **arguments)
+
+    own = inspect.signature(command, eval_str=True)
+    before = [p for p in own.parameters.values() if p.name != "columns"]
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type)
+        for name, f in options.items()
+    ]
+    listed = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in before] + added
+    inside.__signature__ = own.replace(parameters=listed)  # pyright: ignore[reportAttributeAccessIssue]
+    inside.__annotations__ = {p.name: p.annotation for p in before} | types | {"return": None}
+    del inside.__wrapped__  # pyright: ignore[reportAttributeAccessIssue]
+    return inside
+
+
+def _counts(texts: Sequence[str]) -> float | dict[str, float] | None:
+    """`4096` is for all channels, `theta=4096` for one."""
+    if not texts:
+        return None
+    pairs = [text.split("=", 1) if "=" in text else ["", text] for text in texts]
+    try:
+        numbers = {channel: float(value) for channel, value in pairs}
+    except ValueError:
+        raise InputError(
+            f"--counts was given {' '.join(texts)}, but needs the counts of one turn; give for instance "
+            "--counts 4096, or --counts theta=4096 --counts alpha=8192."
+        ) from None
+    if "" in numbers and len(texts) > 1:
+        raise InputError(
+            f"--counts was given {' and '.join(texts)}, which do not say what channel each is for; give one "
+            "number for all, or --counts theta=4096 --counts alpha=8192."
+        )
+    return numbers.get("", numbers)
+
+
+def _period(text: str | None) -> float | str | None:
+    """Seconds, or the word auto."""
+    if text in (None, "auto"):
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(
+            f"--resample was given {text!r}, but needs a sampling period in seconds, or auto; give for "
+            "instance --resample 0.002."
+        ) from None
+
+
+def _channels(outputs: Sequence[str], model: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
+    """`theta=servo` names the channel too; plain column names come in the order of the model's channels."""
+    if outputs and all("=" in text for text in outputs):
+        return dict(text.split("=", 1) for text in outputs)
+    if not outputs and model:
+        return dict(zip(model, model, strict=True))
+    named = model and len(outputs) == len(model)
+    return dict(zip(model, outputs, strict=True)) if named else outputs or None
+
+
+def as_options(sentence: str) -> str:
+    """A sentence about arguments of `rotflex_jax.load`, in terms of the options of the command line."""
+    sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
+    sentence = sentence.replace("degrees=True", "--degrees").replace("degrees=False", "no --degrees")
+    sentence = sentence.replace("arm_absolute=True", "--arm-absolute")
+    sentence = re.sub(r"\btime_unit='(\w+)'", r"--time-unit \1", sentence)
+    sentence = re.sub(r"\bresample='?(\w+)'?", r"--resample \1", sentence)
+    sentence = re.sub(r"\bcounts=\{'(\w+)': (\d+)\}", r"--counts \1=\2", sentence)
+    sentence = re.sub(r"\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
+    sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
+    sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
+    return re.sub(r"Argument `(\w+)`", lambda m: "--" + m[1].replace("_", "-"), sentence)
+
+
+def public_name(file: Path) -> str | None:
+    """The name of a public data set that is given in the place of a file; None where there is such a file."""
+    from rotflex_jax.data.registry import DATASETS
+
+    name = str(file)
+    if name not in DATASETS or file.exists():
+        return None
+    if not DATASETS[name].joint:
+        raise InputError(
+            f"The data set {name} has recordings of several machines, or some that are kept for an official "
+            f"test, and is not searched by its name; see rf.data.load_dataset({name!r}) and the page of "
+            "public machines, or name its files."
+        )
+    return name
+
+
+def joint_for(files: Sequence[Path], joint: str, columns: Columns) -> str:
+    """The joint that was given, or that of the public data set where all files are its name.
+
+    A joint of which the files have one sensor alone becomes one with that sensor.
+    """
+    from rotflex_jax.data.registry import DATASETS
+
+    names = {public_name(file) for file in files}
+    name = names.pop() if len(names) == 1 else None
+    if name is not None:
+        return DATASETS[name].joint if joint == "paper" else joint
+    sensor = columns.sensor_alone(files[0])
+    if sensor is None or joint.partition(":")[0] not in ONE_SENSOR or "sensors=" in joint:
+        return joint
+    return f"{joint}{',' if ':' in joint else ':'}sensors={sensor}"

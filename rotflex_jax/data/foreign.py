@@ -1,0 +1,90 @@
+"""Recordings that objects of other packages hold.
+
+They are recognised by their attributes `u`, `y`, `sampling_time`, and if present
+`state_initialization_window_length` and `name`; those packages are not imported.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rotflex_jax.errors import InputError
+from rotflex_jax.recording import Recording
+from rotflex_jax.recording.samples import real_numbers
+
+FOREIGN_NAMES = {
+    "Ts": ("sampling_time", "Ts", "dt"),
+    "n_init": ("state_initialization_window_length", "n_init"),
+}
+"""Attribute of a recording -> names that other packages give it."""
+
+
+def is_foreign(source: Any) -> bool:
+    """Whether an object holds an input and outputs.
+
+    >>> from types import SimpleNamespace
+    >>> is_foreign(SimpleNamespace(u=[1.0], y=[2.0])), is_foreign("run.csv")
+    (True, False)
+    """
+    # A table with columns u and y has these attributes too.
+    table = isinstance(source, Mapping | Recording) or hasattr(source, "columns")
+    return not table and hasattr(source, "u") and hasattr(source, "y")
+
+
+def from_foreign(
+    source: Any,
+    channels: str | Sequence[str] | None = None,
+    units: Mapping[str, str] | None = None,
+    Ts: float | None = None,
+    accept: str | Sequence[str] = (),
+) -> Recording:
+    """A recording from an object with `u` and `y`.
+
+    Such objects name neither channels nor units, so give them; one output is called `output` otherwise,
+    several `output_1`, `output_2` and so on, without a unit.
+
+    Args:
+        source: the object.
+        channels: names of the outputs, in order.
+        units: channel to unit.
+        Ts: sampling period [s], where the object has none.
+        accept: faults to accept, as in `Recording`.
+
+    Returns:
+        The recording; its `n_init` is the object's, if it has one.
+
+    Raises:
+        InputError: no sampling period, or as `Recording`.
+
+    >>> from types import SimpleNamespace
+    >>> k = np.arange(100)
+    >>> run = SimpleNamespace(u=np.sin(k), y=np.cos(k), sampling_time=0.01, name="train",
+    ...     state_initialization_window_length=20)
+    >>> from_foreign(run, channels="position", units={"position": "m"}).n_init
+    20
+    """
+    label = str(getattr(source, "name", "") or type(source).__name__)
+    known = {key: _first(source, names) for key, names in FOREIGN_NAMES.items()}
+    period = known["Ts"] if Ts is None else Ts
+    if period is None:
+        raise InputError(f"{label} has no sampling_time, but a recording needs one; give Ts= in seconds.")
+    y = real_numbers(source.y, f"{label}: `y`")
+    width = 1 if y.ndim < 2 else y.shape[1]
+    numbered = ["output"] if width == 1 else [f"output_{k + 1}" for k in range(width)]
+    given = numbered if channels is None else [channels] if isinstance(channels, str) else list(channels)
+    return Recording(
+        u=real_numbers(source.u, f"{label}: `u`"),
+        y=y,
+        Ts=float(np.asarray(period)),
+        channels=given,
+        units=[(units or {}).get(name, "") for name in given],
+        n_init=known["n_init"],
+        source=label,
+        accept=accept,
+    )
+
+
+def _first(source: Any, names: Sequence[str]) -> Any:
+    """The first of these attributes that is not None."""
+    return next((v for n in names if (v := getattr(source, n, None)) is not None), None)

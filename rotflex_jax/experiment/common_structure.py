@@ -1,0 +1,218 @@
+"""Rival models built into one structure, with what is known of their parameters beforehand."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax import checks
+from rotflex_jax.effects.base import Effect
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.rival_fit import with_calibrations
+from rotflex_jax.experiment.rival_set import RivalSet
+from rotflex_jax.fit.result import Fit
+from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.mechanism import process_noise_of
+from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Transform
+
+# Standard deviations of a fit are those of one recording at one amplitude: they are doubled. No coordinate is
+# less certain than by the second number, or a logarithm would become no statement at all.
+FIT_SPREAD, LARGEST_SPREAD = 2.0, 2.0
+
+# Uncertainty of a parameter without a standard deviation, as a share of its value.
+UNKNOWN_SHARE = 0.05
+
+
+def rival_set(
+    given: Any,
+    *,
+    Ts: float,
+    noise: Mapping[str, float] | None = None,
+    process_noise: Mapping[str, float] | None = None,
+    uncertainty: float = UNKNOWN_SHARE,
+) -> RivalSet:
+    """Rival models in one structure, with what is known of their parameters.
+
+    Args:
+        given: Name -> `Fit`, `Model` or `Mechanism`; or a list of these, named by the effects that not all
+            have.
+        Ts: Sampling period [s].
+        noise: Channel -> standard deviation of the sensor noise; that of the fits if None.
+        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
+        uncertainty: Standard deviation of parameters that come without one, as a share of their value.
+
+    Raises:
+        InputError: Fewer than two, machines that differ in more than effects, no noise.
+    """
+    uncertainty = checks.number(uncertainty, "uncertainty", above=0, example="0.05")
+    items = _items(given)
+    models = [g.model if isinstance(g, Fit) else Model.of(g) for _, g in items]
+    reduced = [_without_gates(m) for m in models]
+    labels = _labels([name for name, _ in items], reduced)
+    first = reduced[0].mechanism
+    for label, m in zip(labels, reduced, strict=True):
+        other = m.mechanism
+        same = (
+            other.coordinates == first.coordinates
+            and dict(other.ports) == dict(first.ports)
+            and other.outputs == first.outputs
+            and other.units == first.units
+            and m.solver == reduced[0].solver
+        )
+        if not same:
+            raise InputError(
+                f"{labels[0]!r} and {label!r} differ in coordinates, ports, outputs or solver, but models of "
+                "one machine may differ in effects only; build them from the same mechanism."
+            )
+    effects: dict[tuple[str, str], Effect] = {}
+    complete = [with_calibrations(m.mechanism) for m in reduced]
+    for m in complete:
+        for e in m.effects:
+            known = effects.setdefault((e.name, e.at), e)
+            if (
+                type(known) is not type(e)
+                or set(known.values) != set(e.values)
+                or e.replace(**known.values) != known
+            ):
+                raise InputError(
+                    f"The effect {e.name}@{e.at} has another form in one model than in another, but one "
+                    "structure must serve all; give it the same settings."
+                )
+    union = dataclasses.replace(first, effects=tuple(effects.values()), trusted=frozenset())
+    names, specs = union.parameter_names, union.parameter_specifications
+    transform = Transform.of(specs)
+    before = {n for m in reduced for n in m.mechanism.parameter_names}
+    calibrations = {n for m in complete for n in m.parameter_names} - before
+    calibrations |= {
+        f"{e.at}.{e.name}.{p}" for e in union.effects if e.name == "voltage_offset" for p in e.values
+    }
+    own = np.array([i for i, n in enumerate(names) if n in calibrations], dtype=int)
+    gates, values, free, mean, covariance = [], [], [], [], []
+    for m, (_, source) in zip(complete, items, strict=True):
+        mine = {(e.name, e.at) for e in m.effects}
+        gates.append([float((e.name, e.at) in mine) for e in union.effects])
+        of = dict(zip(m.parameter_names, m.values, strict=True))
+        v = np.array([of.get(n, x) for n, x in zip(names, union.values, strict=True)])
+        v[own] = 0.0
+        pick = np.array(
+            [i for i, n in enumerate(names) if n in of and n not in m.trusted | calibrations], int
+        )
+        values.append(v)
+        free.append(pick)
+        mean.append(transform.unconstrain(v)[pick])
+        listed = [names[i] for i in pick]
+        covariance.append(_known_covariance(source, listed, v[pick], specs, transform, pick, uncertainty))
+    sd = noise_std([g for _, g in items], noise, first.channels)
+    return RivalSet(
+        labels,
+        tuple(reduced),
+        union,
+        reduced[0].solver,
+        np.array(gates),
+        np.array(values),
+        tuple(free),
+        own,
+        tuple(mean),
+        tuple(covariance),
+        sd,
+        process_noise_of(first, process_noise),
+        float(Ts),
+    )
+
+
+def _items(given: Any) -> list[tuple[str | None, Any]]:
+    pairs = list(given.items()) if isinstance(given, Mapping) else None
+    if pairs is None and isinstance(given, Sequence) and not isinstance(given, str):
+        pairs = [(None, g) for g in given]
+    good = pairs is not None and all(isinstance(g, Fit | Model | Mechanism) for _, g in pairs)
+    if pairs is None or not good or len(pairs) < 2:
+        raise InputError(
+            "Two or more fitted models are needed to tell which is true, but "
+            f"{'one' if good else checks.shown(given)} was given; give a list of them, or name -> model."
+        )
+    return [(None if n is None else str(n), g) for n, g in pairs]
+
+
+def _without_gates(model: Model) -> Model:
+    """The model without the effects that its gates switch off."""
+    if model.gates is None:
+        return model
+    m = model.mechanism
+    for e, gate in zip(m.effects, model.gates, strict=True):
+        m = m if gate else m.without(e.name, e.at)
+    return dataclasses.replace(model, mechanism=m, gates=None)
+
+
+def _labels(names: list[str | None], models: list[Model]) -> tuple[str, ...]:
+    sets = [{f"{e.name}@{e.at}" for e in m.mechanism.effects} for m in models]
+    common = set.intersection(*sets)
+    labels = [n or " + ".join(sorted(s - common)) or "nothing more" for n, s in zip(names, sets, strict=True)]
+    twice = [n for n in labels if labels.count(n) > 1]
+    if twice:
+        raise InputError(
+            f"Two of the models are both {twice[0]!r}, but each needs a name or effects of its own; give "
+            "name -> model."
+        )
+    return tuple(labels)
+
+
+def _known_covariance(
+    source: Any,
+    names: list[str],
+    values: np.ndarray,
+    specs: Sequence[Any],
+    transform: Transform,
+    pick: np.ndarray,
+    uncertainty: float,
+) -> np.ndarray:
+    """Covariance of unconstrained free parameters: that of a fit, wider; else a share of their values."""
+    whole = np.array([s.typical for s in specs], float)
+    whole[pick] = values
+    z = transform.unconstrain(whole)
+    slope = np.abs(transform.physical(z)[1][pick])
+    typical = np.array([specs[i].typical for i in pick])
+    spread = uncertainty * np.maximum(np.abs(values), uncertainty * typical) / np.maximum(slope, 1e-300)
+    out = np.diag(np.clip(spread, 1e-6, LARGEST_SPREAD) ** 2)
+    if not isinstance(source, Fit):
+        return out
+    of = {n: i for i, n in enumerate(source.free_names)}
+    known = [k for k, n in enumerate(names) if n in of]
+    at = [of[names[k]] for k in known]
+    C = source.covariance[np.ix_(at, at)] * FIT_SPREAD**2
+    scale = slope[known]
+    C = C / np.maximum(np.outer(scale, scale), 1e-300)
+    good = np.isfinite(np.diag(C)) & (np.diag(C) > 0)
+    sd = np.where(good, np.sqrt(np.where(good, np.diag(C), 1.0)), LARGEST_SPREAD)
+    correlation = np.nan_to_num(C / np.outer(sd, sd)) * np.outer(good, good)
+    np.fill_diagonal(correlation, 1.0)
+    # Two that only their ratio determines are correlated nearly to one, which rounding may carry beyond.
+    w, V = np.linalg.eigh((correlation + correlation.T) / 2)
+    correlation = (V * np.maximum(w, 1e-9)) @ V.T
+    sd = np.clip(sd, 1e-6, LARGEST_SPREAD)
+    out[np.ix_(known, known)] = correlation * np.outer(sd, sd)
+    return out
+
+
+def noise_std(
+    given: Sequence[Any], noise: Mapping[str, float] | None, channels: tuple[str, ...]
+) -> Float[np.ndarray, " C"]:
+    """Standard deviation of the sensor noise per channel: as given, or the least of the fits.
+
+    Raises:
+        InputError: It is known of neither, or not of every channel.
+    """
+    if noise is None:
+        fits = [g for g in given if isinstance(g, Fit)]
+        noise = {c: min(f.noise[c] for f in fits) for c in channels} if fits else None
+    good = isinstance(noise, Mapping) and set(noise) == set(channels)
+    sd = [checks.real(noise[c]) for c in channels] if isinstance(noise, Mapping) and good else []
+    if not (sd and all(0 < v < np.inf for v in sd)):
+        raise InputError(
+            f"The sensor noise was given as {noise if good else checks.shown(noise)}, but every channel "
+            f"({', '.join(channels)}) needs a positive standard deviation; give "
+            "noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
+        )
+    return np.array(sd)

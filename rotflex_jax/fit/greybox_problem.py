@@ -1,0 +1,454 @@
+"""What a grey-box fit solves, by damped least squares: free runs or predictions, in stages, within bounds."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rotflex_jax.fit.coordinates import FitCoordinates
+from rotflex_jax.fit.dataset import Dataset, Windows, process_noise_ports
+from rotflex_jax.fit.plausibility import AT_BOUND
+from rotflex_jax.fit.problem import (
+    LARGEST_STEP,
+    LikelihoodEquations,
+    RunLayout,
+    likelihood_equations,
+    runs_with_slopes,
+)
+from rotflex_jax.mechanism import kalman_gains
+from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.models.model import Model
+from rotflex_jax.optimise.damped_least_squares import Minimum, Progress, Rules, Status, minimise
+from rotflex_jax.parameters import Transform
+
+if TYPE_CHECKING:
+    from rotflex_jax.fit.optimistix_adapter import Minimiser
+
+ProcessNoise = Mapping[str, float] | None
+"""Port -> intensity of the process torque [(N m)^2 s]; None for a free run."""
+
+# A step that would lower the negative log-likelihood by less than this is not taken [nat]. A relative
+# tolerance would stop a long recording many nats short of the optimum. A stage that only leads to the next
+# one may stop earlier.
+LAST_STAGE_TOLERANCE, EARLY_STAGE_TOLERANCE = 1e-3, 1.0
+
+# A fit also ends where so many steps lower the cost by less than this [nat]: along a curved minimum, or
+# towards a bound.
+PROGRESS_STEPS, LEAST_PROGRESS = 8, 0.1
+
+# States that the first samples show, or that a run over the whole recording leaves in memories, follow the
+# parameters: the last stage is repeated with new ones until they settle, so many times at least and at most.
+LEAST_REPETITIONS, MOST_REPETITIONS, SETTLED = 4, 6, 0.1
+
+# The scale of a channel is this share of the sensor's noise at least.
+LEAST_SCALE = 0.1
+
+# A start is far where its run misses a channel by more than this share of the channel's standard deviation.
+FAR_START_ERROR = 0.7
+
+# Free runs that miss a channel by more than so many times its noise lack something.
+MISSING = 3.0
+
+# Horizons on the way to a long one: the first [s], how many times longer the next is, and the largest share
+# of the long one that is worth a stage.
+SHORTEST_HORIZON, NEXT_HORIZON, LONGEST_SHARE = 2.0, 2.5, 0.75
+
+# An end is one where the slopes promise no more than this share of a nat for each coordinate.
+RUGGED = 0.5
+
+# Further starts around an end, and their distance as a share of each parameter.
+NEARBY_STARTS, NEARBY = 3, 0.3
+
+# Of two attempts whose costs differ by less, one that converged is better [nat].
+EQUAL_COST = 0.1
+
+_STATUS = {
+    Status.CONVERGED: "converged",
+    Status.DIVERGED: "diverged: the model error at the start is not finite",
+    Status.UNSOLVED: "stopped: a step has no finite solution; the model diverges near these numbers",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class FitPoint:
+    """Where a fit is.
+
+    Attributes:
+        free: Parameters that all recordings share and that are fitted.
+        local: Fitted parameters that each recording has for itself.
+        z: Unconstrained values of all parameters.
+        local_z: Of the recordings' own.
+        x0: First states of the windows, complete.
+    """
+
+    free: tuple[int, ...]
+    local: tuple[int, ...]
+    z: Float[np.ndarray, " P"]
+    local_z: Float[np.ndarray, "R L"]
+    x0: Float[np.ndarray, "R W n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class FitStage:
+    """What is fitted in one stage: free runs of some length, or predictions.
+
+    Attributes:
+        windows: Where runs start again.
+        process_noise: Of the predictor; None for free runs.
+    """
+
+    windows: Windows
+    process_noise: ProcessNoise = None
+
+
+@dataclasses.dataclass(frozen=True)
+class FitAttempt:
+    """Where a sequence of stages ended.
+
+    Attributes:
+        point: The numbers.
+        stage: The last one.
+        K: Gains of the last runs.
+        status: "converged", or why not.
+        steps: Iterations.
+        history: Negative log-likelihood after each minimisation, constants left out [nat].
+        start_error: Error of the run at the start, as a share of the standard deviation of each channel.
+        cost: Negative log-likelihood, constants left out; infinite if diverged.
+    """
+
+    point: FitPoint
+    stage: FitStage
+    K: Float[np.ndarray, "R n C"]
+    status: str
+    steps: int
+    history: list[float]
+    start_error: Float[np.ndarray, " C"]
+    cost: float
+
+    @property
+    def rank(self) -> float:
+        """Smaller for a better attempt."""
+        return self.cost + EQUAL_COST * (self.status != "converged")
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether another way may end better: the start was far away, or this way did not converge."""
+        return self.status != "converged" or not np.all(self.start_error <= FAR_START_ERROR)
+
+
+@dataclasses.dataclass(frozen=True)
+class GreyBoxProblem:
+    """What is fitted to what, and how.
+
+    Attributes:
+        model: Mechanism and solver.
+        dataset: The recordings.
+        layout: What runs are compiled for.
+        ranges: Least and largest unconstrained value of each parameter.
+        max_steps: Most iterations of a minimisation.
+        minimiser: Solver of optimistix, or None for the toolkit's own.
+        say: Called with lines of progress.
+    """
+
+    model: Model
+    dataset: Dataset
+    layout: RunLayout
+    ranges: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]
+    max_steps: int
+    minimiser: "Minimiser | None"
+    say: Callable[[str], None]
+
+    def start(self, local: Sequence[int], windows: Windows) -> FitPoint:
+        """The point of the model as it is."""
+        m = self.model.mechanism
+        free = tuple(m.parameter_names.index(name) for name in m.free_names)
+        z = np.clip(self.transform.unconstrain(m.values), *self.ranges)
+        own = np.tile(z[list(local)], (len(self.dataset.recordings), 1))
+        rest = rest_state(m.structure, np.float64)
+        x0 = np.tile(rest, (*windows.first_states.shape[:2], 1))
+        x0[..., : windows.first_states.shape[-1]] = windows.first_states
+        return FitPoint(tuple(i for i in free if i not in local), tuple(local), z, own, x0)
+
+    @property
+    def transform(self) -> Transform:
+        """Unconstrained <-> physical, by the declared bounds."""
+        return Transform.of(self.model.mechanism.parameter_specifications)
+
+    def physical(self, point: FitPoint) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, "R P"]]:
+        """Parameter values of each recording, and their derivatives by the unconstrained ones."""
+        z = np.tile(point.z, (len(point.local_z), 1))
+        z[:, list(point.local)] = point.local_z
+        values, slopes = self.transform.physical(z)
+        known = ~np.isnan(self.dataset.constants)
+        m = self.model.mechanism
+        held = np.array([name in m.trusted for name in m.parameter_names])
+        values = np.where(held, m.values, values)
+        return np.where(known, self.dataset.constants, values), np.where(known | held, 0.0, slopes)
+
+    def coordinates(self, point: FitPoint, windows: Windows) -> FitCoordinates:
+        """What moves."""
+        return FitCoordinates(len(point.free), len(point.local), self.layout.states, windows)
+
+    def attempt(self, point: FitPoint, stages: Sequence[FitStage]) -> FitAttempt:
+        """One stage after the other, from a start; each but the last only until it is near its end."""
+        history, steps, status = [], 0, "converged"
+        start_error = np.full(len(self.dataset.noise), np.inf)
+        for number, stage in enumerate(stages):
+            last = number == len(stages) - 1
+            if number:
+                point = self._at_windows(point, stage.windows)
+            follows, best = self._follows(stage), None
+            renews = stage.process_noise is not None
+            for repetition in range(MOST_REPETITIONS if last and (follows or renews) else 1):
+                point, K = self._with_shown_states(point, stage), self._gains(point, stage)
+                found = self._minimum(
+                    point, stage, K, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE
+                )
+                point, cost, steps = found.x, found.cost, steps + found.evaluations
+                status = self._status(found)
+                if not history:
+                    start_error = found.first.scale / self._spread
+                if follows:
+                    # What counts is the run from the states that go with these parameters.
+                    point = self._with_shown_states(point, stage)
+                if renews:  # and the prediction with the gain that goes with them
+                    K = self._gains(point, stage)
+                if follows or renews:
+                    cost = self.equations(point, stage, K).cost
+                history.append(float(cost))
+                if best is None or cost < best[0]:
+                    best = cost, point, K, status
+                worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - SETTLED
+                if status != "converged" or not worth:
+                    break
+            assert best
+            cost, point, K, status = best
+        cost = float(cost) if np.isfinite(cost) else np.inf
+        return FitAttempt(point, stage, K, status, steps, history, start_error, cost)
+
+    def _status(self, found: Minimum) -> str:
+        """How a minimisation ended, in words."""
+        status = _STATUS.get(found.status, f"stopped after {self.max_steps} steps")
+        if status != "converged":
+            return status
+        end = found.equations
+        left = end.promised() / (end.nats_that_count * len(end.gradient))
+        if left <= RUGGED:
+            return status
+        return (
+            "stopped: no step lowers the cost, though its slopes promise to move parameters by more than "
+            f"{np.sqrt(2 * left):.1f} standard deviations; the cost has many local minima here"
+        )
+
+    @functools.cached_property
+    def _spread(self) -> Float[np.ndarray, " C"]:
+        """Standard deviation of each channel."""
+        seen = self.dataset.data.seen > 0
+        return np.maximum(np.std(self.dataset.data.y[seen], axis=0), self.dataset.noise)
+
+    def equations(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> LikelihoodEquations:
+        """Likelihood and its quadratic model at a point."""
+        e, J = self.errors(point, stage, K)
+        return likelihood_equations(
+            self.coordinates(point, stage.windows),
+            e,
+            J,
+            int(np.sum(self.dataset.data.seen)),
+            LEAST_SCALE * self.dataset.noise,
+            self._room(point, stage.windows),
+        )
+
+    def errors(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
+        """Errors of the runs and their slopes; zero where a sample does not count."""
+        values, slopes = self.physical(point)
+        many = point.x0.shape[1] > 1
+        y_hat, J = jax.device_get(
+            runs_with_slopes(
+                self.layout,
+                *map(jnp.asarray, (values, slopes, np.array((*point.free, *point.local)))),
+                jnp.asarray(point.x0 if many else point.x0[:, 0]),
+                jax.tree.map(jnp.asarray, self.dataset.data),
+                jnp.asarray(K),
+                jnp.asarray(stage.windows.index) if many else None,
+            )
+        )
+        seen = self.dataset.data.seen[:, :, None] > 0
+        return np.where(seen, y_hat - self.dataset.data.y, 0.0), np.where(seen[..., None], J, 0.0)
+
+    def model_at(self, point: FitPoint, recording: int) -> Model:
+        """The model of a recording."""
+        m = self.model.mechanism
+        return dataclasses.replace(self.model, mechanism=m.with_values(self.physical(point)[0][recording]))
+
+    def horizons(self, seconds: float | None) -> list[Windows]:
+        """Windows of some seconds, or whole recordings, behind those of shorter horizons on the way there.
+
+        They have the same number of windows, so that all share one compiled program.
+        """
+        of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
+        longest = max(r.N * r.Ts for r in self.dataset.recordings)
+        horizon, found, length = min(seconds or longest, longest), [], SHORTEST_HORIZON
+        while length < LONGEST_SHARE * horizon:
+            found.append(of_seconds(length, found[0].number if found else 1))
+            length *= NEXT_HORIZON
+        number = found[0].number if found else 1
+        if seconds is None:
+            return [*found, Windows.whole(self.dataset, number)]
+        return [*found, of_seconds(seconds, number)]
+
+    def solve(
+        self, local: Sequence[int], process_noise: ProcessNoise, window_seconds: float | None
+    ) -> FitAttempt:
+        """The best end of the ways that are worth trying."""
+        *shorter, horizon = self.horizons(window_seconds)
+        start, last = self.start(local, horizon), FitStage(horizon, process_noise)
+        end = self.attempt(start, [last])
+        better = functools.partial(min, key=lambda attempt: attempt.rank)
+        if process_noise is None and shorter and (end.doubtful or self._misses_something(end)):
+            self.say("fit: again, from short horizons to long ones")
+            first = FitStage(shorter[0])
+            way = [first, *map(FitStage, shorter[1:]), last]
+            end = better(end, self.attempt(self._at_windows(start, first.windows), way))
+            end = self._from_nearby(end)
+        elif end.doubtful:
+            self.say("fit: again, from short predictions")
+            # Torques as large as those of the motion make the filter follow the data within a few samples.
+            m = self.model.mechanism
+            short = process_noise_ports(m, (0.03 * self.dataset.torque_scale) ** 2)
+            end = better(end, self.attempt(start, [FitStage(horizon, short), last]))
+        return end
+
+    def _misses_something(self, end: FitAttempt) -> bool:
+        """Whether errors are far beyond the noise, so that a long run may have its least cost elsewhere."""
+        scale = self.equations(end.point, end.stage, end.K).scale
+        return not np.all(scale < MISSING * self.dataset.noise)
+
+    def _from_nearby(self, end: FitAttempt) -> FitAttempt:
+        """The best of some further starts around an end, where the slopes there say that it is none."""
+        bounded = self._limit(end.point, end.stage.windows)[: len(end.point.free)] < np.inf
+        free, random = list(end.point.free), np.random.default_rng(0)
+        for number in range(NEARBY_STARTS):
+            here = self.equations(end.point, end.stage, end.K)
+            if here.promised() < here.nats_that_count:
+                break
+            self.say(f"fit: again, from nearby, {number + 1} of {NEARBY_STARTS}")
+            z = end.point.z.copy()
+            size = np.where(bounded, 1.0, np.maximum(np.abs(z[free]), NEARBY))
+            z[free] += NEARBY * size * np.clip(random.standard_normal(len(free)), -2, 2)
+            near = dataclasses.replace(end.point, z=np.clip(z, *self.ranges))
+            near = self.attempt(near, [end.stage])
+            steps = end.steps + near.steps
+            end = dataclasses.replace(min(end, near, key=lambda attempt: attempt.rank), steps=steps)
+        return end
+
+    def at_ends(self, point: FitPoint) -> dict[str, str]:
+        """Parameters at the end of the range of a healthy machine, with a remark."""
+        names, found = self.model.mechanism.parameter_names, {}
+        for i in (*point.free, *point.local):
+            z = point.local_z[:, point.local.index(i)] if i in point.local else point.z[i : i + 1]
+            for bound, which in zip(self.ranges, ("lower", "upper"), strict=True):
+                if np.any(z == bound[i]):
+                    found[names[i]] = AT_BOUND[which]
+        return found
+
+    def held_by_ends(self, point: FitPoint, windows: Windows) -> Bool[np.ndarray, " M"]:
+        """Coordinates that are at the end of their range."""
+        room = self._room(point, windows)
+        return (room[0] == 0) | (room[1] == 0)
+
+    def _follows(self, stage: FitStage) -> bool:
+        """Whether first states are held at what the parameters imply, wholly or in part."""
+        unseen = len(rest_state(self.model.mechanism.structure, np.float64)) > self._moving
+        return not self.layout.states or (
+            unseen and stage.windows.number > 1 and max(stage.windows.counts) > 1
+        )
+
+    @property
+    def _moving(self) -> int:
+        return 2 * len(self.model.mechanism.coordinates)
+
+    def _at_windows(self, point: FitPoint, windows: Windows) -> FitPoint:
+        """The same parameters, with the first states where fits of these windows start."""
+        x0 = point.x0.copy()
+        x0[..., : self._moving] = windows.first_states
+        return dataclasses.replace(point, x0=x0)
+
+    def _with_shown_states(self, point: FitPoint, stage: FitStage) -> FitPoint:
+        """First states that the first samples show, where they are held, and memories of a whole run."""
+        if not self._follows(stage):
+            return point
+        x0 = point.x0.copy()
+        for r, recording in enumerate(self.dataset.recordings):
+            there = self.model_at(point, r)
+            begins = np.array([samples.start for _, samples in stage.windows.of(r)])
+            moving = x0[r, : len(begins), : self._moving] if self.layout.states else None
+            x0[r, : len(begins)] = there.states_at(recording, begins, moving)
+        return dataclasses.replace(point, x0=x0)
+
+    def _gains(self, point: FitPoint, stage: FitStage) -> Float[np.ndarray, "R n C"]:
+        n, C = point.x0.shape[-1], len(self.dataset.noise)
+        recordings = self.dataset.recordings
+        if stage.process_noise is None:
+            return np.zeros((len(recordings), n, C))
+        return np.stack(
+            [
+                kalman_gains(
+                    self.model_at(point, r).mechanism, [stage.process_noise], self.dataset.noise, x.Ts
+                )[0]
+                for r, x in enumerate(recordings)
+            ]
+        )
+
+    def _room(self, point: FitPoint, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+        """How far each coordinate may go down (not positive) and up (not negative)."""
+        c = self.coordinates(point, windows)
+        room = np.full((2, c.size), np.inf) * np.array([[-1], [1]])
+        for own, bound in zip(room, self.ranges, strict=True):
+            own[: c.shared] = (bound - point.z)[list(point.free)]
+            for r, z in enumerate(point.local_z):
+                own[c.local_columns(r)] = bound[list(point.local)] - z
+        return room[0], room[1]
+
+    def _limit(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
+        """Largest step of each coordinate: a parameter with a bound by a factor of e."""
+        c, specs = self.coordinates(point, windows), self.model.mechanism.parameter_specifications
+        bounded = np.array([bool(np.isfinite(s.lower) or np.isfinite(s.upper)) for s in specs])
+        most = np.where(bounded, LARGEST_STEP, np.inf)
+        limit = np.full(c.size, np.inf)
+        limit[: c.shared] = most[list(point.free)]
+        for r in range(len(point.local_z)):
+            limit[c.local_columns(r)] = most[list(point.local)]
+        return limit
+
+    def _minimum(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"], tolerance: float
+    ) -> Minimum:
+        """The least cost near a point."""
+        if self.minimiser is not None:
+            from rotflex_jax.fit.optimistix_adapter import minimise_by  # takes long to import
+
+            return minimise_by(self.minimiser, self, point, stage, K)
+        coordinates = self.coordinates(point, stage.windows)
+
+        def tell(progress: Progress) -> None:
+            self.say(f"fit: {progress.evaluations} steps, cost {progress.cost:.1f}")
+
+        return minimise(
+            lambda at: self.equations(at, stage, K),
+            point,
+            Rules(enough=tolerance, window=PROGRESS_STEPS, least_progress=LEAST_PROGRESS),
+            limit=self._limit(point, stage.windows),
+            move=coordinates.moved,
+            unit=lambda equations: equations.nats_that_count,
+            max_steps=self.max_steps,
+            report=tell,
+        )
