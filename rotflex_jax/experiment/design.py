@@ -27,8 +27,9 @@ from rotflex_jax.experiment.rival_fit import (
     rival_model,
 )
 from rotflex_jax.experiment.segment_choice import SegmentChoice
-from rotflex_jax.experiment.sequential import models_of, sequential_experiment
+from rotflex_jax.experiment.sequential import sequential_experiment
 from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs
+from rotflex_jax.experiment.until_decided import models_of
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.mechanism import process_noise_of

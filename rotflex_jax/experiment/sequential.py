@@ -17,15 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import checks
-from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE, rival_set
 from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, plain_limits
-from rotflex_jax.experiment.rig import Rig, checked_limits
+from rotflex_jax.experiment.rig import checked_limits
 from rotflex_jax.experiment.rival_set import RivalPosterior, RivalSet, RunData
 from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
 from rotflex_jax.experiment.standard_inputs import Limits
-from rotflex_jax.fit.greybox import fit
 from rotflex_jax.models import model_json
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.files import write_file
@@ -452,123 +450,3 @@ def _prior(given: Any, labels: tuple[str, ...]) -> np.ndarray:
             f"{checks.shown(given)}; give one for each, or leave it out."
         )
     return p / p.sum()
-
-
-def experiment_until(
-    models: Any,
-    rig: Rig,
-    *,
-    probabilities: Mapping[str, float] | Sequence[float] | None = None,
-    error: float = ERROR,
-    max_seconds: float = MOST_SECONDS,
-    segment_seconds: float = SEGMENT_SECONDS,
-    noise: Mapping[str, float] | None = None,
-    process_noise: Mapping[str, float] | None = None,
-    uncertainty: float = UNKNOWN_SHARE,
-    improve: bool = True,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> SequentialResult:
-    """Experiment until it is decided which of several models is true.
-
-    A segment is chosen, played and recorded; each model is fitted to all that was recorded; and the
-    probabilities follow from the averaged likelihoods,
-
-        p_h ~ p_h0 * integral of p(y | parameters, h) p(parameters | h) over the parameters.
-
-    It stops when one has at least the probability `1 - error`: if one of the models is true, a wrong one is
-    then named with at most the probability `error`, averaged over the probabilities beforehand (Wald's test;
-    for two models of equal probability its thresholds are those of error rates `error` each way). It stops
-    too when the time is up, and when no input within the limits would decide in the time that is left.
-
-    Not where none of the models is near the machine: probabilities are among those given.
-
-    Args:
-        models: Name -> `Fit`, `Model` or `Mechanism`, or a list of them; or the result of a search, whose
-            probable sets of effects are fitted. A `Fit` says how well its parameters are known.
-        rig: Plays voltages, and has the limits.
-        probabilities: Of each model beforehand; equal if None, those of the search if there are some.
-        error: Probability of a wrong answer at which it stops.
-        max_seconds: Time on the rig at which it stops [s].
-        segment_seconds: Length of a segment [s].
-        noise: Channel -> standard deviation of the sensor noise; that of the fits if None.
-        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
-        uncertainty: Standard deviation of parameters that come without one, as a share of their value.
-        improve: Whether inputs are improved by gradient, or standard ones played.
-        seed: Of standard inputs and draws.
-        progress: Called with a line of text now and then.
-
-    Returns:
-        SequentialResult.
-
-    Raises:
-        InputError: No rig, fewer than two models, no noise, or a recording that does not fit.
-
-    Source: A. Wald, Sequential tests of statistical hypotheses, Annals of Mathematical Statistics 16, 1945;
-        C. W. Baum and V. V. Veeravalli, A sequential procedure for multihypothesis testing, IEEE Trans.
-        Information Theory 40, 1994; G. E. P. Box and W. J. Hill, Discrimination among mechanistic models,
-        Technometrics 9, 1967.
-    """
-    say = checks.progress(progress)
-    if not isinstance(rig, Rig):
-        raise InputError(
-            f"Argument `rig` must be a Rig, but is {checks.shown(rig)}; derive a class from rotflex_jax.Rig, "
-            "or use CallbackRig, SimulatedRig or FileRig."
-        )
-    models, found = models_of(models, say)
-    e = sequential_experiment(
-        models,
-        checked_limits(getattr(rig, "limits", None)),
-        checks.positive(getattr(rig, "Ts", None), "Ts", "s", "0.002"),
-        probabilities=found if probabilities is None else probabilities,
-        error=error,
-        max_seconds=max_seconds,
-        segment_seconds=segment_seconds,
-        continues=rig.continues,
-        noise=noise,
-        process_noise=process_noise,
-        uncertainty=uncertainty,
-        improve=improve,
-        seed=seed,
-    )
-    while not (e := e.with_next_segment(say)).verdict:
-        assert e.planned is not None
-        say(f"{e.seconds:g} s: playing {e.planned.input}, {e.planned.setting}")
-        e = e.with_recording(rig.play(e.planned.u))
-        say(e.result().standing)
-        if e.verdict:
-            break
-    return e.result()
-
-
-# Sets of effects of a search that are less probable than this are left out, and at most so many are fitted.
-LEAST_PROBABLE, MOST_SETS = 0.02, 5
-
-
-def models_of(given: Any, say: Progress) -> tuple[Any, Mapping[str, float] | None]:
-    """Models as they are; of a search's result the probable sets, fitted to its recordings.
-
-    Args:
-        given: As `models` in `experiment_until`.
-        say: Told what is fitted.
-
-    Returns:
-        Models, and name -> probability where the search had some.
-    """
-    known, train = getattr(given, "probabilities", None), getattr(given, "train", None)
-    if known is None or not train:
-        return given, None
-    models, found = {}, {}
-    for s in known.sets[:MOST_SETS]:
-        if s.probability < LEAST_PROBABLE and len(models) >= 2:
-            continue
-        m, label = given.baseline.model, " + ".join(sorted(s.effects)) or "nothing more"
-        have = {(e.name, e.at) for e in m.mechanism.effects}
-        final = {(e.name, e.at): e for e in given.model.mechanism.effects}
-        for name in sorted(s.effects):
-            at = tuple(name.split("@"))
-            if at not in have:
-                m = m + final.get(at, CATALOG[at[0]](at=at[1]))
-        say(f"fitting {label}")
-        models[label], found[label] = fit(m, list(train)), s.probability
-    return models, found
