@@ -26,6 +26,7 @@ from measured_joint import arm_alone, drawing, fine_run, with_play
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE / "results" / "B1.json"
 
+from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.text.files import write_file
 
 
@@ -111,7 +112,7 @@ def differences(A: rf.Recording, B: rf.Recording) -> dict:
     found = fine_run.fit({"A": A, "B": B}, free, own)
     print("\n| number | A | B |\n|---|---|---|")
     for k in own:
-        cells = (f"{found.numbers[r][k]:.4g} +- {1.96 * found.std[r][k]:.2g}" for r in "AB")
+        cells = (f"{found.numbers[r][k]:.4g} +- {HALF_WIDTH_95 * found.std[r][k]:.2g}" for r in "AB")
         print(f"| {k} | " + " | ".join(cells) + " |")
     errors = {r: fine_run.rms(found.numbers[r], True, run) for r, run in (("A", A), ("B", B))}
     print("errors", errors)

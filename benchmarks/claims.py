@@ -11,6 +11,8 @@ from typing import Any
 
 import scipy.stats
 
+from rotflex_jax.parameters import HALF_WIDTH_95
+
 RESULTS = Path(__file__).resolve().parent / "results"
 
 # Name -> the text that stands between the marks of that name.
@@ -261,7 +263,7 @@ def arena_over_oracle() -> str:
 def arena_intervals() -> str:
     """Share of 95 % intervals that hold the truth [%]."""
     numbers = [p for r in records() for p in r["parameters"].values() if p.get("std")]
-    held = sum(abs(p["estimate"] - p["true"]) <= 1.96 * p["std"] for p in numbers)
+    held = sum(abs(p["estimate"] - p["true"]) <= HALF_WIDTH_95 * p["std"] for p in numbers)
     return f"{100 * held / len(numbers):.0f}" if numbers else "–"
 
 

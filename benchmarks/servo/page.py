@@ -5,6 +5,8 @@ from __future__ import annotations
 import statistics
 from typing import Any
 
+from rotflex_jax.parameters import HALF_WIDTH_95
+
 SEARCHES = {"search": "search of the catalogue", "search, own effect": "search, `weight_friction` added"}
 
 
@@ -74,7 +76,7 @@ def page(found: dict[str, Any]) -> str:
                 lines.append(f"- {split} left out, {title}: {effects} (`{row['verdict']}`)")
     if "direction" in found:
         d = found["direction"]
-        fits = ", ".join(f"{n} = {v:.3g} ± {1.96 * s:.2g}" for n, (v, s) in d["fit"].items())
+        fits = ", ".join(f"{n} = {v:.3g} ± {HALF_WIDTH_95 * s:.2g}" for n, (v, s) in d["fit"].items())
         lines += ["", "## Friction that knows the direction of the load", ""]
         lines += [
             f"Fitted with a level for lifting and one for lowering: {fits}. As a candidate beside friction "

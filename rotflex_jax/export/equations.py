@@ -7,7 +7,7 @@ import numpy as np
 
 from rotflex_jax.effects.base import Effect, Linear
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.assembly import effects_of
+from rotflex_jax.mechanism.assembly import effects_of, second_order_matrices
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
 from rotflex_jax.text.numbers import one_line
@@ -181,15 +181,11 @@ def _active(model: Model) -> Mechanism:
 
 
 def _matrices(mechanism: Mechanism) -> dict[str, np.ndarray]:
-    n = len(mechanism.coordinates)
-    M, D, K, b = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
-    for _, effect in effects_of(mechanism, Linear):
-        p, stamp = np.array(mechanism.port_vectors[effect.at]), effect.stamp()
-        M += float(stamp.inertia) * np.outer(p, p)
-        D += float(stamp.damping) * np.outer(p, p)
-        K += float(stamp.stiffness) * np.outer(p, p)
-        b += float(stamp.drive) * p
-    return {"M": M, "D": D, "K": K, "b": b}
+    linear = [e for _, e in effects_of(mechanism, Linear)]
+    found = second_order_matrices(
+        [(e.stamp(), mechanism.port_vectors[e.at]) for e in linear], len(mechanism.coordinates)
+    )
+    return {name: np.array(part, float) for name, part in zip("MDKb", found, strict=True)}
 
 
 def _with_equations(mechanism: Mechanism) -> Iterator[Effect]:

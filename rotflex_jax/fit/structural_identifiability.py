@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from rotflex_jax.effects.base import Linear
 from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.assembly import second_order_matrices
 from rotflex_jax.parameters import HALF_WIDTH_95
 
 # Entries below this share of the largest belong to no sentence.
@@ -277,17 +278,8 @@ def _state_space(m: Mechanism, effects: Sequence[Any], none: Dual) -> tuple[Matr
     """`A` and `B` of positions, speeds and the states of linear effects, as `mechanism.assembly` has them."""
     n = len(m.coordinates)
     empty = lambda rows, columns: [[none] * columns for _ in range(rows)]  # noqa: E731
-    M, D, K, drive = empty(n, n), empty(n, n), empty(n, n), [none] * n
     stamps = [(e.stamp(), [exact(x) for x in m.vector(e)]) for e in effects]
-    for s, p in stamps:
-        for i in range(n):
-            drive[i] = drive[i] + s.drive * p[i]
-            for j in range(n):
-                both = p[i] * p[j]
-                if both:
-                    M[i][j] = M[i][j] + s.inertia * both
-                    D[i][j] = D[i][j] + s.damping * both
-                    K[i][j] = K[i][j] + s.stiffness * both
+    M, D, K, drive = second_order_matrices(stamps, n, none)
     inverse = _inverse(M, none)
     size = 2 * n + sum(len(s.own) for s, _ in stamps)
     A, B = empty(size, size), [none] * size

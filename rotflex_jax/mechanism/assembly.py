@@ -5,6 +5,7 @@ Everything here is formed once per set of parameters, outside the scan, and is d
 
 import dataclasses
 import functools
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar, get_args
 
 import jax
@@ -171,6 +172,31 @@ def equations(mechanism: Mechanism, gates: Float[Array, " E"]) -> EquationsOfMot
     stamps = [PlacedStamp(e.stamp(), np.array(mechanism.vector(e)), each[i]) for i, e in stamped(mechanism)]
     P = np.array(layout.port_matrix).reshape(len(layout.torque_ports), layout.n)
     return equations_from_stamps(stamps, P, layout.linear, gates.dtype)
+
+
+def second_order_matrices(
+    stamps: Iterable[tuple[Stamp, Sequence[Any]]], n: int, zero: Any = 0.0
+) -> tuple[list[list[Any]], list[list[Any]], list[list[Any]], list[Any]]:
+    """`M`, `D`, `K` and the column of the voltage of the equations of motion, outside of JAX.
+
+    States that effects have of their own are left out.
+
+    Args:
+        stamps: Of linear effects, each with the vector of its port; in any kind of number.
+        n: Number of coordinates.
+        zero: Of that kind.
+    """
+    M, D, K = ([[zero] * n for _ in range(n)] for _ in range(3))
+    drive = [zero] * n
+    for s, p in stamps:
+        for i in range(n):
+            drive[i] = drive[i] + s.drive * p[i]
+            for j in range(n):
+                if both := p[i] * p[j]:
+                    M[i][j] = M[i][j] + s.inertia * both
+                    D[i][j] = D[i][j] + s.damping * both
+                    K[i][j] = K[i][j] + s.stiffness * both
+    return M, D, K, drive
 
 
 def equations_from_stamps(
