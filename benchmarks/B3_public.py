@@ -3,7 +3,7 @@
     python benchmarks/B3_public.py
     python benchmarks/B3_public.py --only silverbox emps --fresh
 
-EMPS and the Silverbox are judged on their official tests, the rotary arm on runs that were left out. Needs
+EMPS and the Silverbox are evaluated on their official tests, the rotary arm on runs that were left out. Needs
 the recordings: `rotflex data fetch emps silverbox rotary_arm`, or a folder named by `ROTFLEX_DATA`. Cases
 that `results/B3.json` has already are kept unless `--fresh` is given. Writes `results/B3.json` and the page
 `results/B3.md`.

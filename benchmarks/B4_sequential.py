@@ -6,7 +6,7 @@ A machine of the independent simulator hides one effect; an ordinary recording o
 says which of two or three it is. Each rival is fitted to that recording, and all start equally probable. Then
 `experiment_until` plays on the simulator, half a second at a time, until one has the probability 99 %.
 
-Beside it the standard inputs, without a pause and judged by the same rule: of each kind (multisine, binary
+Beside it the standard inputs, without a pause and evaluated by the same rule: of each kind (multisine, binary
 sequence, sweep, steps, noise) the setting and level that the fitted models expect most of, and of these five
 the one that turned out fastest. They are judged at fewer moments, and the earliest possible one counts.
 Last, cases that no input within the limits can tell: does the loop say so.

@@ -1,4 +1,4 @@
-"""B9: every measured machine, every direction, judged on recordings that had no say.
+"""B9: every measured machine, every direction, evaluated on recordings that had no say.
 
     python benchmarks/B9_measured.py
     python benchmarks/B9_measured.py --only rotflex two_dof_link_1

@@ -20,11 +20,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = {
-    "discover/selection.py": ("test_limits_of_decisions.py", "test_decide.py"),
-    "discover/probabilities.py": ("test_probabilities.py",),
-    "discover/localise.py": ("test_locate.py",),
-    "discover/conclusion.py": ("test_stand_in.py", "test_limits_of_verdict.py", "test_assessment.py"),
-    "mechanism/friction.py": ("test_mechanism.py", "test_load_friction.py"),
+    "discover/selection.py": ("test_discover_selection.py",),
+    "discover/probabilities.py": ("test_discover_probabilities.py",),
+    "discover/localise.py": ("test_discover_localise.py",),
+    "discover/conclusion.py": (
+        "test_discover_conclusion.py",
+        "test_discover_verdict.py",
+    ),
+    "mechanism/friction.py": ("test_mechanism.py", "test_mechanism_load_friction.py"),
 }
 LONGEST = 600.0
 """A mutant whose tests take longer hangs, and counts as noticed [s]."""

@@ -5,7 +5,7 @@
     python benchmarks/set_probabilities.py plain.json worlds.json --fit --figure probabilities.png
 
 Rows of tuning runs keep what each half second says for each set (`evidence`). The rule is the one under which
-the right sets are most probable, mean logarithm over machines; it is fitted and judged by halves of the
+the right sets are most probable, mean logarithm over machines; it is fitted and evaluated by halves of the
 machines in turn, so that what is printed of it is of machines it was not fitted to.
 """
 

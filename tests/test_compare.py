@@ -361,7 +361,7 @@ def test_what_cannot_be_compared_is_refused(methods: list, given: dict, phrase: 
         rf.compare(record, methods, **given)
 
 
-def test_a_recording_is_not_judged_on_itself() -> None:
+def test_a_recording_is_not_evaluated_on_itself() -> None:
     record = recorded(2.0)
     with pytest.raises(rf.InputError, match="proves nothing"):
         rf.compare(record, ["textbook"], test=record)

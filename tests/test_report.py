@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 from rich.console import Console
-from test_locate import recording as turning, reversals, white
+from test_discover_localise import recording as turning, reversals, white
 
 from rotflex_jax.discover import locate
 from rotflex_jax.discover.discovery import Discovery

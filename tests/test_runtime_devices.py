@@ -42,21 +42,21 @@ def assert_same(found: dict, counts: list[int]) -> None:
 
 
 def test_a_sweep_on_two_and_on_eight_devices() -> None:
-    assert_same(said(run("spread_rows.py")), [2, 8])
+    assert_same(said(run("sweep_on_devices.py")), [2, 8])
 
 
 def test_a_sweep_over_two_processes() -> None:
     with socket.socket() as place:
         place.bind(("127.0.0.1", 0))
         port = place.getsockname()[1]
-    both = [run("spread_rows.py", process, port) for process in (0, 1)]
+    both = [run("sweep_on_devices.py", process, port) for process in (0, 1)]
     first, second = (said(process) for process in both)
     assert_same(first, [4])
     assert first["spread"] == second["spread"]
 
 
 def test_fits_on_two_devices_end_where_those_on_one_do() -> None:
-    found = said(run("spread_fits.py"))
+    found = said(run("fits_on_devices.py"))
     assert (found["devices"], found["waits"]) == ([2], [])
     for what in ("values", "std", "costs", "cut"):
         # An offset that is zero but for the noise has fewer digits: sums are added up in another order.

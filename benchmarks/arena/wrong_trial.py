@@ -10,7 +10,7 @@ from dataclasses import asdict
 from typing import Any
 
 from arena.probability import told as probabilities_told
-from judged import ESTABLISHED, PROVISIONAL, errors, named, searched
+from evaluation import ESTABLISHED, PROVISIONAL, errors, named, searched
 from rotflex_jax.arena.marking import alike
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.arena.wrong_worlds import World, world

@@ -50,7 +50,7 @@ STEPS = 3  # per sample
 
 
 def compare(runs: dict[str, rf.Recording]) -> dict:
-    """Errors of the deflection [deg] of each law, learnt from one run and judged on each."""
+    """Errors of the deflection [deg] of each law, learnt from one run and evaluated on each."""
     out = {}
     for law, free in LAWS.items():
         for learnt, run in runs.items():

@@ -106,7 +106,7 @@ def fit(
 
 
 def compare(A: rf.Recording, B: rf.Recording) -> dict:
-    """Each structure learnt from one run and judged on both, as the table of `fits` has it."""
+    """Each structure learnt from one run and evaluated on both, as the table of `fits` has it."""
     runs, out = {"A": A, "B": B}, {}
     for name, free in STRUCTURES.items():
         lugre = "presliding" in free

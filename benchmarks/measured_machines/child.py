@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import rotflex_jax as rf
-from judged import errors, named, searched
+from evaluation import errors, named, searched
 from public_machines.rounds import estimates
 from rotflex_jax.arena.measured import MACHINES, Way
 

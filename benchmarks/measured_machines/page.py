@@ -18,14 +18,14 @@ KEYS = dict(
 HEAD = """# B9: measured machines
 
 Written by `python benchmarks/B9_measured.py`. Learnt from some recordings, decided on the ends of these,
-judged on others that had no say. Root mean square errors of free runs over the whole test and over windows
+evaluated on others that had no say. Root mean square errors of free runs over the whole test and over windows
 of 2 s, of all channels; calibrated: with the voltage offset that the first 2 s of each test recording ask
 for. Provisional rounds are in brackets, look-alikes after an equals sign.
 
 """
 
 
-def judged(row: Row, stage: str) -> tuple[dict[str, Any], str]:
+def evaluated(row: Row, stage: str) -> tuple[dict[str, Any], str]:
     """Errors of a stage on the test by kind, and where they are from.
 
     The search's own where it reports any on recordings that had no say; otherwise simulated by the benchmark
@@ -101,7 +101,7 @@ def page(results: dict[str, Any]) -> str:
     for row in good:
         machine = MACHINES[row["machine"]]
         for stage in ("baseline", "final"):
-            errors, source = judged(row, stage)
+            errors, source = evaluated(row, stage)
             head = [row["machine"], row["direction"], machine.unit] if stage == "baseline" else ["", "", ""]
             cells = [told(errors[kind], machine.factor) for kind in KINDS]
             cells.append(told(held_out(row, stage)["windows"], machine.factor))

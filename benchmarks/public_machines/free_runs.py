@@ -2,7 +2,7 @@
 
 The search of the toolkit judges predictors, whose horizon is short. What acts slowly, a drift of an offset
 for instance, hardly shows there and decides a free run of 25 s. Here effects are added one at a time to what
-that search found: each candidate is fitted to one free run over the first part of the record and judged by
+that search found: each candidate is fitted to one free run over the first part of the record and evaluated by
 one over the rest, then the other way round.
 """
 

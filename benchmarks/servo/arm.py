@@ -10,7 +10,7 @@ import numpy as np
 import rotflex_jax as rf
 from rotflex_jax import effects as fx
 
-# Learnt from these motions, judged on the other one, of joints that carry little.
+# Learnt from these motions, evaluated on the other one, of joints that carry little.
 TRAIN, TEST = ("multisine", "chirp_sweep"), "step_response"
 JOINTS = ("Rotation", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 

@@ -46,7 +46,7 @@ def search(train: Recordings, validation: Recordings, model: Model) -> Given:
 
 
 def _named(find: Callable[[], Any], train: Recordings, validation: Recordings, model: Model) -> Given:
-    """What a method of `rivals` names; the grey box fits the structure, so that its arithmetic is not judged.
+    """What a method of `rivals` names; the grey box fits the structure, so that its arithmetic is not scored.
 
     Such a method has columns for a joint of two angles, and one recording of each kind.
     """

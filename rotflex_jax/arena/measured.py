@@ -21,7 +21,7 @@ SILVERBOX_SAMPLES = 16_000
 
 @dataclass(frozen=True)
 class Way:
-    """What is learnt from what, and judged on what.
+    """What is learnt from what, and evaluated on what.
 
     Args:
         name: of the direction.
@@ -72,19 +72,19 @@ class Machine:
 
 
 def learnt(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Way:
-    """Learnt from runs, whose ends decide, and judged on other recordings."""
+    """Learnt from runs, whose ends decide, and evaluated on other recordings."""
     parts = [r.split(SHARE) for r in runs]
     return Way(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
 
 
 def halves(run: rf.Recording) -> Way:
-    """Learnt from the first half of a run and judged on the second."""
+    """Learnt from the first half of a run and evaluated on the second."""
     first, second = run.split(0.5)
     return learnt("first half to second half", [first], [second])
 
 
 def together(runs: Sequence[rf.Recording]) -> Way:
-    """Learnt from the beginnings of all runs and judged on their ends."""
+    """Learnt from the beginnings of all runs and evaluated on their ends."""
     parts = [r.split(SHARE) for r in runs]
     return learnt(f"first {100 * SHARE:g} % of all to the rest", [a for a, _ in parts], [b for _, b in parts])
 
@@ -126,7 +126,7 @@ def _silverbox(_: list[rf.Recording]) -> list[Way]:
 
 
 def by_itself(name: str, run: rf.Recording) -> Way:
-    """Learnt from the first half of a run, decided on what follows and judged on its end."""
+    """Learnt from the first half of a run, decided on what follows and evaluated on its end."""
     train, rest = run.split(0.5)
     decides, judges = rest.split(2 * SHARE - 1)
     return Way(f"{name}, first half to its end", (train,), (decides,), (judges,))

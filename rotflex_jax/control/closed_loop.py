@@ -372,7 +372,7 @@ def _position_of(controller: Controller) -> np.ndarray:
     if not np.allclose(weights @ rows, controller.row, atol=1e-9):
         raise InputError(
             f"The readings {', '.join(controller.model.mechanism.channels)} do not show the position of "
-            f"{controller.port!r}, so the tracking of a machine cannot be judged; control a port that is "
+            f"{controller.port!r}, so the tracking of a machine cannot be assessed; control a port that is "
             "measured."
         )
     return weights

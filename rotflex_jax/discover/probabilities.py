@@ -1,6 +1,6 @@
 """How probable each set of effects is that a search has fitted, and each effect with it.
 
-A set is judged by what it says of recordings that its fit has not seen, half second by half second, as a
+A set is rated by what it says of recordings that its fit has not seen, half second by half second, as a
 predictor and in free runs. Residuals of half a second belong together, so sums over half seconds are drawn
 again with random weights: what a set gains only in a few moments loses its lead in many of these draws.
 """

@@ -27,7 +27,7 @@ Progress = Callable[[str], None]
 # Voltage before a segment that its simulation begins with, for actuators that remember, and rest after it
 # within which the machine must stay inside its limits [s].
 BEFORE, AFTER = 0.3, 0.3
-# An input is judged by what so many repetitions of it would show, since the first alone says as much of the
+# An input is rated by what so many repetitions of it would show, since the first alone says as much of the
 # parameters as of the rival.
 LOOK_AHEAD = 4
 # Draws from what is known of each rival's parameters; the worst counts for an input, the best for giving up.

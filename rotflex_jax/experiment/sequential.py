@@ -1,4 +1,4 @@
-"""Experiments that stop by themselves: a few seconds are chosen, played and judged, until it is decided.
+"""Experiments that stop by themselves: a few seconds are chosen, played and evaluated, until it is decided.
 
 Each segment is the one after which the expected probability of a wrong answer is least; after each the
 rivals are fitted to everything recorded so far and their probabilities follow. It ends when one is probable

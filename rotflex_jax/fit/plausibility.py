@@ -233,7 +233,7 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
     There the recordings cannot tell one size from another, and an effect with such a threshold is inactive.
 
     Args:
-        m: With the values that are judged.
+        m: With the values in question.
         reach: Of the recordings that they were fitted to.
         effects: Those that are looked at; all of them if None.
     """

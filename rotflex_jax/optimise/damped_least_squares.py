@@ -163,7 +163,7 @@ def solution_within(
         back = held & ~released & np.where(x <= low, b - A @ x > 0, b - A @ x < 0)
         if not (over | back).any():
             break
-        # Those that come back do so when nothing else goes out, for they are judged with all others solved.
+        # Those that come back do so when nothing else goes out, for they are tested with all others solved.
         held, released = (held | over, released) if over.any() else (held & ~back, released | back)
     return x, held
 

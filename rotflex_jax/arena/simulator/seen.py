@@ -1,4 +1,4 @@
-r"""Whether a run shows a hidden effect: judged by the plant alone, no package asked.
+r"""Whether a run shows a hidden effect: decided by the plant alone, no package asked.
 
 The recorded voltage is played again to the plant without the effect, started again from the true state at the
 beginning of each window. What then differs from the true readings is reduced by all that another set of

@@ -1,4 +1,4 @@
-"""What B0 and B9 say of a search on recordings that had no say."""
+"""What the benchmarks say of a search on test data."""
 
 import math
 from types import SimpleNamespace
@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import judged
+import evaluation
 import rotflex_jax as rf
-from measured_machines.page import best, held_out, judged as errors_of, page
+from measured_machines.page import best, evaluated as errors_of, held_out, page
 from rotflex_jax.arena.measured import MACHINES, halves
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.data.registry import DATASETS
@@ -25,11 +25,11 @@ def drifting(offset: float, seed: int = 7) -> rf.Recording:
 @pytest.mark.parametrize("model", [rf.Model(JOINT), rf.Model(JOINT + rf.effects.VoltageOffset(offset=0.2))])
 def test_calibration_finds_the_offset_of_a_recording(model):
     record = drifting(0.043)
-    found = judged.calibrated(model, record)
+    found = evaluation.calibrated(model, record)
     assert found is not None
     assert found[1] == pytest.approx(0.043, abs=0.004)
     free = model.simulate(record)
-    own = judged.errors(model, [record])
+    own = evaluation.errors(model, [record])
     assert own["whole"] == rf.metrics.rmse(record, free)
     # Counting and jitter are 5e-4 rad; the offset alone is worth a hundred times as much.
     assert own["whole"]["theta"] > 0.05 > 0.01 > own["whole_calibrated"]["theta"]
@@ -38,9 +38,9 @@ def test_calibration_finds_the_offset_of_a_recording(model):
 
 def test_every_recording_has_an_offset_of_its_own():
     records = [drifting(0.05), drifting(-0.03, 8)]
-    found = judged.errors(rf.Model(JOINT), records)
+    found = evaluation.errors(rf.Model(JOINT), records)
     assert found["offsets"] == pytest.approx([0.05, -0.03], abs=0.004)
-    each = [judged.errors(rf.Model(JOINT), [r])["whole"]["theta"] for r in records]
+    each = [evaluation.errors(rf.Model(JOINT), [r])["whole"]["theta"] for r in records]
     assert found["whole"]["theta"] == pytest.approx(math.sqrt(np.mean(np.square(each))))
 
 
@@ -55,7 +55,7 @@ def test_a_search_that_knows_tests_is_told_of_them(monkeypatch):
 
     for name, search in (("old", old), ("new", new)):
         monkeypatch.setattr(rf, "discover", search)
-        judged.searched(JOINT, ["a"], ["b"], ["c"])
+        evaluation.searched(JOINT, ["a"], ["b"], ["c"])
         assert given[name] == (["a"], ["b"], ["c"])[: len(given[name])]
     assert len(given["new"]) == 3
 
@@ -68,7 +68,7 @@ def test_rounds_without_a_status_are_established():
         "evidence": {"held_out_gain_nats": 1.0, "score": 2.0},
     }
     result = SimpleNamespace(to_dict=lambda: {"rounds": [one, {**one, "status": "provisional"}]})
-    first, second = judged.named(result)
+    first, second = evaluation.named(result)
     assert (first["status"], second["status"]) == ("established", "provisional")
     assert first["equivalent"] == [["stribeck", "hub"]]
 

@@ -1,4 +1,4 @@
-"""Intervals that keep their promise: white residuals, correlated ones, unequal ones."""
+"""Intervals that keep their promise: white, correlated and unequal residuals; constants from both sides."""
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from rotflex_jax.fit.inference import (
     by_recording,
     correlation_length,
     curvature,
+    nats_that_count,
     sandwich,
 )
 
@@ -150,3 +151,61 @@ def test_correlation_length_of_white_noise_and_of_nothing():
     assert correlation_length(np.zeros((100, 2))) == 2
     drift = np.linspace(-1, 1, 500)[:, None]
     assert correlation_length(drift) == 50  # never more than a tenth of the recording
+
+
+COUNT = 10_000
+
+
+def spread(J: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Standard deviations of the parameters of slopes (COUNT, D)."""
+    parts = [RecordingSlopes(J[:, None], e[:, None], np.arange(J.shape[1]))]
+    return np.sqrt(np.diag(sandwich(parts, curvature(parts, J.shape[1]))))
+
+
+@pytest.mark.parametrize(("relative", "determined"), [(1e-9, True), (3e-11, True), (3e-12, False)])
+def test_a_direction_is_determined_down_to_a_curvature(relative: float, determined: bool) -> None:
+    """Two columns that differ by a little: the smaller eigenvalue of their correlation is `relative`."""
+    rng = np.random.default_rng(0)
+    basis = np.linalg.qr(rng.standard_normal((COUNT, 2)))[0]
+    angle = 2 * np.arcsin(np.sqrt(relative / 2))  # 1 - cos(angle) = relative
+    J = np.column_stack([basis[:, 0], np.cos(angle) * basis[:, 0] + np.sin(angle) * basis[:, 1]])
+    assert np.isfinite(spread(J, rng.standard_normal(COUNT))).all() == determined
+
+
+@pytest.mark.parametrize(("share", "lost"), [(0.01, True), (1e-4, False)])
+def test_who_has_a_part_in_what_is_not_determined_has_no_interval(share: float, lost: bool) -> None:
+    """The second column is the first and a little of the third: of the three only sums are determined."""
+    rng = np.random.default_rng(1)
+    a, b = np.linalg.qr(rng.standard_normal((COUNT, 2)))[0].T
+    std = spread(np.column_stack([a, a + np.sqrt(2) * share * b, b]), rng.standard_normal(COUNT))
+    assert np.isnan(std[:2]).all() and bool(np.isnan(std[2])) is lost
+
+
+def test_lags_go_as_far_as_the_root_of_the_samples() -> None:
+    """A weak correlation that lasts is seen in no single lag of white residuals."""
+    white = np.random.default_rng(2).standard_normal((COUNT, 1))
+    assert bandwidth(white) == 100
+    assert bandwidth(white[:50]) == 5  # a tenth of the samples at most
+
+
+@pytest.mark.parametrize("D", [1, 5])
+def test_nats_of_white_errors_count_each(D: int) -> None:
+    rng = np.random.default_rng(3)
+    parts = [
+        RecordingSlopes(rng.standard_normal((COUNT, 1, D)), rng.standard_normal((COUNT, 1)), np.arange(D))
+    ]
+    assert 1.0 <= nats_that_count(parts, curvature(parts, D)) < 1.3
+
+
+def test_nats_of_errors_that_go_on_count_less() -> None:
+    """Of an AR(1) with a constant slope the information counts (1 + a) / (1 - a) times over."""
+    rng, a, most = np.random.default_rng(4), 0.8, []
+    for _ in range(20):
+        w = rng.standard_normal(COUNT)
+        e = np.empty(COUNT)
+        e[0] = w[0]
+        for k in range(1, COUNT):
+            e[k] = a * e[k - 1] + w[k]
+        parts = [RecordingSlopes(np.ones((COUNT, 1, 1)), e[:, None] / e.std(), np.arange(1))]
+        most.append(nats_that_count(parts, curvature(parts, 1)))
+    assert np.mean(most) == pytest.approx((1 + a) / (1 - a), rel=0.25)

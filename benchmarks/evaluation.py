@@ -1,4 +1,4 @@
-"""Searches judged on recordings that had no say: what was named, and free runs with and without calibration.
+"""Searches evaluated on test data: what was named, and free runs with and without calibration.
 
 Shared by B0 (wrong worlds) and B9 (measured machines).
 """

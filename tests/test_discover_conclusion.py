@@ -1,27 +1,41 @@
-"""Signs that an effect stands in for something else: sizes by window, changes of free runs, nats left."""
+"""How a search ends: signs that an effect stands in for another, limits of the verdict, the proposal."""
 
 import dataclasses
+import json
 import types
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from small_problem import HUB, NOISE, problem, recordings, records, start, supermodel
 
+import rotflex_jax as rf
+import rotflex_jax.effects as fx
+from rotflex_jax.data.excitation import noise
 from rotflex_jax.discover import conclusion, summary
 from rotflex_jax.discover.conclusion import (
     LEAST_CHANGE,
     SCATTER,
     WindowSizes,
+    end_state,
     nats_above_noise,
+    proposed,
+    seen_limits,
     signs,
     window_sizes,
+    with_proposal,
 )
+from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_effect
 from rotflex_jax.discover.likelihood import LikelihoodProblem, levenberg_marquardt
-from rotflex_jax.discover.result import HorizonGain
+from rotflex_jax.discover.result import NEXT, HorizonGain, Round, Stage
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import SearchHorizon, ValidatedHypothesis, ValidationSet
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder
+from rotflex_jax.mechanism import simulate
+from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
 
 
@@ -152,3 +166,121 @@ def test_one_effect_in_the_place_of_several_has_the_signs_of_its_part(monkeypatc
     monkeypatch.setattr(summary, "signs", lambda *a: asked.update(gains=a[2]) or {HUB: ("it is small",)})
     assert summary.stand_ins(state)[merged] == ("it is small",)
     assert asked["gains"][HUB] == 4.0
+
+
+SAMPLES = 1000  # of each of the two channels
+NEAR = 1.5  # times the noise of the sensor
+
+
+def ended(
+    *,
+    ratio: float = 1.0,
+    noise_nats: float = 0.0,
+    rounds: tuple[tuple[str, ...], ...] = (),
+    excited: int = 4,
+    candidates: int = 4,
+) -> Verdict:
+    """The verdict of a search that ended so near to the noise, with these equivalents of each round."""
+    floor = {"theta": 5e-4, "alpha": 2e-3}
+    errors = {"theta": 5e-4, "alpha": 2e-3 * ratio}
+    baseline: Any = SimpleNamespace(held_out_rmse_windows={"theta": 5e-2, "alpha": 2e-1})
+    final: Any = SimpleNamespace(
+        held_out_rmse_windows=errors, process_noise_nats=noise_nats, window_seconds=2.0
+    )
+    found: Any = [SimpleNamespace(effect="coulomb", port="hub", equivalent=others) for others in rounds]
+    ranking: Any = [SimpleNamespace(excited=k < excited) for k in range(candidates)]
+    recordings: Any = [SimpleNamespace(N=SAMPLES // 2)] * 2
+    return end_state(baseline, found, final, floor, ranking, recordings)[0]
+
+
+@pytest.mark.parametrize(("share", "explained"), [(0.999, True), (1.001, False)])
+@pytest.mark.parametrize("rounds", [(), ((),)])
+def test_explained_is_near_the_noise_of_every_sensor(share: float, explained: bool, rounds: Any) -> None:
+    verdict = ended(ratio=NEAR * share, rounds=rounds)
+    good = Verdict.FOUND if rounds else Verdict.NOTHING_MISSING
+    assert verdict == (good if explained else Verdict.UNEXPLAINED)
+
+
+@pytest.mark.parametrize(("share", "explained"), [(0.999, True), (1.001, False)])
+def test_explained_leaves_little_to_process_noise(share: float, explained: bool) -> None:
+    # 0.07 nat for each measured value, those of both channels.
+    verdict = ended(noise_nats=0.07 * 2 * SAMPLES * share)
+    assert verdict == (Verdict.NOTHING_MISSING if explained else Verdict.UNEXPLAINED)
+
+
+def test_one_round_that_others_equal_makes_the_end_ambiguous() -> None:
+    assert ended(rounds=((), ("stribeck",))) == Verdict.AMBIGUOUS
+    assert ended(rounds=((), ())) == Verdict.FOUND
+
+
+def test_more_than_half_of_the_candidates_must_have_shown() -> None:
+    assert ended(excited=2, candidates=4) == Verdict.NOTHING_MISSING
+    assert ended(excited=1, candidates=4) == Verdict.NOT_EXCITED
+    assert ended(excited=2, candidates=5) == Verdict.NOT_EXCITED
+    assert ended(excited=0, candidates=0) == Verdict.NOTHING_MISSING
+
+
+TS, SD = 0.01, 5e-4
+
+
+def found(verdict: Verdict = Verdict.AMBIGUOUS) -> Discovery:
+    """A delay that could as well be a lag, as a search would tell it."""
+    m = rf.joints.paper(joint_damping=0.003, hub_damping=0.004)
+    grown = m + fx.Delay(time=0.012)
+    u = noise(400, TS, rms=0.8, seed=1)
+    y = simulate(grown, u, TS) + SD * np.random.default_rng(0).standard_normal((400, 2))
+    rec = rf.Recording(u=u, y=y, Ts=TS)
+    errors = {"theta": SD, "alpha": SD}
+    stages = [
+        Stage(Model(x), (), errors, errors, (y,), (y,), 2.0, {"hub": 0.0, "joint": 0.0}, 0.0, 0.0)
+        for x in (m, grown)
+    ]
+    turn = Round("delay", "input", (("lag", "input"),), {}, stages[1], 1.0, 1.0, "late", "v(t) = u(t - time)")
+    return Discovery(verdict, "Either.", (rec,), (rec,), stages[0], (turn,), (), (), errors, 1.0)
+
+
+@pytest.fixture(scope="module")
+def answered():
+    old, conclusion.PROPOSAL_SECONDS = conclusion.PROPOSAL_SECONDS, 3.0
+    yield with_proposal(found())
+    conclusion.PROPOSAL_SECONDS = old
+
+
+def test_the_best_standard_input_is_proposed_within_what_the_machine_has_borne(answered):
+    e, limits = answered.proposal, seen_limits(answered.train)
+    assert e.separates == ("delay@input", "lag@input")
+    assert e.chosen.input in {"noise", "multisine", "prbs", "steps", "sweep"}
+    assert np.max(np.abs(e.u)) <= limits.voltage == np.max(np.abs(answered.train[0].u))
+    assert e.chosen.peaks["alpha"] <= limits.deflection
+    assert e.numbers["delay@input"]["time"] == 0.012
+    # The lag that looks like that delay.
+    assert e.numbers["lag@input"]["time"] == pytest.approx(0.012, rel=0.5)
+    assert e.chosen.nats > 1
+
+
+def test_the_json_keeps_its_contract(answered):
+    told = json.loads(json.dumps(answered.to_dict()))["next_experiment"]
+    assert told["separates"] == ["delay@input", "lag@input"]
+    assert told["input"] == answered.proposal.chosen.input
+    assert told["file"] == NEXT
+
+
+@pytest.mark.parametrize("verdict", sorted(set(Verdict) - {Verdict.AMBIGUOUS}))
+def test_nothing_is_proposed_where_nothing_is_open(verdict):
+    plain = found(verdict)
+    assert with_proposal(plain) is plain
+    assert plain.to_dict()["next_experiment"] is None
+
+
+def test_no_design_without_an_equal():
+    alone = dataclasses.replace(found(), rounds=())
+    assert proposed(alone) is None and alone.next_experiment() is None
+
+
+def test_a_proposal_that_fails_is_a_note():
+    """An effect that the catalogue lacks, for one."""
+    result = found()
+    turn = dataclasses.replace(result.rounds[0], equivalent=(("unknown", "input"),))
+    told = with_proposal(dataclasses.replace(result, rounds=(turn,)))
+    assert told.proposal is None
+    assert "No next experiment" in told.notes[-1] and "unknown" in told.notes[-1]

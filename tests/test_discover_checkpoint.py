@@ -1,8 +1,9 @@
-"""A search that was stopped goes on from the rounds that it had finished, and ends as if it had not been."""
+"""A search that was stopped goes on from its finished rounds; what is said while a user waits."""
 
 import copy
 import json
 import shutil
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,9 +12,9 @@ import pytest
 from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
-from rotflex_jax.cli import main
+from rotflex_jax.cli import main, terminal
 from rotflex_jax.cli.stopping import RoundsSoFar
-from rotflex_jax.discover.checkpoint import digest_of_search
+from rotflex_jax.discover.checkpoint import TimeLeft, beginning, digest_of_search
 from rotflex_jax.discover.validation import Horizons
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import content
@@ -168,3 +169,64 @@ def test_nothing_is_reported_before_all_is_read(
             SPINDLE, *spun().split(0.7), candidates=PAIRS, rounds=1, resume=searched[1], progress=stop
         )
     assert reached[:2] == [len(written["stages"])] * 2
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_the_time_left_is_that_of_the_steps_measured() -> None:
+    clock = Clock()
+    left = TimeLeft(clock)
+
+    def after(seconds: float, kind: str) -> float | None:
+        clock.now += seconds
+        left.follow(beginning(kind, kind))  # pyright: ignore[reportArgumentType]
+        return left.seconds()
+
+    # The first steps compile; nobody knows how long.
+    assert (left.seconds(), after(1, "baseline"), after(30, "score"), after(20, "refit")) == (None,) * 4
+    assert left.words() == "51 s so far"
+    # 40 s of refits were measured. A second round if it is the last one: scores, refits, and two more steps
+    # of refits, for which nothing else is known yet.
+    assert after(40, "score") == 20 + 3 * 40
+    clock.now += 15
+    left.follow("  a line of no step")
+    assert left.seconds() == 5 + 3 * 40
+    assert left.words() == "106 s so far, about 2 min left if this round is the last"
+    clock.now += 100  # longer than the first time: then nobody knows
+    assert left.seconds() is None and left.words() == "206 s so far, longer than expected"
+    # The last measurement of each kind counts: it did not compile.
+    assert after(0, "refit") == 3 * 40 and after(10, "needed") == 2 * 10
+    assert after(4, "finish") == 10 and left.words().endswith("about 10 s left")
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(terminal, "SILENCE", 0.05)
+
+
+def test_a_step_that_takes_long_is_said_again(impatient: None, capsys: pytest.CaptureFixture[str]) -> None:
+    said = ""
+    with terminal.progress("Searching") as step:
+        step("refitting coulomb at hub")
+        until = time.monotonic() + 30
+        while "still" not in said and time.monotonic() < until:
+            time.sleep(0.02)
+            said += capsys.readouterr().err
+    assert said.startswith("refitting Coulomb friction at hub (0 s so far)")
+    assert "  still refitting Coulomb friction at hub (0 s; 0 s so far)" in said
+    capsys.readouterr()
+    time.sleep(0.15)
+    assert capsys.readouterr().err == ""  # nothing more after the end
+
+
+def test_a_long_line_is_shortened_when_it_is_said_again(
+    impatient: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = terminal._Told("Searching")
+    told.take("refitting " + ", ".join(f"effect{k} at hub" for k in range(20)))
+    assert " … (0 s" in told.again() and len(told.again()) < 110

@@ -1,4 +1,4 @@
-"""A sweep over several devices, as a program: `spread_rows.py [PROCESS PORT]` prints what it found as JSON.
+"""A sweep over several devices: `sweep_on_devices.py [PROCESS PORT]` prints what it found as JSON.
 
 Alone it has eight virtual devices; as one of two processes it has two, and shares all four.
 """
