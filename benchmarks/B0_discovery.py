@@ -127,9 +127,9 @@ def one(job: Job) -> dict[str, Any]:
 
 def again(row: Job) -> dict[str, Any]:
     """The oracle of a record that is done, likewise."""
-    from arena.trial import judged_again
+    from arena.trial import evaluated_again
 
-    return judged_again(row)
+    return evaluated_again(row)
 
 
 def rows(

@@ -6,7 +6,7 @@ A machine hides one effect of a pair; an ordinary recording of it takes 20 s at 
 The model is fitted to that recording with the true effect; `next_experiment` ranks the standard inputs and
 designs a better one within the same limits. Then the design and the best of the ranking are played on the
 machine, with fresh sensor noise, and both hypotheses are refitted to each new recording. The margin is the
-difference of what they are worth: log-likelihood (Gaussian, deviation re-estimated) less half of BIC's
+difference of what they are worth: log-likelihood (Gaussian, its sigma re-estimated) less half of BIC's
 penalty. Writes results/B4.json and results/B4.md.
 """
 
@@ -65,8 +65,8 @@ def recorded(truth: tuple, numbers: dict, seed: int, played: np.ndarray | None =
 def evidence(rival: RivalModel, rec: rf.Recording, noise: np.ndarray) -> tuple[float, bool]:
     """Log-likelihood of a recording less half of BIC's penalty [nat], and whether the fit converged.
 
-    Gaussian, the deviation of each channel re-estimated, constants left out. First state, offset, bias and
-    every number of the machine are fitted to this recording, from several shapes of the effect.
+    Gaussian, the standard deviation of each channel re-estimated, constants left out. First state, offset,
+    bias and every parameter of the machine are fitted to this recording, from several shapes of the effect.
     """
     found = best_rival_fit(rival, rec.u, rec.y, TS, [rival.start, *starts_with_other_shapes(rival)])
     errors = np.mean(np.square(found.residuals * noise), axis=0)

@@ -32,7 +32,7 @@ LONGEST = 16_000
 
 
 def measured(which: str) -> tuple:
-    """The rotary flexible joint: one run learnt from and the other judged on, or the ends of both."""
+    """The rotary flexible joint: one run fitted and the other evaluated on, or the ends of both."""
     A, B = rf.data.load_dataset("rotflex")
     joint = rf.joints.quanser_2010()
     if which == "mixed":
@@ -42,7 +42,7 @@ def measured(which: str) -> tuple:
 
 
 def public(name: str) -> tuple:
-    """A public benchmark with its official recordings to judge on."""
+    """A public benchmark with its official recordings to evaluate on."""
     benchmark = rf.data.benchmark(name)
     train, machine = benchmark.train, getattr(rf.joints, name)()
     if name == "silverbox":  # its input was measured behind a filter, and runs on between samples
@@ -51,7 +51,7 @@ def public(name: str) -> tuple:
 
 
 def arm() -> tuple:
-    """A geared motor with a rigid arm, measured: one controller learnt from, two others judged on."""
+    """A geared motor with a rigid arm, measured: one controller fitted, two others evaluated on."""
     _, slow, fast, other = rf.data.load_dataset("rotary_arm")
     return rf.joints.rotary_arm(), [slow], [fast, other]
 

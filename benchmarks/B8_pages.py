@@ -58,7 +58,7 @@ SHARES: dict[str, tuple[fx.Effect, ...]] = {
     "unequal coulomb": (fx.CoulombAsymmetric("hub", forward=0.045, backward=0.015),),
     "offset with friction": (fx.Coulomb("hub", level=0.03), fx.VoltageOffset(offset=0.3)),
 }
-# Hidden at the hub -> an effect of the arena, or none; `new positions` judges where nothing was trained.
+# Hidden at the hub -> an effect of the arena, or none; `new positions` evaluates where nothing was trained.
 HIDDEN: dict[str, dict] = {
     "friction": {("coulomb", "hub"): {"level": 0.03}},
     "drag": {("quadratic_drag", "hub"): {"coefficient": 0.008}},

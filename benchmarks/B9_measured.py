@@ -6,7 +6,7 @@
     python benchmarks/B9_measured.py --workers 16
     python benchmarks/B9_measured.py --list
 
-The ends of the runs that are learnt from decide (validation); the test recordings are for judging alone. Free
+The ends of the runs that are learnt from decide (validation); the test recordings have no other use. Free
 runs over the whole test and over windows of 2 s, with and without the voltage offset that the first 2 s of a
 test ask for. A search runs in a new process with nothing compiled, and once more in another one with what the
 first has compiled. Beside it is the best of the other methods (`rotflex_jax.compare`) on the same data. With

@@ -2,7 +2,7 @@
 
 Between events every contact slides one way or rests, and an adaptive rule of order 8 integrates to
 a tolerance of 1e-11; events are a sliding speed that reaches zero and a holding torque that reaches
-its level. Exact, so that it can judge the step of the package.
+its level. Exact, so that it can check the step of the package.
 """
 
 import dataclasses

@@ -10,7 +10,7 @@ import scipy.stats
 from claims import most
 
 RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
-# Files with runs of a tree that was changed, from before this was refused. Each run anew leaves the list.
+# Files with runs of a tree that was changed, from before this was refused. A new run leaves the list.
 OF_CHANGED_TREES = {"B0.json", "B2.json", "B6.json"}
 
 

@@ -12,7 +12,7 @@ import scipy.signal
 import rotflex_jax as rf
 from rotflex_jax.compare import SINDy
 from rotflex_jax.compare.sindy import smoothed_derivatives, smoothed_input
-from rotflex_jax.compare.sparse_law import Piece, SparseLaw, Terms, motions, refined
+from rotflex_jax.compare.sparse_equations import Piece, SparseEquations, Terms, motions, refined
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 
@@ -128,8 +128,8 @@ def test_motion_is_that_of_scipy() -> None:
     run = motions(terms, W[None], np.zeros((1, 1, 2)), record.u[None], Ts)[0, 0]
     np.testing.assert_allclose(run[:, 0], record.y[:, 0], atol=1e-6)
     part = record.slice(100, 300)
-    np.testing.assert_allclose(SparseLaw(terms, W, Ts).simulate(part), part.y, atol=1e-4)
-    law, k = SparseLaw(terms, W, Ts), 120
+    np.testing.assert_allclose(SparseEquations(terms, W, Ts).simulate(part), part.y, atol=1e-4)
+    law, k = SparseEquations(terms, W, Ts), 120
     y = record.y.copy()
     y[k:] += 0.5
     changed = dataclasses.replace(record, y=y)

@@ -482,7 +482,7 @@ def test_old_file_stays_where_the_new_one_finds_no_room(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
     try:
-        refused(lambda: save_csv(recording, path), "run.csv cannot be written .*make room")
+        refused(lambda: save_csv(recording, path), "run.csv cannot be written .*make space")
         refused(lambda: Model(paper()).save(path), "run.csv cannot be written")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -14,7 +14,7 @@ NOISE = {"theta": 1e-4, "alpha": 1e-4}
 
 
 def smooth(rng: np.random.Generator, N: int, cutoff: float, Ts: float) -> np.ndarray:
-    """Band-limited noise of unit deviation."""
+    """Band-limited noise of unit standard deviation."""
     sos = butter(4, cutoff, fs=1 / Ts, output="sos")
     x = sosfilt(sos, rng.standard_normal(N + 2000))[2000:]
     return x / x.std()
@@ -81,7 +81,7 @@ def test_speed_and_deflection_are_named(moving, kind, phrase, where) -> None:
 
 
 def test_a_carried_error_is_traced_to_where_it_arises(moving) -> None:
-    # A torque error beyond 9 degrees is integrated twice: it lies everywhere, but arises there.
+    # A torque error beyond 9 degrees is integrated twice: it shows in all samples, but arises there.
     alpha = moving.channel("alpha")
     push = np.where(np.abs(alpha) > np.deg2rad(9), np.sign(alpha), 0.0)
     push = push - push.mean()
@@ -98,7 +98,7 @@ def test_restarted_runs_do_not_hide_where_an_error_arises(moving) -> None:
     e = white(moving)
     e[np.abs(moving.channel("alpha")) > 0.15, 0] *= 4.0
     starts = np.arange(0, moving.N, 500)
-    for k in starts:  # every window starts anew with an error of its own
+    for k in starts:  # every window starts with an error of its own
         e[k : k + 500, 0] += 0.3 * (-1) ** (k // 500)
     told = locate(moving, e, moving.channels, NOISE, window_seconds=2.0)
     assert any("arises while the deflection is beyond" in w.statement for w in told)

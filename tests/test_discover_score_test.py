@@ -22,7 +22,7 @@ SMALL = 0.0015
 
 @pytest.fixture(scope="module")
 def weak():
-    """Recordings with a little friction: judge, baseline at its optimum, its scores by place."""
+    """Recordings with a little friction: likelihood, baseline at its optimum, its scores by place."""
     problem = sp.problem(sp.recordings(sp.records(SMALL)))
     h = sp.fitted(problem)
     return problem, h, {s.location: s for s in scores(problem, h)}

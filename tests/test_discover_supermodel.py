@@ -78,7 +78,7 @@ def numbers(name: str) -> ParameterSet:
 
 
 def parameter_set(name: str) -> ParameterSet:
-    """The same as a bench takes it: the first state is that of the part that runs."""
+    """The same as the batched predictor takes it: the first state is that of the part that runs."""
     whole = numbers(name)
     return whole._replace(x0=whole.x0[..., list(supermodel().active(whole.gates).states)])
 

@@ -240,7 +240,9 @@ def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
 
 
 def test_the_catalogue_shows_every_effect_with_all_its_parameters() -> None:
-    catalogue, laws = (importlib.import_module(f"generate.{name}") for name in ("catalogue", "laws"))
+    catalogue, figures = (
+        importlib.import_module(f"generate.{name}") for name in ("catalogue", "effect_figures")
+    )
     shown = catalogue.shown()
     assert (DOCS / "catalogue.md").read_text(encoding="utf-8") == catalogue.overview(), "build the site once"
     own = {name for name, cls in CATALOG.items() if cls.__module__.startswith("rotflex_jax.")}
@@ -253,6 +255,6 @@ def test_the_catalogue_shows_every_effect_with_all_its_parameters() -> None:
         assert ":Source: " in page and "none given" not in page
         assert f".. figure:: {cls.name}.svg" in page
     for cls in shown[::6]:  # the site draws all of them
-        for ax in laws.figure(cls).axes:
+        for ax in figures.figure(cls).axes:
             assert re.search(r"\[.+\]", ax.get_xlabel()) and re.search(r"\[.+\]", ax.get_ylabel())
             assert ax.lines

@@ -19,7 +19,7 @@ from rotflex_jax.effects import (
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.export import latex, state_space, text
-from rotflex_jax.export.equations import law
+from rotflex_jax.export.equations import equation
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import simulate, simulate_states
 from rotflex_jax.models.model import Model
@@ -124,7 +124,7 @@ def test_every_law_is_good_latex(name):
     """Another program's reader of LaTeX mathematics takes it, and every name of the effect is in it."""
     from matplotlib.mathtext import MathTextParser
 
-    written = law(CATALOG[name])
+    written = equation(CATALOG[name])
     size = MathTextParser("path").parse(f"${written}$")
     assert size.width > 20
     # An equation may leave out a parameter only where its own text leaves it out.
@@ -135,10 +135,10 @@ def test_every_law_is_good_latex(name):
 
 
 def test_laws_read_as_a_person_would_write_them():
-    assert law(CATALOG["quadratic_drag"]) == (
+    assert equation(CATALOG["quadratic_drag"]) == (
         r"\tau = -\mathit{coefficient} \cdot \dot{\varphi} \cdot |\dot{\varphi}|"
     )
-    assert law(CATALOG["coulomb"]) == (
+    assert equation(CATALOG["coulomb"]) == (
         r"\tau = -\mathit{level} \cdot \operatorname{sign} (\dot{\varphi}), \quad "
         r"\text{ holds while } |\tau| \leq \mathit{level}"
     )

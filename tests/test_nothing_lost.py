@@ -169,7 +169,7 @@ def test_rounds_of_an_earlier_start_are_not_overwritten_by_fewer(tmp_path: Path)
     assert len(three) == 3
     assert reached("as it is") == reached("as it is", "+ coulomb at hub") == three
     assert len(reached("as it is", "+ coulomb at hub", "+ lag at input", "+ delay at input")) == 4
-    # Another search, or the same one on another way, counts anew.
+    # Another search, or the same one on another way, counts by itself.
     assert len(reached("as it is", "+ lag at input")) == 2
     assert reached("as it is", digest="b") == ["as it is"]
     file.write_text("{")

@@ -13,7 +13,7 @@ from rotflex_jax.arena.simulator.hidden import DEFAULTS, OUTSIDE
 
 Row = dict[str, Any]
 
-# What intervals may claim; the deviation of an estimate stands for all of them.
+# What intervals may claim; the standard deviation of an estimate stands for all of them.
 CLAIMS = (0.5, 0.68, 0.8, 0.9, 0.95, 0.99)
 
 

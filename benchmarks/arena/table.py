@@ -64,7 +64,7 @@ def show(console: Console, records: list[dict[str, Any]]) -> None:
 
 
 def summary(records: list[dict[str, Any]]) -> str:
-    """The numbers that a release is judged by."""
+    """The figures by which releases are compared."""
     good = [r for r in records if "error" not in r]
     outside = [r for r in good if r.get("outside")]
     seen = [r for r in good if r["wanted"] and not r.get("outside")]

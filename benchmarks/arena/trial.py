@@ -72,8 +72,8 @@ def with_oracle(row: dict[str, Any], train: rf.Recording, test: rf.Recording) ->
     }
 
 
-def judged_again(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with its oracle anew, the search left as it was; the row itself where that fails."""
+def evaluated_again(row: dict[str, Any]) -> dict[str, Any]:
+    """A row with its oracle computed again, the search left as it was; the row itself where that fails."""
     try:
         return with_oracle(row, *recording(row)[0].split(SPLIT))
     except Exception as problem:  # a finished search is worth more than its oracle

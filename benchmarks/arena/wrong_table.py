@@ -67,7 +67,7 @@ def show_worlds(console: Console, records: list[Row]) -> None:
 
 
 def summary(records: list[Row]) -> str:
-    """The numbers that a release is judged by."""
+    """The figures by which releases are compared."""
     lines = []
     for name, rows in groups(records).items():
         hidden = [r for r in rows if r["hidden"]]

@@ -1,6 +1,6 @@
-"""A search that learns and judges by free runs, within a training record alone.
+"""A search that fits and decides by free runs, within a training record alone.
 
-The search of the toolkit judges predictors, whose horizon is short. What acts slowly, a drift of an offset
+The search of the toolkit compares predictors, whose horizon is short. What acts slowly, a drift of an offset
 for instance, hardly shows there and decides a free run of 25 s. Here effects are added one at a time to what
 that search found: each candidate is fitted to one free run over the first part of the record and evaluated by
 one over the rest, then the other way round.

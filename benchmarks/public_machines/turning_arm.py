@@ -1,4 +1,4 @@
-"""The rotary arm: one run with the rigid arm to learn from and others to judge on; one cut in two."""
+"""The rotary arm: one run with the rigid arm to fit and others to evaluate on; one cut in two."""
 
 from __future__ import annotations
 

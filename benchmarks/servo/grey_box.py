@@ -79,7 +79,7 @@ FRICTION: dict[str, tuple[fx.Effect, ...]] = {
     "weight friction": (WeightFriction("hub"),),
     "weight friction, Stribeck": (WeightFriction("hub"), fx.Stribeck("hub", level=0.003, excess=0.01)),
 }
-"""Structures that are fitted everywhere, beside the one that a search finds."""
+"""Structures that are fitted in every case, beside the one that a search finds."""
 
 
 def servo(effects: tuple[fx.Effect, ...] = ()) -> rf.Mechanism:

@@ -33,7 +33,7 @@ class Split:
     Attributes:
         name: What is left out.
         train: Learnt from.
-        validation: Those of them on which a search judges its models.
+        validation: Those of them on which a search compares its models.
         test: Left out.
     """
 
@@ -49,7 +49,7 @@ class Split:
 
 
 def splits(recordings: Sequence[rf.Recording]) -> dict[str, Split]:
-    """Every motion and every gain left out once; within the rest, a search judges on the next one."""
+    """Every motion and every gain left out once; within the rest, a search validates on the next one."""
 
     def one(name: str, of: Callable[[rf.Recording], object], left_out: object, judged: object) -> Split:
         train = tuple(r for r in recordings if of(r) != left_out)

@@ -7,10 +7,10 @@ import math
 import re
 
 from generate.docstrings import plain
-from generate.laws import figure
+from generate.effect_figures import figure
 from rotflex_jax.effects import CATALOG, LearnedTorque
 from rotflex_jax.effects.base import KINDS, Effect
-from rotflex_jax.export.equations import law
+from rotflex_jax.export.equations import equation
 from rotflex_jax.parameters import Specification
 
 # What the figure shows, by kind, where that is not plain from its axes.
@@ -58,20 +58,20 @@ def overview(on_site: bool = False) -> str:
         *([] if on_site else ["([how to build it](../CONTRIBUTING.md)) has a page with a drawing for each."]),
         "[An effect of your own](add_effect.md) takes part in everything from the moment it is registered.",
         "",
-        "A law gives the torque *on* its port in the port's positive direction; only the level of dry",
+        "An equation gives the torque *on* its port in the port's positive direction; only the level of dry",
         "friction is a positive number that opposes motion. The places are those of the flexible joint; on",
         "[another machine](own_machine.md) they are read by what acts there.",
         "",
     ]
     for kind in KINDS:
         lines += [f"## {kind.kind_label.capitalize()}", "", kind.kind_meaning, ""]
-        lines += ["| effect | what it is | law | searched at |", "|---|---|---|---|"]
+        lines += ["| effect | what it is | equation | searched at |", "|---|---|---|---|"]
         for cls in (c for c in shown() if c.kind() == kind.kind_label):
             where = ", ".join(f"`{place}`" for place in cls.searched) or "no"
             file = f"../{cls.__module__.replace('.', '/')}.py"
             link = f"effects/{cls.name}.rst" if on_site else file
-            law = cls.equation.replace("|", r"\|")
-            lines.append(f"| [`{cls.name}`]({link}) | {cls.title} | `{law}` | {where} |")
+            written = cls.equation.replace("|", r"\|")
+            lines.append(f"| [`{cls.name}`]({link}) | {cls.title} | `{written}` | {where} |")
         lines.append("")
     if on_site:
         lines += ["```{toctree}", ":hidden:", "", *(f"effects/{cls.name}" for cls in shown()), "```", ""]
@@ -88,10 +88,10 @@ def _page(cls: type[Effect]) -> str:
         f".. py:class:: rotflex_jax.effects.{cls.__name__}({_signature(cls)})",
     ]
     lines += [f"   :canonical: {cls.__module__}.{cls.__qualname__}", "", first, ""]
-    for equation in law(cls).split(r", \quad "):
-        lines += [".. math::", "", f"   {equation}", ""]
+    for line in equation(cls).split(r", \quad "):
+        lines += [".. math::", "", f"   {line}", ""]
     caption = OWN_CAPTIONS.get(cls.name) or CAPTIONS.get(cls.kind(), "")
-    about = plain(f"Figure of the law of {cls.title}")
+    about = plain(f"Figure of the equation of {cls.title}")
     lines += [f".. figure:: {cls.name}.svg", f"   :alt: {about}", "   :width: 34em", "", f"   {caption}", ""]
     for paragraph in prose:
         lines += [paragraph, ""]

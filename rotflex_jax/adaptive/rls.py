@@ -116,7 +116,7 @@ class Kalman(AdaptiveFilter):
 
         w[k+1] = w[k] + N(0, q),    y[k] = w[k] phi[k] + N(0, r)
 
-    With `q = 0` and `r = 1` it is RLS without forgetting and `p0` is its `delta`. Unlike forgetting,
+    With `q = 0` and `r = 1` it is RLS without forgetting and `p0` is its `delta`. Other than forgetting,
     `q` lets P grow by a fixed amount per sample, so that a quiet input does no quick harm. The state
     holds the covariance of the weights, in their units if `r` and `q` are.
 

@@ -49,12 +49,12 @@ def grid(
 ) -> Tuned:
     """The objective of `tune` at every combination of given settings.
 
-    For two settings an alternative to the gradient, which shows the objective everywhere. Not for four or
+    For two settings an alternative to the gradient, which shows the whole objective. Not for four or
     more: the number of combinations grows exponentially.
 
     Args:
         build: as in `tune`.
-        axes: numbers to try, by name of the setting.
+        axes: values to try, by name of the setting.
         basis: as in `tune`.
         recordings: as in `tune`.
         channel: as in `tune`.

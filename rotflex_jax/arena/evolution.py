@@ -162,7 +162,7 @@ WINDOW = 2.0
 FIRST, AGAIN, MOST = 3200, 800, 4
 # Without an effect that stays, the sum of the logarithms of mean squares over validation data rises so much.
 NEEDED = 0.04
-# The box: what a fit has free is within these factors of the start, an effect's numbers of its typical size.
+# Bounds: what a fit has free is within these factors of the start, an effect's parameters of their sizes.
 _FREE, _AMPLITUDE, _SHAPE = (0.5, 2.0), 3.0, (0.4, 2.5)
 _DAMPER = 0.02
 
@@ -249,7 +249,7 @@ def _squares_of_many(structure: Mechanism, solver: Solver) -> Callable[..., Any]
 
 
 def evolved(train: Sequence[Recording], validation: Sequence[Recording], model: Model) -> dict[str, Any]:
-    """All effects at once in one model, its numbers by CMA-ES on short free runs; what is not needed leaves.
+    """All effects at once in one model, its parameters by CMA-ES on short free runs, less what is not needed.
 
     Without each effect in turn the error on validation data says whether it is needed. Those that are not are
     switched off, three times; after the first two the evolution goes on with the others.
@@ -280,8 +280,8 @@ def evolved(train: Sequence[Recording], validation: Sequence[Recording], model: 
             seen = (np.arange(r.u.shape[1]) >= r.unseen).astype(float)
             parts = []
             for a in range(0, len(values), _LANES):
-                lanes = [np.resize(x[a : a + _LANES], (_LANES, *x.shape[1:])) for x in (values, gates)]
-                total = np.asarray(many(*map(jnp.asarray, lanes), r.first, r.u, r.y, r.Ts, seen)).sum(axis=1)
+                filled = [np.resize(x[a : a + _LANES], (_LANES, *x.shape[1:])) for x in (values, gates)]
+                total = np.asarray(many(*map(jnp.asarray, filled), r.first, r.u, r.y, r.Ts, seen)).sum(axis=1)
                 parts.append(np.log(total / (seen.sum() * len(r.u)))[: len(values) - a])
             return np.nan_to_num(np.concatenate(parts).sum(axis=1), nan=1e6, posinf=1e6)
 

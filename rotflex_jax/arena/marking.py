@@ -128,7 +128,7 @@ def parameter_errors(
         K: stiffness of the plant's joint [N m/rad].
 
     Returns:
-        Full name -> true value, estimate with its deviation, error [%], and whether the 95 % interval
+        Full name -> true value, estimate with its standard deviation, error [%], whether the 95 % interval
         holds the truth.
     """
     table = dict[str, dict[str, Any]]()

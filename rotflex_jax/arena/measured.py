@@ -1,4 +1,4 @@
-"""Every measured machine: its model, and all ways to learn from some recordings and judge on others.
+"""Every measured machine: its model, and all ways to fit some recordings and evaluate on others.
 
 A machine without a model in `rotflex_jax.joints` is listed too and left out with that reason; it takes part
 as soon as there is a mechanism of its name.
@@ -93,7 +93,7 @@ def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
     """From each run to the others, then all together.
 
     Of two runs, the end of the one that is learnt from decides, or else the first half of the other one,
-    whose second half judges. Of three, the next one decides and the third judges.
+    whose second half is the test. Of three, the next one decides and the third is the test.
     """
     names, ways = list(runs), list[Way]()
     for k, name in enumerate(names):
@@ -101,8 +101,8 @@ def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
         if len(names) == 2:
             other = runs[following]
             ways.append(learnt(f"{name} to {following}", [run], [other]))
-            decides, judges = other.split(0.5)
-            ways.append(Way(f"{name} and half of {following} to the rest", (run,), (decides,), (judges,)))
+            decides, tests = other.split(0.5)
+            ways.append(Way(f"{name} and half of {following} to the rest", (run,), (decides,), (tests,)))
         else:
             last = {n: r for n, r in runs.items() if n not in (name, following)}
             title = f"{name}, decided on {following}, to {' and '.join(last)}"
@@ -128,8 +128,8 @@ def _silverbox(_: list[rf.Recording]) -> list[Way]:
 def by_itself(name: str, run: rf.Recording) -> Way:
     """Learnt from the first half of a run, decided on what follows and evaluated on its end."""
     train, rest = run.split(0.5)
-    decides, judges = rest.split(2 * SHARE - 1)
-    return Way(f"{name}, first half to its end", (train,), (decides,), (judges,))
+    decides, tests = rest.split(2 * SHARE - 1)
+    return Way(f"{name}, first half to its end", (train,), (decides,), (tests,))
 
 
 def _link(stage: int) -> Callable[[list[rf.Recording]], list[Way]]:

@@ -29,7 +29,7 @@ ONE, TWO, NOTHING, OUT, WORLD, MEASURED = (
 # A set of records has them in these shares, in an order of its own.
 _CYCLE = (ONE, NOTHING, OUT, ONE, TWO, WORLD, ONE, ONE, NOTHING, OUT, ONE, ONE)
 FS, SHARE, TEST_SECONDS, WINDOW_SECONDS = 500.0, 0.7, 6.0, 2.0
-"""Sampling rate [Hz]; share of a record for training; what follows it and only judges [s]; its runs [s]."""
+"""Sampling rate [Hz]; share of a record for training; of the test data that follow [s]; its runs [s]."""
 
 # Strengths and widths are drawn log-uniformly about those of the simulator's table.
 _SIZE, _WIDTH = (0.6, 1.6), (0.7, 1.4)
@@ -47,7 +47,7 @@ class Problem:
         train: Recordings to fit.
         validation: Recordings to decide on.
         model: The textbook model.
-        test: Recordings that judge the free run of a model.
+        test: Recordings on which the free run of a model is scored.
         hidden: Effects that should be named.
         forgiven: Names that are neither right nor wrong: those of what else is wrong in a wrong world.
         noise: Standard deviation of each channel of the test recordings.
@@ -98,8 +98,8 @@ def _alone(r: rf.Recording, source: str = "arena") -> rf.Recording:
 
 
 def _noise(tests: tuple[rf.Recording, ...], model: Model) -> dict[str, float]:
-    deviation = sensor_noise(list(tests), model)
-    return dict(zip(model.mechanism.channels, map(float, deviation), strict=True))
+    noise = sensor_noise(list(tests), model)
+    return dict(zip(model.mechanism.channels, map(float, noise), strict=True))
 
 
 def drawn(

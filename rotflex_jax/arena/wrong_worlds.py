@@ -30,7 +30,7 @@ from rotflex_jax.arena.simulator.seen import distinctness
 Ranges = Mapping[str, tuple[float, float]]
 
 VISIBLE = 8.0
-"""What only the hidden effect explains, over the sensor's deviation, in training and in validation data."""
+"""What only the hidden effect explains over the sensor's noise, in training and in validation data."""
 
 _HUB = {"level": (0.012, 0.06)}
 _FINE = {"level": (0.003, 0.015)}
@@ -86,7 +86,7 @@ class Beside:
 
     Args:
         name: of what it is.
-        values: its numbers.
+        values: its parameters.
         names: places that would be a right name for it, or that take it up.
     """
 

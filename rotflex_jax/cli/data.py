@@ -91,7 +91,7 @@ def check(
 
 
 def _say_what_can_be_known(model: "Model", recording: "Recording", joint: str) -> None:
-    """Which parameters of a model a recording determines, at the numbers that the model starts with."""
+    """Which parameters of a model a recording determines, at the values that the model starts with."""
     from rotflex_jax.fit.identifiable import identifiable
 
     if not model.mechanism.free_names:
@@ -99,9 +99,9 @@ def _say_what_can_be_known(model: "Model", recording: "Recording", joint: str) -
     try:
         with terminal.progress("What these sensors can determine"):
             found = identifiable(model, recording)
-    except InputError as error:  # the recording may be good where the numbers of the model are not
+    except InputError as error:  # the recording may be good where the parameters of the model are not
         terminal.message(f"note: {error}")
         return
-    terminal.message(f"What can be known of {joint}, at its own numbers:")
+    terminal.message(f"What can be known of {joint}, at its own parameters:")
     for sentence in found.sentences:
         terminal.message(f"  {sentence}")

@@ -206,7 +206,7 @@ def _continued(
 
     enable_fast_start()
     played = columns.load(recording)
-    with terminal.progress("Judging") as step:
+    with terminal.progress("Evaluating") as step:
         e = e.with_recording(played).with_next_segment(step)
     _report(e, state, save, json_file)
 

@@ -121,7 +121,7 @@ def _repeating(
 
 
 def _named(step: str) -> str:
-    """A line of progress with effects as they are called everywhere else."""
+    """A line of progress with effects as they are called elsewhere."""
     from rotflex_jax.effects.labels import with_titles  # long after `--help` was answered
 
     return with_titles(step)

@@ -76,12 +76,12 @@ register(
     )
 )
 register(SINDy())
-register(SINDy("sindy_ensemble", "a sparse law of motion, median of an ensemble", "ensemble"))
-register(SINDy("sindy_weak", "a sparse law of motion, weak form", "weak"))
+register(SINDy("sindy_ensemble", "sparse equations of motion, median of an ensemble", "ensemble"))
+register(SINDy("sindy_weak", "sparse equations of motion, weak form", "weak"))
 register(
     SINDy(
         "sindy_free_run",
-        "a sparse law of motion, weak form, its numbers refined for free runs",
+        "sparse equations of motion, weak form, coefficients refined for free runs",
         "weak",
         free_runs=True,
     )

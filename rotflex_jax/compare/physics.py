@@ -22,7 +22,7 @@ class Textbook:
     """The mechanism as it was given, nothing fitted."""
 
     name: str = "textbook"
-    title: str = "the mechanism with its given numbers"
+    title: str = "the mechanism with its given parameters"
     family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:

@@ -11,7 +11,7 @@ import scipy
 from jaxtyping import Float
 
 from rotflex_jax.compare.method import Fitted, Progress, require_one_sampling_period
-from rotflex_jax.compare.sparse_law import Piece, SparseLaw, Terms, costs, refined
+from rotflex_jax.compare.sparse_equations import Piece, SparseEquations, Terms, costs, refined
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -116,7 +116,7 @@ class SINDy:
     """
 
     name: str = "sindy"
-    title: str = "a sparse law of motion, thresholded least squares"
+    title: str = "sparse equations of motion, thresholded least squares"
     variant: Literal["plain", "ensemble", "weak"] = "plain"
     smoothings: tuple[Smoothing, ...] = (
         ("savgol", 15),
@@ -169,10 +169,10 @@ class SINDy:
                 ps, self._rows(terms, train, states, smoothing, (0.0, self.share)), threshold
             )
             W, remark = self._refined(terms, W, first, train, states, say)
-        law = SparseLaw(terms, W, train[0].Ts)
+        found = SparseEquations(terms, W, train[0].Ts)
         chosen = f"{smoothing[0]} over {smoothing[1]:g} samples, threshold {threshold:g}"
         words = f"{chosen}, order {order}, powers to {degree}; {_describe_sensitivity(tried)}{remark}"
-        return Fitted(law, int(np.count_nonzero(W)), words, law.predict)
+        return Fitted(found, int(np.count_nonzero(W)), words, found.predict)
 
     def _refined(
         self,

@@ -48,7 +48,7 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
     within seconds. Free runs over the first seconds determine them, together with the first state, while all
     else is as trained. Errors of a free run are alike for half a second or so: a block of that length counts
     as one measurement against what offsets usually are. The recordings share the size of their errors, and a
-    recording no longer than these seconds has nothing left to judge its offsets by.
+    recording no longer than these seconds has nothing left to compare its offsets with.
 
     Args:
         problem: Free runs over recordings that the hypothesis was not fitted to.

@@ -239,7 +239,7 @@ def advice(coloured: dict[str, float]) -> tuple[str, ...]:
     return (
         f"What remains is no torque: the free-run errors of {listed} are an AR(1) with that coefficient from "
         "one sample to the next, whatever the motion. Sensor noise is taken for white here; look for a "
-        "filter or a drifting zero of the sensor, and judge the model by its free runs.",
+        "filter or a drifting zero of the sensor, and compare models by their free runs.",
     )
 
 

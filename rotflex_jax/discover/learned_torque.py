@@ -46,7 +46,7 @@ class LearnedTorqueResult:
     Attributes:
         at: Port.
         kept: Whether the validation data are better explained with it.
-        effect: The learned map; zero everywhere where it was not kept.
+        effect: The learned map; zero where it was not kept.
         before: The model without it, refitted and evaluated.
         after: With it; the same as `before` where it was not kept.
         held_out_gain_nats: What it gains in log-likelihood of the validation data [nat].

@@ -63,7 +63,7 @@ def excluding(
 
 
 def conditional_note(found: Sequence[ConditionalInterval]) -> tuple[str, ...]:
-    """What follows for a reader, as a sentence with the numbers of each; nothing where all agree."""
+    """What follows for a reader, as a sentence with the values of each; nothing where all agree."""
     if not found:
         return ()
     listed = "; ".join(

@@ -248,7 +248,7 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
 
 
 def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
-    """Which numbers of an effect the recordings do not speak for."""
+    """Which parameters of an effect the recordings do not speak for."""
     head = f"{location.port}.{location.effect}."
     return tuple(
         r.sentence for r in remarks if r.kind == "beyond the recordings" and r.parameter.startswith(head)

@@ -2,7 +2,7 @@
 
 A new effect is a frozen dataclass that derives from one kind. A kind says by the attributes of `Effect` where
 it acts, which states it has and how a step treats it; the other packages ask these attributes, so that a new
-kind is this file, its step in `mechanism/` and its drawing in `docs/generate/laws.py`.
+kind is this file, its step in `mechanism/` and its drawing in `docs/generate/effect_figures.py`.
 
 Sign: an effect returns the torque that acts *on* the port in its positive direction, except the `limit` of a
 dry friction, which is the (non-negative) level of the torque that opposes sliding.

@@ -95,7 +95,7 @@ class CubicSpring(Force):
 @register
 @dataclasses.dataclass(frozen=True)
 class QuadraticSpring(Force):
-    """The quadratic term of a spring that is stiffer to one side, as two unlike springs give.
+    """The quadratic term of a spring that is stiffer to one side, as two different springs give.
 
         tau = -stiffness position^2
 

@@ -337,15 +337,15 @@ class RivalSet:
             cost += 0.5 * float(np.sum(w**2))
             residuals.append(w)
         precision = self._precision(h, len(runs))
-        away = unknowns - np.concatenate([self.prior_mean[h], np.zeros(D - m)])
+        difference = unknowns - np.concatenate([self.prior_mean[h], np.zeros(D - m)])
         known = np.isfinite(cost) and np.all(np.isfinite(information))
         if not known:
             cost = math.inf
         return RivalPosterior(
             unknowns,
             cost,
-            0.5 * float(away @ precision @ away),
-            gradient + precision @ away,
+            0.5 * float(difference @ precision @ difference),
+            gradient + precision @ difference,
             information if known else np.zeros((D, D)),
             precision,
             tuple(residuals),

@@ -36,14 +36,14 @@ _TOKEN = re.compile(
 )
 
 
-def law(effect: Effect | type[Effect]) -> str:
+def equation(effect: Effect | type[Effect]) -> str:
     r"""The equation of an effect in LaTeX, without dollar signs.
 
     Position and speed of the effect's port are written as phi and its rate, the true value at a sensor
     as y_0; parameters keep their names, in italics.
 
     >>> from rotflex_jax.effects import CubicSpring
-    >>> print(law(CubicSpring))
+    >>> print(equation(CubicSpring))
     \tau = -\mathit{stiffness} \cdot \varphi^{3}
     """
     return to_latex(effect.equation, specifications(effect))
@@ -161,7 +161,7 @@ def latex(model: Mechanism | Model) -> str:
         place = effect.location
         lines += [
             rf"% {one_line(f'{effect.title} {place}')}",
-            rf"\[ {law(effect)} \quad \text{{({_words(place)})}} \]",
+            rf"\[ {equation(effect)} \quad \text{{({_words(place)})}} \]",
         ]
     lines += ["", r"\begin{tabular}{llll}", r"place & parameter & value & meaning \\ \hline"]
     for effect in mechanism.effects:

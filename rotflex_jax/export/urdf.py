@@ -36,7 +36,7 @@ def to_urdf(
         links: inertia about the axis, weight as a mass off the axis;  joints: damping and friction
 
     Each coordinate is a joint, one behind the other about one axis, with a link. A URDF has neither motors
-    nor springs: the law of each motor is named, for whoever applies its torque as effort of the joint, and
+    nor springs: the equation of each motor is given, for whoever applies its torque as effort of the joint;
     springs are left out. Not for a flexible joint, then, unless the simulator adds its spring: `to_mjcf`.
 
     Args:

@@ -309,8 +309,8 @@ def _unseen(
     n = moving // 2
     speed = np.sqrt(np.mean(np.square(X[:, n:moving]), axis=0))
     resting = bool(np.all(np.abs(start[n:moving]) < AT_REST * speed))
-    away = np.where(resting or recording.continues is not None, 0.0, X[:, moving:] - start[moving:])
-    return away.T @ away / len(X)
+    error = np.where(resting or recording.continues is not None, 0.0, X[:, moving:] - start[moving:])
+    return error.T @ error / len(X)
 
 
 def _finite(covariance: np.ndarray) -> np.ndarray:

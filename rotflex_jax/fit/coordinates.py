@@ -19,7 +19,7 @@ RANK_TOLERANCE = 1e-10
 
 
 class Point(Protocol):
-    """Numbers that a fit moves: a dataclass with at least these fields."""
+    """Parameters that a fit moves: a dataclass with at least these fields."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 

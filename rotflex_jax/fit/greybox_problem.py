@@ -42,7 +42,7 @@ LAST_STAGE_TOLERANCE, EARLY_STAGE_TOLERANCE = 1e-3, 1.0
 PROGRESS_STEPS, LEAST_PROGRESS = 8, 0.1
 
 # States that the first samples show, or that a run over the whole recording leaves in memories, follow the
-# parameters: the last stage is repeated with new ones until they settle, so many times at least and at most.
+# parameters: the last stage is repeated with new ones until they converge, at least and at most so often.
 LEAST_REPETITIONS, MOST_REPETITIONS, SETTLED = 4, 6, 0.1
 
 # The scale of a channel is this share of the sensor's noise at least.
@@ -70,7 +70,7 @@ EQUAL_COST = 0.1
 _STATUS = {
     Status.CONVERGED: "converged",
     Status.DIVERGED: "diverged: the model error at the start is not finite",
-    Status.UNSOLVED: "stopped: a step has no finite solution; the model diverges near these numbers",
+    Status.UNSOLVED: "stopped: a step has no finite solution; the model diverges near these parameters",
 }
 
 
@@ -111,7 +111,7 @@ class FitAttempt:
     """Where a sequence of stages ended.
 
     Attributes:
-        point: The numbers.
+        point: The parameters and first states.
         stage: The last one.
         K: Gains of the last runs.
         status: "converged", or why not.

@@ -22,11 +22,7 @@ from rotflex_jax.fit.dataset import (
     with_common_constants,
 )
 from rotflex_jax.fit.plausibility import check_signs
-from rotflex_jax.fit.problem import (
-    LARGEST_STEP,
-    directions,
-    normal_equations,
-)
+from rotflex_jax.fit.problem import LARGEST_STEP, directions, normal_equations
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
@@ -139,7 +135,7 @@ def minimise_starts(
     Side by side they would wait for the slowest, and a run with all its sums fills a core as it is.
 
     Args:
-        structure: Mechanism without numbers; static.
+        structure: Mechanism without values; static.
         solver: Integration rule; static.
         mesh: Devices that the starts are shared out to; None for one device; static.
         z: Unconstrained coordinates of the free parameters at each start.

@@ -4,7 +4,7 @@
 
 has the cost `r'r / 2`, the slope `J'r = g` and the product `J'J = H` of the whole problem, so a solver of the
 Gauss-Newton kind takes the same steps as on the residuals of all samples, of which it sees none. The scale
-of the channels is held while it works, and the whole repeated with new ones until these settle.
+of the channels is held while it works, and the whole repeated with new ones until these converge.
 """
 
 import functools

@@ -88,7 +88,7 @@ def _static_damping(effect: Effect) -> float:
 
 # Moves over each of these shares of the recording, of at most so many samples, are compared.
 MOVE_SHARES, MAX_SIGN_SAMPLES = (0.001, 0.003, 0.01, 0.03), 20_000
-# RecordingSamples of a block of the linear run.
+# Samples of a block of the linear run.
 LINEAR_RUN_BLOCK = 64
 # A channel that moves against the model at all shares, correlated at least this much.
 OPPOSED_CORRELATION = -0.6

@@ -54,7 +54,7 @@ def predicted(
     """Outputs of R recordings, predicted with gain `K`; a free run where it is zero.
 
     Args:
-        structure: Mechanism without numbers.
+        structure: Mechanism without values.
         solver: Integration rule.
         values: Parameter values of each recording.
         x0: First positions and speeds.
@@ -112,9 +112,9 @@ def normal_equations(
     """Half the squared error of each channel of a run, the gradient of their sum, and `J'J`.
 
     Args:
-        structure: Mechanism without numbers; static.
+        structure: Mechanism without values; static.
         solver: Integration rule; static.
-        numbers: Where it runs; a free run where the gain is None.
+        numbers: Parameters and states where it runs; a free run where the gain is None.
         ways: The D directions.
         samples: The recording.
         scale: Size of the error of each channel.
@@ -143,7 +143,7 @@ def directions(
     """Directions of the coordinates of some parameters, then of that many positions and speeds.
 
     Args:
-        structure: Mechanism without numbers.
+        structure: Mechanism without values.
         slopes: Derivative of each value by its coordinate.
         free: Indices of the parameters.
         states: How many entries of the first state are free.
@@ -160,7 +160,7 @@ class RunLayout:
     """What runs with slopes are compiled for; hashable, so it can be static.
 
     Attributes:
-        structure: Mechanism without numbers.
+        structure: Mechanism without values.
         solver: Integration rule.
         states: How many entries of each first state are free.
         mesh: Devices that the recordings are shared out to; None for one device.

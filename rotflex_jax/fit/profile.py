@@ -5,7 +5,7 @@
 The quantity is held by a row of its own in the least-squares problem, `(g - c) / w` with a width far below
 its standard deviation. What the minimum of that sum has as its `g` is where the profile is known exactly,
 whatever the width: given its own `g`, nothing lowers the cost. Every point goes through the compiled program
-of the fit, with the numbers of its neighbour as a start.
+of the fit, with the parameters of its neighbour as a start.
 """
 
 import contextlib

@@ -199,7 +199,7 @@ def least_squares(
         blocks: How many, for "cv".
 
     Raises:
-        InputError: Nothing to fit, unlike sampling periods, no such channel, a negative ridge.
+        InputError: Nothing to fit, different sampling periods, no such channel, a negative ridge.
 
     Source: Golub and Van Loan 2013, Matrix Computations, sections 5.3 and 5.5.
 

@@ -137,7 +137,7 @@ def flexible_joint(
 
     Angles and voltage determine torques only up to a common factor, so the arm's inertia is
     trusted, and of the motor everything but its torque constant. Free are hub inertia, stiffness,
-    torque constant and both dampers. From the deflection alone four numbers describe all that is linear
+    torque constant and both dampers. From the deflection alone four parameters describe all that is linear
     between voltage and deflection, so that a model without dry friction leaves one combination of the five
     open, and they have no intervals. Friction at the hub closes it: where it holds depends on the hub's own
     motion, which a wrong torque constant would scale.

@@ -269,7 +269,7 @@ class EffectShare:
         linear: Size of the change of `h1` as a share of the linear response, less its expected noise.
         quadratic: Size of the change of `h2` as a share of the linear response, likewise.
         z: Root mean square of both changes in standard errors; chance alone gives about one. Zero where
-            nothing changed at all, infinite where the change is the same everywhere, as a linear effect's.
+            nothing changed at all, infinite where the change is the same at all inputs, as a linear effect's.
     """
 
     effect: Effect

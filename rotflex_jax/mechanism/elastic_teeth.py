@@ -179,7 +179,7 @@ def _until_zero(o: Oscillator, span: Array) -> Array:
     """Time until the torque first falls to zero, or `span`.
 
     An oscillator whose torque is above zero for a whole period stays so, as it decays. Exponentials are
-    evaluated twice only: from one look to the next the motion is a product, between them a cubic.
+    evaluated twice only: from one evaluation to the next the motion is a product, between them a cubic.
     """
     square = o.stiff - o.loss * o.loss / 4
     period = 2 * np.pi / jnp.sqrt(jnp.where(square > 0, square, 1.0))

@@ -35,7 +35,7 @@ class Scenario:
     """Effects that are added to the paper's joint.
 
     Attributes:
-        about: In words, with numbers.
+        about: In words, with values.
         odd: Whether the negative voltage gives the negative motion: then all kernels of even degree are
             zero.
         effects: The effects for a port of the arm's friction, "joint" or "arm".
@@ -86,7 +86,7 @@ SCENARIOS: dict[str, Scenario] = {
         lambda at: (QuadraticSpring("joint", stiffness=3.0), CubicSpring("joint", stiffness=10.0)),
     ),
     "S5p": Scenario(
-        "unlike springs (3 on the left, 2 on the right, in the holes C and 3), friction and dead zone as "
+        "different springs (3 on the left, 2 on the right, in the holes C and 3), friction and dead zone as "
         "in S1",
         False,
         lambda at: (*_unlike_springs(), *_S1(at)),

@@ -59,6 +59,6 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
             UNFINISHED.discard(part)
     except OSError as error:
         raise InputError(
-            f"{path} cannot be written ({error.strerror or error}); make room or name another place."
+            f"{path} cannot be written ({error.strerror or error}); make space or name another place."
         ) from error
     return path

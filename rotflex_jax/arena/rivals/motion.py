@@ -1,4 +1,4 @@
-r"""Positions, speeds and accelerations from counted angles, and the linear joint to judge them by.
+r"""Positions, speeds and accelerations from counted angles, and the linear joint to compare them with.
 
 Differentiating an encoder twice is what every regression of accelerations stands or falls with.
 The smoother is a cubic Savitzky-Golay filter; its window is the one that leaves the torque balance of

@@ -14,7 +14,7 @@ from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.effects import CATALOG
 
 # A smoothed residual repeats itself, and its motion is not quite the true one: with nothing hidden up to
-# 25 log-units are gained, with samples discounted for their correlation. A simpler law wins at this share.
+# 25 log-units are gained, with samples discounted for their correlation. A simpler model wins at this share.
 ROUNDS, MARGIN, PARSIMONY = 3, 30.0, 0.9
 
 
@@ -84,7 +84,7 @@ def select(train: Regression, validation: Regression, candidates: Sequence[Torqu
         gain, best, direction = max(trials, key=lambda t: t[0])
         if gain < MARGIN:
             break
-        # The rule of parsimony that the search itself keeps: a simpler law that says nearly as much.
+        # The rule of parsimony that the search itself keeps: a simpler model that says nearly as much.
         simpler = [
             t
             for t in trials

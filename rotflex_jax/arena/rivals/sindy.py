@@ -88,7 +88,7 @@ def _listed(m: Motion) -> list[TorqueTerm]:
 
 
 def _normalised(features: Values) -> tuple[Values, Callable[[Values], Values]]:
-    """Columns of unit deviation, the others without what the linear ones can say in their place.
+    """Columns of unit standard deviation, the others without what the linear ones can say in their place.
 
     The span is the same; a sine of small angles is no longer a second name for the angle.
 
@@ -132,7 +132,7 @@ def _features(
         for k in range(t.columns.shape[2]):
             for row in range(2):
                 shape = t.columns[:, row, k]
-                # A level that Coulomb's and Stribeck's law share is one column, and so is a torque that acts
+                # A level that Coulomb and Stribeck friction share is one column, and so is a torque that acts
                 # on both angles; an error of a sensor is two.
                 again = not np.any(shape) or any(np.array_equal(shape, c) for c in columns)
                 if again if kept is None else (i, k, row) not in kept:
@@ -177,5 +177,5 @@ def _against_bumps(signal: Values, m: Motion) -> Values:
 
 
 def _merged(rounds: list[Place]) -> list[Place]:
-    """Stribeck's law has Coulomb's level: where both are named at a port, Stribeck's stands for both."""
+    """Stribeck's friction has Coulomb's level: where both are named at a port, Stribeck's stands for both."""
     return [p for p in rounds if not (p[0] == "coulomb" and ("stribeck", p[1]) in rounds)]

@@ -29,7 +29,7 @@ LATE = (0.002, 0.0045, 0.01)
 LAGS = (0.003, 0.006, 0.012)
 COOLING = (10.0, 30.0, 90.0)
 MODES = {"hub": (12.0, 18.0, 25.0), "arm": (7.0, 10.0, 14.0)}
-# Common to all shapes of a law: Bouc and Wen's beta, the rise of LuGre's friction at rest, damping ratio.
+# Common to all shapes of an effect: Bouc and Wen's beta, the rise of LuGre's friction at rest, damping ratio.
 BETA, RISE, DAMPING = 0.5, 0.5, 0.03
 
 
@@ -39,7 +39,7 @@ class TorqueTerm(NamedTuple):
     Attributes:
         place: name and port.
         columns: (N, 2, k) shapes of the torque on (theta, alpha), one per number to be fitted.
-        shape: the numbers that are fixed by it, for the reader.
+        shape: the parameters that are fixed by it, for the reader.
     """
 
     place: Place
@@ -185,7 +185,7 @@ def _of_sensors(m: Motion, accelerations: bool) -> Iterator[TorqueTerm]:
 def _hysteresis(v: Values, level: Values, width: float, release: float, Ts: float) -> Values:
     """State along a measured motion of ``x' = v / width - part |v| / (width level) x``.
 
-    `part` is one while the torque builds up and `release` while it goes back: one for Dahl's law, whose level
+    `part` is one while the torque builds up and `release` while it goes back: one for Dahl's, whose level
     is one, and for LuGre's, whose level depends on the speed; ``2 beta - 1`` for Bouc and Wen's.
     """
     x, out = 0.0, np.empty_like(v)

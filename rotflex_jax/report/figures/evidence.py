@@ -204,7 +204,7 @@ def _comparable(discovery: SearchResult) -> dict[str, list[Estimate | None]]:
 @figure(
     "parameters",
     section="parameters",
-    caption="Missing physics bends the parameters that are there; they settle once it is added. "
+    caption="Missing physics bends the parameters that are there; they stop changing once it is added. "
     "Bars are 95 % intervals; parameters near zero are only in the table.",
     description="Parameters of each model relative to their final values, with intervals.",
 )

@@ -1,4 +1,4 @@
-"""One figure for each effect: its law at the values an effect has by default."""
+"""One figure for each effect: its equation at the values an effect has by default."""
 
 import math
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from rotflex_jax.text.plotting import blank, styled
 HELD = {"color": FINAL, "alpha": 0.25, "lw": 7, "solid_capstyle": "butt"}
 LINE = {"color": FINAL, "lw": 1.8}
 OTHER = {"color": MUTED, "lw": 1.2, "ls": "--"}
-# Ranges over which a law is drawn where one of its own numbers says how far it reaches.
+# Ranges over which an equation is drawn where one of its own parameters says how far it reaches.
 WIDE = {"joint_play": 0.02, "cogging": math.pi / 2, "gravity": math.pi, "cubic_spring": 0.2}
 Draw = Callable[[Axes, Effect], None]
 
@@ -73,7 +73,7 @@ def _load_friction(ax: Axes, effect: Effect) -> None:
 
 
 def _force(ax: Axes, effect: Effect) -> None:
-    """Over the position or the speed, whichever the law depends on."""
+    """Over the position or the speed, whichever the equation depends on."""
     assert isinstance(effect, Force)
     reach = WIDE.get(effect.name, 0.3)
     x = np.linspace(-reach, reach, 400)
@@ -102,7 +102,7 @@ def _loop(ax: Axes, effect: Effect) -> None:
 
 
 def _with_memory(effect: Memory, t: np.ndarray, *signals: np.ndarray) -> np.ndarray:
-    """Torque of a law with memory along a motion: position, speed, drive."""
+    """Torque of an effect with memory along a motion: position, speed, drive."""
 
     def step(z: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
         return z + (t[1] - t[0]) * effect.flow(z, *now), effect.force(z, *now)
@@ -189,7 +189,7 @@ def _late(ax: Axes, effect: Effect) -> None:
 
 
 def _stamped(x: str, entry: str) -> Draw:
-    """A linear law: torque over what its one entry multiplies."""
+    """A linear effect: torque over what its one entry multiplies."""
 
     def draw(ax: Axes, effect: Effect) -> None:
         assert isinstance(effect, Linear)

@@ -1,4 +1,4 @@
-"""Terms of a sparse law of motion, the motion that it makes, and free runs over many stretches at once."""
+"""Terms of sparse equations of motion, their simulation, and free runs over many stretches at once."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ class Terms:
 
     Attributes:
         channels: Names of the outputs.
-        order: 2 where the law gives accelerations of the outputs, 1 where it gives their rates.
+        order: 2 where the equations give accelerations of the outputs, 1 where they give their rates.
         degree: 3 for powers of outputs and speeds, 1 for none.
         width: Speed within which the sign turns, for each output.
         held: Whether the input is held between samples, or runs on smoothly.
@@ -73,8 +73,8 @@ class Terms:
 
 
 @dataclasses.dataclass(frozen=True)
-class SparseLaw:
-    """A law of motion with few terms, as a simulator.
+class SparseEquations:
+    """Equations of motion with few terms, as a simulator.
 
     Attributes:
         terms: Library.
@@ -114,7 +114,7 @@ class SparseLaw:
     def _check(self, recording: Recording) -> None:
         if abs(recording.Ts / self.Ts - 1) > 1e-6:
             raise InputError(
-                f"The law was fitted at a sampling period of {self.Ts:g} s, but the recording has "
+                f"The equations were fitted at a sampling period of {self.Ts:g} s, but the recording has "
                 f"{recording.Ts:g} s; fit it to a recording of that period."
             )
 
@@ -154,7 +154,7 @@ def motions(
     u: Float[np.ndarray, "M N"],
     Ts: float,
 ) -> Float[np.ndarray, "K M N n"]:
-    """States of K laws from M first states each, under M inputs."""
+    """States of K models from M first states each, under M inputs."""
     N = u.shape[1]
     padded = np.repeat(u[:, -1:], max(2, 1 << (N - 1).bit_length()), axis=1)
     padded[:, :N] = u
@@ -206,7 +206,7 @@ def _motions(
     return jax.vmap(lambda W, x: jax.vmap(lambda x, u: one(W, x, u))(x, within))(W, x0)
 
 
-# A law that goes so many ranges of the measurement away in a run over a whole recording is out.
+# A model that leaves the measurement by so many of its ranges in a run over a whole recording is out.
 LARGEST_EXCURSION = 3.0
 # Difference quotients change a weight by this share, and a step must lower the mean log error by this much.
 WEIGHT_DIFFERENCE, LOG_ERROR_TOLERANCE = 1e-4, 1e-5
@@ -228,7 +228,7 @@ def costs(
     train: Sequence[Recording],
     states: Sequence[Float[np.ndarray, "N states"]],
 ) -> Float[np.ndarray, " L"]:
-    """Mean log error of free runs of several laws over the pieces; infinite where one leaves the range."""
+    """Mean log error of free runs of several models over the pieces; infinite where one leaves the range."""
     n, C = terms.order * len(terms.channels), len(terms.channels)
     with np.errstate(all="ignore"):
         e = _missed(terms, W, pieces, train[0].Ts)
@@ -251,17 +251,17 @@ def refined(
         return W
     samples = sum(piece.y.size for piece in pieces)
 
-    def laws(values: Float[np.ndarray, "L K"]) -> Float[np.ndarray, "L P C"]:
+    def expanded(values: Float[np.ndarray, "L K"]) -> Float[np.ndarray, "L P C"]:
         out = np.zeros((len(values), *W.shape))
         out[:, where[0], where[1]] = values
         return out
 
     def cost(values: Float[np.ndarray, " K"]) -> float:
-        return samples * _log_error(_missed(terms, laws(values[None]), pieces, Ts)[0])
+        return samples * _log_error(_missed(terms, expanded(values[None]), pieces, Ts)[0])
 
     def linearised(values: Float[np.ndarray, " K"]) -> NormalEquations:
         h = WEIGHT_DIFFERENCE * np.maximum(np.abs(values), 1e-3 * np.abs(start))
-        e = _missed(terms, laws(values + np.vstack([0 * h, np.diag(h)])), pieces, Ts)
+        e = _missed(terms, expanded(values + np.vstack([0 * h, np.diag(h)])), pieces, Ts)
         # Errors in units of their own size have the gradient of the logarithm.
         scaled = (e / (np.sqrt(np.mean(e[0] ** 2, axis=(0, 1))) + 1e-300)).reshape(len(e), -1)
         equations = NormalEquations.of(((scaled[1:] - scaled[0]) / h[:, None]).T, scaled[0])
@@ -270,13 +270,13 @@ def refined(
     rules = Rules(enough=LOG_ERROR_TOLERANCE * samples)
     with np.errstate(all="ignore"):
         found = minimise(linearised, start, rules, cost=cost, max_steps=max_steps)
-    return laws(found.x[None])[0]
+    return expanded(found.x[None])[0]
 
 
 def _missed(
     terms: Terms, W: Float[np.ndarray, "L P C"], pieces: Sequence[Piece], Ts: float
 ) -> Float[np.ndarray, "L M N C"]:
-    """Errors of free runs of several laws over all pieces."""
+    """Errors of free runs of several models over all pieces."""
     n, C = terms.order * len(terms.channels), len(terms.channels)
     start = np.stack([p.x0[:n] for p in pieces])
     start = np.broadcast_to(start, (len(W), *start.shape))
