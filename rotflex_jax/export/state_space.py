@@ -10,13 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rotflex_jax.checks import number, positive
-from rotflex_jax.effects.base import Force, Memory
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.assembly import Layout, effects_of, equations, rest_state
+from rotflex_jax.mechanism.assembly import Layout, equations, rest_state
 from rotflex_jax.mechanism.linear import state_names, zero_order_hold
 from rotflex_jax.mechanism.simulate import read_outputs
-from rotflex_jax.mechanism.step import memory_rates, torques
+from rotflex_jax.mechanism.step import has_smooth_torques, memory_rates, torques
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision
 
@@ -114,7 +113,7 @@ def state_space(
     with double_precision():
         gates = model.parameters_and_gates()[1]
         eq = equations(mechanism, gates)
-        smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
+        smooth = has_smooth_torques(mechanism)
 
         def slope(x: Array, u: Array) -> Array:
             L, z = x[:start], x[start:]

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from rotflex_jax.effects.base import Effect, Linear, Sensing
+from rotflex_jax.effects.base import Effect, Linear
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, linearise
 from rotflex_jax.mechanism.assembly import Layout
@@ -200,7 +200,7 @@ class Reach(NamedTuple):
         """The most that the recordings reach of what a parameter is a size of, and what that is."""
         if unit == "V" and effect.at == "input":
             return self.input, "the input"
-        if unit == "s" and (effect.at == "input" or isinstance(effect, Sensing)):
+        if unit == "s" and effect.acts_on in ("input", "channel"):
             return self.seconds / BEYOND, "a third of the recording"
         if unit == "rad" and effect.at in self.position:
             return self.position[effect.at], f"the motion of {effect.at}"

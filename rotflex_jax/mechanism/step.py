@@ -162,7 +162,7 @@ def transmitted_torques(
     if rows is None:
         return None
     load = matvec(rows.state, x) + scaled_vector(rows.voltage, v)
-    if not effects_of(mechanism, Force) and not effects_of(mechanism, Memory):
+    if not has_smooth_torques(mechanism):
         return load
     layout = Layout.of(mechanism.structure)
     motors = [
@@ -246,6 +246,11 @@ def memory_drive(
     if e.driven_by == "voltage":
         return v
     return motor_torque(mechanism, e.at, x, v, gates) + motor_limit(mechanism, e.at, x, v, gates)
+
+
+def has_smooth_torques(mechanism: Mechanism) -> bool:
+    """Whether `torques` of a mechanism may be other than zero."""
+    return any(e.torque_at_port and not e.dry_contact for e in mechanism.effects)
 
 
 def torques(
@@ -408,8 +413,7 @@ def _advance_smooth(
     start = start if extra is None else start + extra
     if not layout.torque_ports:
         return start
-    smooth = bool(effects_of(mechanism, Force) or effects_of(mechanism, Memory))
-    if not smooth:
+    if not has_smooth_torques(mechanism):
         return _with_dry_friction(mechanism, L, start, z, v, c, solver.passes)
     f0 = torques(mechanism, L, z, v, c.gates)
     guess = start + matvec(c.hold, f0)
