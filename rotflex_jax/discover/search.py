@@ -76,11 +76,14 @@ from rotflex_jax.discover.stepwise import (
     calibration_notes,
     eliminate,
     fit_baseline,
+    fit_free_run_baseline,
+    is_far_from_given,
     merge_effects,
     nested_models,
     refit_candidates,
     refit_near_predictions,
     remaining_rivals,
+    without_fit,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, checked_candidates, scales
 from rotflex_jax.discover.validation import (
@@ -88,7 +91,6 @@ from rotflex_jax.discover.validation import (
     SearchHorizon,
     ValidatedHypothesis,
     ValidationSet,
-    as_free_run,
     at_horizon,
     validate,
 )
@@ -137,6 +139,7 @@ class SearchState:
         machine: Calibrations that belong to the machine.
         tests: Score tests of the model of `tested`, of predictions and of free runs.
         tested: The model whose score tests were made last.
+        nominal: The user's model with the values that it has, where the fit has moved far away from these.
         resumed: After how many rounds of a search that was stopped this one went on.
         digest: Of all that the models depend on.
     """
@@ -166,6 +169,12 @@ class SearchState:
     machine: list[EffectLocation] = dataclasses.field(default_factory=list)
     tests: tuple[ScoreTest, ScoreTest] | None = None
     tested: Hypothesis | None = None
+    nominal: ValidatedHypothesis | None = None
+
+    @property
+    def origin(self) -> ValidatedHypothesis:
+        """The model beside which slopes say what a candidate would do."""
+        return self.nominal if self.nominal and not self.scores else self.current
 
     @functools.cached_property
     def reach(self) -> Reach:
@@ -292,11 +301,14 @@ def discover(
     while len(state.scores) < rounds:
         left = len(state.problem.supermodel.candidates) - len(state.scores)
         say(beginning("score", f"round {len(state.scores) + 1}: scoring {left} candidates"))
-        promising_scores, starts, runs_starts = _score_candidates(state)
-        if starts:
-            say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
-            if _decide(state, _refit(state, starts, runs_starts), promising_scores):
-                continue
+        promising_scores, candidates = _refit_promising(state, state.current)
+        if state.nominal and not state.scores:
+            # Beside a baseline that hardly moves no candidate has a slope; the values that were given have.
+            say("the baseline is far from the values given: candidates beside these")
+            more, others = _refit_promising(state, state.nominal)
+            promising_scores, candidates = [*promising_scores, *more], _likelier(candidates, others)
+        if candidates and _decide(state, candidates, promising_scores):
+            continue
         if len(state.scores) + 2 > rounds or not _add_pair(state):
             break
     say(beginning("needed", "checking that each effect is needed"))
@@ -369,10 +381,15 @@ def _check_constants(m: Mechanism, s: SuperModel, recordings: Sequence[Recording
 def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -> SearchState:
     """The user's model, fitted and validated."""
     h = fit_baseline(horizons.prediction.problem)
-    problem = horizons.free_run.problem
-    current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
+    current = horizons.validated(h, fit_free_run_baseline(horizons.free_run.problem, h))
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
+    s, fits = (
+        horizons.prediction.problem.supermodel,
+        (h, current.free_run.hypothesis if current.free_run else h),
+    )
+    if any(is_far_from_given(s, fit) for fit in fits):
+        state.nominal = without_fit(horizons)
     return state
 
 
@@ -392,16 +409,16 @@ def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, pat
     first, *later = found
     state = SearchState(model, horizons, say, first, digest, len(later), passed=[first], tried=[first])
     if later:
-        _rank(state)
+        _rank(state, first)
     state.reached("as it is")
     for reached, stage in zip(later, stages[1:], strict=True):
         _add(state, reached, stage.added)
     return state
 
 
-def _rank(state: SearchState) -> tuple[list[Score], list[Score]]:
-    """Scores of all candidates beside the current model, of predictions and of free runs."""
-    listed, runs = (test.listed for test in _score_tests(state, state.current))
+def _rank(state: SearchState, beside: ValidatedHypothesis) -> tuple[list[Score], list[Score]]:
+    """Scores of all candidates beside a model, of predictions and of free runs."""
+    listed, runs = (test.listed for test in _score_tests(state, beside))
     if not state.ranking:
         by_runs = {x.location: x.nats for x in runs}
         state.ranking = [(x, by_runs[x.location]) for x in listed]
@@ -421,14 +438,14 @@ def _score_tests(state: SearchState, beside: ValidatedHypothesis) -> tuple[Score
 
 
 def _score_candidates(
-    state: SearchState,
+    state: SearchState, beside: ValidatedHypothesis
 ) -> tuple[list[Score], list[CandidateStart], list[CandidateStart]]:
     """Scores worth a refit, and starts at both horizons: theirs, and effects that contain one that is on."""
-    current, s = state.current, state.problem.supermodel
-    listed, runs = _rank(state)
+    s = state.problem.supermodel
+    listed, runs = _rank(state, beside)
     chosen = promising_at_both(listed, runs, REFITTED)
     known = {x.location for x, _ in chosen}
-    further = [c for c in generalisations(s, current.hypothesis) if c.location not in known]
+    further = [c for c in generalisations(s, beside.hypothesis) if c.location not in known]
     return (
         [x for x, _ in chosen],
         [*(x.start for x, _ in chosen), *further],
@@ -436,24 +453,38 @@ def _score_candidates(
     )
 
 
+def _refit_promising(
+    state: SearchState, beside: ValidatedHypothesis
+) -> tuple[list[Score], list[ValidatedHypothesis]]:
+    """The candidates with the best scores beside a model, added to it and refitted; their scores first."""
+    scored, starts, runs_starts = _score_candidates(state, beside)
+    if not starts:
+        return [], []
+    state.say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
+    return scored, _refit(state, beside, starts, runs_starts)
+
+
 def _refit(
-    state: SearchState, starts: list[CandidateStart], runs_starts: list[CandidateStart]
+    state: SearchState,
+    beside: ValidatedHypothesis,
+    starts: list[CandidateStart],
+    runs_starts: list[CandidateStart],
 ) -> list[ValidatedHypothesis]:
-    """The current model with each candidate, refitted and validated; what is not plausible is left out."""
-    current, s, horizons = state.current, state.problem.supermodel, state.horizons
-    assert current.free_run
-    grown = refit_candidates(state.problem, current.hypothesis, starts)
+    """A model with each candidate, refitted and validated; what is not plausible is left out."""
+    s, horizons = state.problem.supermodel, state.horizons
+    assert beside.free_run
+    grown = refit_candidates(state.problem, beside.hypothesis, starts)
     # A shape that predictions have found is worth a start of free runs.
     informed = [
         dataclasses.replace(y, others=(*y.others, h.mean_values(s)[s.parameter_indices(y.location)]))
         for y, h in zip(runs_starts, grown, strict=True)
     ]
     problem = horizons.free_run.problem
-    runs = refit_candidates(problem, current.free_run.hypothesis, informed)
+    runs = refit_candidates(problem, beside.free_run.hypothesis, informed)
     runs = refit_near_predictions(problem, runs, grown)
     validated = [
         dataclasses.replace(
-            horizons.validated(h, f, current),
+            horizons.validated(h, f, beside),
             location=c.location,
             parameter_count=parameter_count(s, h, c.location),
         )
@@ -463,6 +494,15 @@ def _refit(
     validated = validate_from_best_states(state.validation, validated)
     state.tried += validated
     return validated
+
+
+def _likelier(*lists: list[ValidatedHypothesis]) -> list[ValidatedHypothesis]:
+    """Of each effect the fit that is likelier as a prediction of the training recordings."""
+    best: dict[EffectLocation | None, ValidatedHypothesis] = {}
+    for v in (v for each in lists for v in each):
+        known = best.setdefault(v.location, v)
+        best[v.location] = max(known, v, key=lambda x: x.hypothesis.log_likelihood)
+    return list(best.values())
 
 
 def _decide(state: SearchState, candidates: list[ValidatedHypothesis], scored: list[Score]) -> bool:
@@ -490,7 +530,8 @@ def _refit_replaced(
     """Candidates in whose place the winner may stand, refitted without it, where it leaves something."""
     if not is_unexplained(state.horizons, winner):
         return []
-    before = tuple(t.listed for t in _score_tests(state, state.current))
+    beside = state.origin
+    before = tuple(t.listed for t in _score_tests(state, beside))
     after = tuple(t.listed for t in _score_tests(state, winner))
     assert winner.location
     locations = replaced_by(winner.location, before, after, tried)
@@ -498,7 +539,8 @@ def _refit_replaced(
         return []
     state.say("refitting what it may stand for: " + ", ".join(map(str, locations)))
     first, second = ({x.location: x for x in listed} for listed in before)
-    more = _refit(state, [first[p].start for p in locations], [second[p].start for p in locations])
+    starts = [first[p].start for p in locations], [second[p].start for p in locations]
+    more = _refit(state, beside, *starts)
     for candidate in more:
         state.say("  " + describe(candidate, state.current))
     return [(first[c.location], c) for c in more if c.location]
