@@ -497,11 +497,15 @@ def _refit(
 
 
 def _likelier(*lists: list[ValidatedHypothesis]) -> list[ValidatedHypothesis]:
-    """Of each effect the fit that is likelier as a prediction of the training recordings."""
+    """Of each effect, at each horizon, the fit that is likelier on the training recordings."""
     best: dict[EffectLocation | None, ValidatedHypothesis] = {}
     for v in (v for each in lists for v in each):
-        known = best.setdefault(v.location, v)
-        best[v.location] = max(known, v, key=lambda x: x.hypothesis.log_likelihood)
+        if (known := best.get(v.location)) is None:
+            best[v.location] = v
+            continue
+        likelihood = lambda x: x.hypothesis.log_likelihood  # noqa: E731
+        runs = max((x.free_run for x in (known, v) if x.free_run), key=likelihood, default=None)
+        best[v.location] = dataclasses.replace(max(known, v, key=likelihood), free_run=runs)
     return list(best.values())
 
 
