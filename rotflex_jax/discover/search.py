@@ -75,9 +75,9 @@ from rotflex_jax.discover.stepwise import (
     assign_calibrations,
     calibration_notes,
     eliminate,
+    far_from_given,
     fit_baseline,
     fit_free_run_baseline,
-    is_far_from_given,
     merge_effects,
     nested_models,
     refit_candidates,
@@ -301,13 +301,13 @@ def discover(
     while len(state.scores) < rounds:
         left = len(state.problem.supermodel.candidates) - len(state.scores)
         say(beginning("score", f"round {len(state.scores) + 1}: scoring {left} candidates"))
-        promising_scores, candidates = _refit_promising(state, state.current)
+        scored, refitted = _refit_promising(state, state.current)
         if state.nominal and not state.scores:
             # Beside a baseline that hardly moves no candidate has a slope; the values that were given have.
             say("the baseline is far from the values given: candidates beside these")
             more, others = _refit_promising(state, state.nominal)
-            promising_scores, candidates = [*promising_scores, *more], _likelier(candidates, others)
-        if candidates and _decide(state, candidates, promising_scores):
+            scored, refitted = [*scored, *more], _likelier(refitted, others)
+        if refitted and _decide(state, refitted, scored):
             continue
         if len(state.scores) + 2 > rounds or not _add_pair(state):
             break
@@ -384,13 +384,15 @@ def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) 
     current = horizons.validated(h, fit_free_run_baseline(horizons.free_run.problem, h))
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
-    s, fits = (
-        horizons.prediction.problem.supermodel,
-        (h, current.free_run.hypothesis if current.free_run else h),
-    )
-    if any(is_far_from_given(s, fit) for fit in fits):
-        state.nominal = without_fit(horizons)
+    _set_nominal(state)
     return state
+
+
+def _set_nominal(state: SearchState) -> None:
+    """The model as given beside the fitted one, where the fit has gone far away from it at either horizon."""
+    fits = [v.hypothesis for v in (state.current, state.current.free_run) if v]
+    if any(far_from_given(state.problem.supermodel, h) for h in fits):
+        state.nominal = without_fit(state.horizons)
 
 
 def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:
@@ -410,6 +412,8 @@ def _as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, pat
     state = SearchState(model, horizons, say, first, digest, len(later), passed=[first], tried=[first])
     if later:
         _rank(state, first)
+    else:
+        _set_nominal(state)
     state.reached("as it is")
     for reached, stage in zip(later, stages[1:], strict=True):
         _add(state, reached, stage.added)
@@ -682,6 +686,7 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
             *conditional_note(conditional),
             *calibration_notes(problem.supermodel, validated[-1], state.own),
             *difference_notes(problem.supermodel, pairs),
+            *_far_baseline(state),
             *state.notes,
             *(f"{remark.sentence}." for remark in remarks),
         ),
@@ -702,6 +707,23 @@ def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
         for at, found in ((horizons.prediction, state.current), (horizons.free_run, runs))
     )
     return excluding(*each)
+
+
+def _far_baseline(state: SearchState) -> tuple[str, ...]:
+    """Parameters of the model as it is that its fit has moved far, in a sentence."""
+    s, h = state.problem.supermodel, state.passed[0].hypothesis
+    found, names = h.mean_values(s), s.mechanism.parameter_names
+    units = [spec.unit for spec in s.mechanism.parameter_specifications]
+    moved = [
+        f"{names[i]} from {s.mechanism.values[i]:.3g} to {found[i]:.3g} {units[i]}".strip()
+        for i in far_from_given(s, h)
+    ]
+    if not moved:
+        return ()
+    return (
+        f"The fit of the model as it is has moved {' and '.join(moved)}, as happens where friction holds a "
+        "machine at rest; candidates were also tried beside the values given.",
+    )
 
 
 def _resumed(count: int) -> tuple[str, ...]:

@@ -76,12 +76,13 @@ def fit_free_run_baseline(problem: LikelihoodProblem, prediction: Hypothesis) ->
 FAR_FROM_GIVEN = 10.0
 
 
-def is_far_from_given(s: SuperModel, h: Hypothesis) -> bool:
-    """Whether a fit has moved a positive parameter of the user's model far from the value that was given."""
+def far_from_given(s: SuperModel, h: Hypothesis) -> list[int]:
+    """Indices of positive parameters of the user's model that a fit has moved far from the values given."""
     i = np.array(s.baseline_free)
     given, found = s.mechanism.values[i], h.mean_values(s)[i]
-    positive = (given > 0) & (found > 0)
-    return bool(np.any(np.abs(np.log(found[positive] / given[positive])) > np.log(FAR_FROM_GIVEN)))
+    positive = np.minimum(given, found) > 0
+    i, ratio = i[positive], found[positive] / given[positive]
+    return i[np.abs(np.log(ratio)) > np.log(FAR_FROM_GIVEN)].tolist()
 
 
 def without_fit(horizons: Horizons) -> ValidatedHypothesis:
