@@ -28,26 +28,38 @@ class Promising(NamedTuple):
     """Candidates that are worth a refit.
 
     Attributes:
+        beside: The model that they are added to.
         scores: Of predictions; effects that contain one that is on have none.
         starts: Where refits of predictions start.
         runs_starts: Where those of free runs start.
     """
 
+    beside: ValidatedHypothesis
     scores: list[Score]
     starts: list[CandidateStart]
     runs_starts: list[CandidateStart]
 
 
-def score_candidates(state: SearchState) -> Promising:
-    """The candidates with the best scores at both horizons, and effects that contain one that is on."""
-    current, s = state.current, state.problem.supermodel
-    left = len(s.candidates) - len(state.scores)
+def score_candidates(state: SearchState) -> list[Promising]:
+    """The candidates with the best scores beside each model that they may be added to."""
+    left = len(state.problem.supermodel.candidates) - len(state.scores)
     state.say(beginning("score", f"round {len(state.scores) + 1}: scoring {left} candidates"))
-    listed, runs = state.rank()
+    found = [_promising(state, state.current)]
+    if state.origin is not state.current:
+        state.say("the model as it is was fitted far from the values given: candidates beside these too")
+        found.append(_promising(state, state.origin))
+    return [p for p in found if p.starts]
+
+
+def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
+    """The candidates with the best scores at both horizons, and effects that contain one that is on."""
+    listed, runs = state.rank(beside)
     chosen = promising_at_both(listed, runs, REFITTED)
     known = {x.location for x, _ in chosen}
-    further = [c for c in generalisations(s, current.hypothesis) if c.location not in known]
+    further = generalisations(state.problem.supermodel, beside.hypothesis)
+    further = [c for c in further if c.location not in known]
     return Promising(
+        beside,
         [x for x, _ in chosen],
         [*(x.start for x, _ in chosen), *further],
         [*(y.start for _, y in chosen), *further],
@@ -55,23 +67,26 @@ def score_candidates(state: SearchState) -> Promising:
 
 
 def _refit_and_validate(
-    state: SearchState, starts: list[CandidateStart], runs_starts: list[CandidateStart]
+    state: SearchState,
+    beside: ValidatedHypothesis,
+    starts: list[CandidateStart],
+    runs_starts: list[CandidateStart],
 ) -> list[ValidatedHypothesis]:
-    """The current model with each candidate, refitted and validated; what is not plausible is left out."""
-    current, s, horizons = state.current, state.problem.supermodel, state.horizons
-    assert current.free_run
-    grown = refit_candidates(state.problem, current.hypothesis, starts)
+    """A model with each candidate, refitted and validated; what is not plausible is left out."""
+    s, horizons = state.problem.supermodel, state.horizons
+    assert beside.free_run
+    grown = refit_candidates(state.problem, beside.hypothesis, starts)
     # A shape that predictions have found is worth a start of free runs.
     informed = [
         dataclasses.replace(y, others=(*y.others, h.mean_values(s)[s.parameter_indices(y.location)]))
         for y, h in zip(runs_starts, grown, strict=True)
     ]
     problem = horizons.free_run.problem
-    runs = refit_candidates(problem, current.free_run.hypothesis, informed)
+    runs = refit_candidates(problem, beside.free_run.hypothesis, informed)
     runs = refit_near_predictions(problem, runs, grown)
     validated = [
         dataclasses.replace(
-            horizons.validated(h, f, current),
+            horizons.validated(h, f, beside),
             location=c.location,
             parameter_count=parameter_count(s, h, c.location),
         )
@@ -83,13 +98,28 @@ def _refit_and_validate(
     return validated
 
 
-def add_best(state: SearchState, promising: Promising) -> bool:
+def _likelier(candidates: Sequence[ValidatedHypothesis]) -> list[ValidatedHypothesis]:
+    """Of each effect, at each horizon, the fit that is likelier on the training recordings."""
+
+    def better(a: ValidatedHypothesis, b: ValidatedHypothesis) -> ValidatedHypothesis:
+        return max(a, b, key=lambda v: v.hypothesis.log_likelihood)
+
+    best: dict[EffectLocation | None, ValidatedHypothesis] = {}
+    for v in candidates:
+        known = best.setdefault(v.location, v)
+        assert v.free_run and known.free_run
+        best[v.location] = dataclasses.replace(better(known, v), free_run=better(known.free_run, v.free_run))
+    return list(best.values())
+
+
+def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
     """Refit what is promising and add what validation data prefer; False where they prefer none of it."""
-    scored, starts, runs_starts = promising
-    if not starts:
-        return False
-    state.say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
-    candidates = _refit_and_validate(state, starts, runs_starts)
+    scored, refitted = [], []
+    for beside, scores, starts, runs_starts in promising:
+        state.say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
+        scored += scores
+        refitted += _refit_and_validate(state, beside, starts, runs_starts)
+    candidates = _likelier(refitted)
     data, current = state.problem.dataset.data, state.current
     for candidate in candidates:
         state.say("  " + describe(candidate, current))
@@ -113,7 +143,7 @@ def _refit_replaced(
     """Candidates in whose place the winner may stand, refitted without it, where it leaves something."""
     if not is_unexplained(state.horizons, winner):
         return []
-    before = tuple(t.listed for t in state.score_tests(state.current))
+    before = tuple(t.listed for t in state.score_tests(state.origin))
     after = tuple(t.listed for t in state.score_tests(winner))
     assert winner.location
     locations = replaced_by(winner.location, before, after, tried)
@@ -121,9 +151,8 @@ def _refit_replaced(
         return []
     state.say("refitting what it may stand for: " + ", ".join(map(str, locations)))
     first, second = ({x.location: x for x in listed} for listed in before)
-    more = _refit_and_validate(
-        state, [first[p].start for p in locations], [second[p].start for p in locations]
-    )
+    starts, runs_starts = ([by[p].start for p in locations] for by in (first, second))
+    more = _refit_and_validate(state, state.origin, starts, runs_starts)
     for candidate in more:
         state.say("  " + describe(candidate, state.current))
     return [(first[c.location], c) for c in more if c.location]

@@ -16,18 +16,17 @@ from rotflex_jax.discover.checkpoint import (
     restored,
 )
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
-from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.score_test import Score, ScoreTest, score_test
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
-from rotflex_jax.discover.stepwise import fit_baseline
+from rotflex_jax.discover.stepwise import far_from_given, fit_baseline, fit_free_run_baseline, without_fit
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import (
     Horizons,
     SearchHorizon,
     ValidatedHypothesis,
     ValidationSet,
-    as_free_run,
 )
 from rotflex_jax.fit.plausibility import Reach, beyond_recordings
 from rotflex_jax.models.model import Model
@@ -61,6 +60,7 @@ class SearchState:
         machine: Calibrations that belong to the machine.
         tests: Score tests of the model of `tested`, of predictions and of free runs.
         tested: The model whose score tests were made last.
+        nominal: The user's model with the values that it has, where the fit has moved far away from these.
         resumed: After how many rounds of a search that was stopped this one went on.
         digest: Of all that the models depend on.
     """
@@ -90,6 +90,15 @@ class SearchState:
     machine: list[EffectLocation] = dataclasses.field(default_factory=list)
     tests: tuple[ScoreTest, ScoreTest] | None = None
     tested: Hypothesis | None = None
+    nominal: ValidatedHypothesis | None = None
+
+    @property
+    def origin(self) -> ValidatedHypothesis:
+        """The model beside which slopes say what a candidate would do: the current one, or the nominal one.
+
+        Beside a baseline that hardly moves no candidate has a slope; beside the given values it has.
+        """
+        return self.nominal if self.nominal and not self.scores else self.current
 
     @functools.cached_property
     def reach(self) -> Reach:
@@ -156,9 +165,9 @@ class SearchState:
             )
         return self.tests
 
-    def rank(self) -> tuple[list[Score], list[Score]]:
-        """Scores of all candidates beside the current model, of predictions and of free runs."""
-        listed, runs = (test.listed for test in self.score_tests(self.current))
+    def rank(self, beside: ValidatedHypothesis) -> tuple[list[Score], list[Score]]:
+        """Scores of all candidates beside a model, of predictions and of free runs; the first are kept."""
+        listed, runs = (test.listed for test in self.score_tests(beside))
         if not self.ranking:
             by_runs = {x.location: x.nats for x in runs}
             self.ranking = [(x, by_runs[x.location]) for x in listed]
@@ -179,11 +188,18 @@ def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -
     """The user's model, fitted and validated."""
     say(beginning("baseline", "fitting the model as it is"))
     h = fit_baseline(horizons.prediction.problem)
-    problem = horizons.free_run.problem
-    current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
+    current = horizons.validated(h, fit_free_run_baseline(horizons.free_run.problem, h))
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
+    _set_nominal(state)
     return state
+
+
+def _set_nominal(state: SearchState) -> None:
+    """The model as given beside the fitted one, where the fit has gone far away from it at either horizon."""
+    fits = [v.hypothesis for v in (state.current, state.current.free_run) if v]
+    if any(far_from_given(state.problem.supermodel, h) for h in fits):
+        state.nominal = without_fit(state.horizons)
 
 
 def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:
@@ -202,7 +218,9 @@ def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path
     first, *later = found
     state = SearchState(model, horizons, say, first, digest, len(later), passed=[first], tried=[first])
     if later:
-        state.rank()
+        state.rank(first)
+    else:
+        _set_nominal(state)
     state.reached("as it is")
     for reached, stage in zip(later, stages[1:], strict=True):
         state.add(reached, stage.added)

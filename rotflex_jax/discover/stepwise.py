@@ -18,7 +18,12 @@ from rotflex_jax.discover.hypothesis import (
     with_effect,
     without,
 )
-from rotflex_jax.discover.likelihood import LikelihoodProblem, levenberg_marquardt, refit
+from rotflex_jax.discover.likelihood import (
+    LikelihoodProblem,
+    choose_process_noise,
+    levenberg_marquardt,
+    refit,
+)
 from rotflex_jax.discover.selection import (
     FREE_RUN_BETTER,
     FREE_RUN_Z,
@@ -43,12 +48,60 @@ from rotflex_jax.mechanism.assembly import Layout
 
 def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
     """The user's model with calibrations, fitted from a short, a middle and an endless prediction horizon."""
-    s, noise, first = problem.supermodel, problem.noise, problem.windows.first_states
+    least, most = problem.process_noise_range
+    intensities = (most, np.sqrt(least * most), least)
+    # A distant start is safe only with a short horizon: all paths begin with one.
+    near = problem.with_process_noise(_as_given(problem), dict.fromkeys(problem.ports, 100 * most))
+    near = refit(problem, [near], alternations=0)[0]
+    paths = [problem.with_process_noise(near, dict.fromkeys(problem.ports, q)) for q in intensities]
+    return max(refit(problem, paths, wide=True), key=lambda h: h.log_likelihood)
+
+
+def fit_free_run_baseline(problem: LikelihoodProblem, prediction: Hypothesis) -> Hypothesis:
+    """The user's model fitted to free runs, from the parameters of predictions and from the given ones.
+
+    Where a model lacks what holds a machine at rest, the likeliest predictor may be one that hardly moves: an
+    inertia without end. No parameter has a slope there, and free runs would not find back.
+
+    Args:
+        problem: Of free runs.
+        prediction: The user's model fitted to predictions.
+    """
+    starts = [as_free_run(problem, h) for h in (prediction, _as_given(problem))]
+    able = [h for h in starts if np.isfinite(h.log_likelihood)] or starts[:1]
+    return max(refit(problem, able), key=lambda h: h.log_likelihood)
+
+
+# A positive parameter that a fit has moved by more than this factor from the value that was given.
+FAR_FROM_GIVEN = 10.0
+
+
+def far_from_given(s: SuperModel, h: Hypothesis) -> list[int]:
+    """Indices of positive parameters of the user's model that a fit has moved far from the values given."""
+    i = np.array(s.baseline_free)
+    given, found = s.mechanism.values[i], h.mean_values(s)[i]
+    positive = np.minimum(given, found) > 0
+    i, ratio = i[positive], found[positive] / given[positive]
+    return i[np.abs(np.log(ratio)) > np.log(FAR_FROM_GIVEN)].tolist()
+
+
+def without_fit(horizons: Horizons) -> ValidatedHypothesis:
+    """The user's model with the values that it has and the process noise that suits these, validated."""
+    problem = horizons.prediction.problem
+    _, most = problem.process_noise_range
+    start = problem.with_process_noise(_as_given(problem), dict.fromkeys(problem.ports, most))
+    h = choose_process_noise(problem, problem.evaluated(start, problem.innovations([start])[0]), wide=True)
+    return horizons.validated(h, as_free_run(horizons.free_run.problem, h))
+
+
+def _as_given(problem: LikelihoodProblem) -> Hypothesis:
+    """The user's model with the values that it has, and calibrations of zero."""
+    s, first = problem.supermodel, problem.windows.first_states
     R, C = len(first), len(s.mechanism.channels)
     z = s.transform.unconstrain(s.mechanism.values)
     for i in s.local:
         z[i] = 0.0
-    start = Hypothesis(
+    return Hypothesis(
         locations=s.calibrations,
         free=tuple(s.baseline_free),
         local=tuple(s.local),
@@ -57,15 +110,8 @@ def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
         x0=embed_initial_state(s, s.calibrations, first),
         K=np.zeros((R, Layout.of(s.mechanism.structure).size, C)),
         process_noise={},
-        whitener=Whitener.of_noise(noise),
+        whitener=Whitener.of_noise(problem.noise),
     )
-    least, most = problem.process_noise_range
-    intensities = (most, np.sqrt(least * most), least)
-    # A distant start is safe only with a short horizon: all paths begin with one.
-    near = problem.with_process_noise(start, dict.fromkeys(problem.ports, 100 * most))
-    near = refit(problem, [near], alternations=0)[0]
-    paths = [problem.with_process_noise(near, dict.fromkeys(problem.ports, q)) for q in intensities]
-    return max(refit(problem, paths, wide=True), key=lambda h: h.log_likelihood)
 
 
 # Steps tried of each shape of a candidate before the best one is chosen.

@@ -33,7 +33,7 @@ from rotflex_jax.discover.result import (
 )
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import helps
-from rotflex_jax.discover.stepwise import calibration_notes, nested_models
+from rotflex_jax.discover.stepwise import calibration_notes, far_from_given, nested_models
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, at_horizon, validate
 from rotflex_jax.discover.verdict import Verdict
@@ -132,6 +132,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *conditional_note(conditional),
             *calibration_notes(supermodel, evaluated.final, state.own),
             *difference_notes(supermodel, evaluated.pairs),
+            *_far_baseline(state),
             *state.notes,
             *(f"{remark.sentence}." for remark in remarks),
         ),
@@ -161,6 +162,23 @@ def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
         for at, found in ((horizons.prediction, state.current), (horizons.free_run, runs))
     )
     return excluding(*each)
+
+
+def _far_baseline(state: SearchState) -> tuple[str, ...]:
+    """Parameters of the model as it is that its fit has moved far, in a sentence."""
+    s, h = state.problem.supermodel, state.passed[0].hypothesis
+    found, names = h.mean_values(s), s.mechanism.parameter_names
+    units = [spec.unit for spec in s.mechanism.parameter_specifications]
+    moved = [
+        f"{names[i]} from {s.mechanism.values[i]:.3g} to {found[i]:.3g} {units[i]}".strip()
+        for i in far_from_given(s, h)
+    ]
+    if not moved:
+        return ()
+    return (
+        f"The fit of the model as it is has moved {' and '.join(moved)}, as happens where friction holds a "
+        "machine at rest; candidates were also tried beside the values given.",
+    )
 
 
 def _resumed(count: int) -> tuple[str, ...]:
