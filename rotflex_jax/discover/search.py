@@ -41,6 +41,7 @@ from rotflex_jax.discover.hypothesis import (
     parameter_count,
     without,
 )
+from rotflex_jax.discover.input_reading import nats_if_smooth, smooth_note
 from rotflex_jax.discover.likelihood import (
     LikelihoodProblem,
     choose_process_noise,
@@ -59,7 +60,13 @@ from rotflex_jax.discover.result import (
     conditional_note,
     excluding,
 )
-from rotflex_jax.discover.score_test import Score, ScoreTest, promising_at_both, score_test
+from rotflex_jax.discover.score_test import (
+    Score,
+    ScoreTest,
+    promising_at_both,
+    residual_lines,
+    score_test,
+)
 from rotflex_jax.discover.selection import (
     best_window_rmse,
     choose,
@@ -74,6 +81,7 @@ from rotflex_jax.discover.stepwise import (
     Eliminated,
     assign_calibrations,
     calibration_notes,
+    disturbance_notes,
     eliminate,
     fit_baseline,
     merge_effects,
@@ -138,6 +146,7 @@ class SearchState:
         tests: Score tests of the model of `tested`, of predictions and of free runs.
         tested: The model whose score tests were made last.
         resumed: After how many rounds of a search that was stopped this one went on.
+        smooth_nats: What the model gains with an input that is smooth between samples [nat]; zero if unclear.
         digest: Of all that the models depend on.
     """
 
@@ -147,6 +156,7 @@ class SearchState:
     current: ValidatedHypothesis
     digest: str = ""
     resumed: int = 0
+    smooth_nats: float = 0.0
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
@@ -373,6 +383,9 @@ def _fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) 
     current = horizons.validated(h, refit(problem, [as_free_run(problem, h)])[0])
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
+    state.smooth_nats = nats_if_smooth(state.problem, h)
+    for line in smooth_note(state.smooth_nats):
+        say(line)
     return state
 
 
@@ -413,9 +426,10 @@ def _score_tests(state: SearchState, beside: ValidatedHypothesis) -> tuple[Score
     assert beside.free_run
     if state.tests is None or state.tested is not beside.hypothesis:
         state.tested = beside.hypothesis
+        lines = residual_lines(state.problem, beside.hypothesis)
         state.tests = (
-            score_test(state.problem, beside.hypothesis),
-            score_test(state.horizons.free_run.problem, beside.free_run.hypothesis),
+            score_test(state.problem, beside.hypothesis, lines),
+            score_test(state.horizons.free_run.problem, beside.free_run.hypothesis, lines),
         )
     return state.tests
 
@@ -632,9 +646,11 @@ def _report(state: SearchState, evaluation: Evaluation, started: float) -> Disco
         noise_floor=floor,
         elapsed_s=time.perf_counter() - started,
         notes=(
+            *smooth_note(state.smooth_nats),
             *_resumed(state.resumed),
             *conditional_note(conditional),
             *calibration_notes(problem.supermodel, validated[-1], state.own),
+            *disturbance_notes(problem.supermodel, validated[-1]),
             *difference_notes(problem.supermodel, pairs),
             *state.notes,
             *(f"{remark.sentence}." for remark in remarks),

@@ -134,13 +134,18 @@ class ValidatedHypothesis:
 
     @property
     def with_trained_calibrations(self) -> Hypothesis:
-        """The hypothesis on the validation recordings with calibrations as trained, not as adapted."""
+        """The hypothesis on the validation recordings with calibrations as trained, not as adapted.
+
+        The phase of a disturbance is never that of another recording: it stays as adapted.
+        """
         if self.folds:
             trained = [h.local_z[k] for k, h in enumerate(self.folds)]
             local_z = self.adapted.local_z.copy()
             local_z[:, len(self.hypothesis.free) :] = trained
         else:
             local_z = np.tile(self.hypothesis.local_z.mean(axis=0), (len(self.adapted.x0), 1))
+        own = [k for k, i in enumerate(self.adapted.local) if i in self.adapted.phased]
+        local_z[:, own] = self.adapted.local_z[:, own]
         return dataclasses.replace(self.adapted, local_z=local_z)
 
     @property
