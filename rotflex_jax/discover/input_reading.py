@@ -21,11 +21,13 @@ LEAST_NATS, LEAST_Z = 20.0, 3.0
 MOST_REPEATED = 0.5
 
 
-def smooth_means(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """Mean over each sample of the band-limited signal through the samples; constant beyond its ends.
+def held_equivalent(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Values that act, each held over its sample, as the band-limited signal through the samples does.
 
-    >>> k = np.arange(200.0)
-    >>> bool(np.allclose(smooth_means(np.sin(0.1 * k))[50:150], np.sin(0.1 * (k + 0.5))[50:150], atol=1e-3))
+    That is its value in the middle of each sample, with the amplitude that holding takes restored.
+
+    >>> t = 0.1 * np.arange(200.0)
+    >>> bool(np.allclose(held_equivalent(np.sin(t))[50:150], np.sin(t + 0.05)[50:150], atol=1e-3))
     True
     """
     before, after = KERNEL_HALF_WIDTH - 1, KERNEL_HALF_WIDTH
@@ -49,7 +51,7 @@ def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
     for row, recording in zip(u, problem.dataset.recordings, strict=True):
         if np.mean(np.diff(recording.u) == 0) > MOST_REPEATED:
             return 0.0
-        row[: recording.N] = smooth_means(recording.u.astype(float))
+        row[: recording.N] = held_equivalent(recording.u.astype(float))
     read = data._replace(u=u)
     smooth = dataclasses.replace(
         problem,
