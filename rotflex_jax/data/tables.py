@@ -12,7 +12,7 @@ from jaxtyping import Float, Shaped
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.quality import Finding
-from rotflex_jax.recording.samples import finite, sampling_period
+from rotflex_jax.recording.samples import LONGEST_STEP, finite, sampling_period
 
 
 @dataclass(frozen=True)
@@ -299,8 +299,6 @@ def _are_numbers(cells: list[str]) -> bool:
         return False
 
 
-# Longest step that is bridged, in median steps.
-LONGEST_STEP = 5.0
 # A step longer than this, in median steps, has lost rows.
 LOST = 1.5
 
