@@ -427,7 +427,8 @@ def test_regressions_have_a_column_for_the_catalogue():
     named = {x.place for x in terms(moving(ANGLES, SPEEDS, ACCELERATIONS))}
     wanted = {(kind.name, port) for kind, port in search_places(rf.joints.paper())}
     own = {("viscous", "hub"), ("viscous", "joint")}  # which the joint has
-    assert wanted - named == own | {("backlash", "hub"), ("voltage_drift", "input")}
+    in_time = {("voltage_drift", "input"), ("periodic_disturbance", "input")}
+    assert wanted - named == own | in_time | {("backlash", "hub")}
 
 
 @pytest.mark.parametrize(

@@ -52,10 +52,55 @@ def matlab(**variables: object) -> Callable[[Path], Path]:
     return lambda folder: _saved(folder / "run.mat", lambda f: scipy.io.savemat(f, variables))
 
 
+def in_the_room(folder: Path) -> Path:
+    """Longer than the others: four seconds have too little slow motion to tell."""
+    whole = demo_recording().slice(0, 3000)
+    columns = {"t": whole.t, "voltage": whole.u, "theta": whole.y[:, 0], "alpha": whole.y.sum(axis=1)}
+    return as_csv(pd.DataFrame(columns))(folder)
+
+
 def npz(folder: Path) -> Path:
     return _saved(
         folder / "run.npz", lambda f: np.savez(f, **dict(zip(NAMES, (T, U, THETA, ALPHA), strict=True)))
     )
+
+
+def simulink(folder: Path) -> Path:
+    """A scope's structure with time: each signal an entry of its own."""
+    signals = np.zeros(3, dtype=[("values", object), ("label", object)])
+    for k, x in enumerate((U, THETA, ALPHA)):
+        signals[k] = (x[:, None], NAMES[k + 1])
+    return matlab(out={"time": T, "signals": signals})(folder)
+
+
+def timeseries(folder: Path) -> Path:
+    matio = pytest.importorskip("matio")
+    from matio.utils import MatlabOpaque
+
+    def one(x: np.ndarray) -> object:
+        return MatlabOpaque({"Data_": x[:, None], "Time_": T[:, None]}, "timeseries")
+
+    signals = {name: one(x) for name, x in zip(NAMES[1:], (U, THETA, ALPHA), strict=True)}
+    return _saved(folder / "run.mat", lambda f: matio.save_to_mat(str(f), signals, version="v7"))
+
+
+def sheet(folder: Path) -> Path:
+    pytest.importorskip("openpyxl")
+    return _saved(folder / "run.xlsx", lambda f: table().to_excel(f, index=False))
+
+
+def parquet(folder: Path) -> Path:
+    pytest.importorskip("pyarrow")
+    return _saved(folder / "run.parquet", table().to_parquet)
+
+
+def of_channels(folder: Path) -> Path:
+    """A folder with the time and one channel in each file."""
+    whole = folder / "run"
+    whole.mkdir()
+    for name, x in zip(NAMES[1:], (U, THETA, ALPHA), strict=True):
+        pd.DataFrame({"t": T, name: x}).to_csv(whole / f"{name}.csv", index=False)
+    return whole
 
 
 jitter = 0.2 * 0.002 * np.random.default_rng(1).uniform(-1, 1, len(T))
@@ -87,6 +132,33 @@ READ = {
         matlab(run={"t": T, "voltage": U, "theta": THETA, "alpha": ALPHA}),
         "--time run.t --input run.voltage --output run.theta --output run.alpha",
     ),
+    "Simulink, a structure with time": (
+        simulink,
+        "--time out.time --input out.signals[0].values --output out.signals[1].values "
+        "--output out.signals[2].values",
+    ),
+    "MATLAB, timeseries": (timeseries, ""),
+    "a spreadsheet": (sheet, ""),
+    "parquet": (parquet, ""),
+    "a folder with a file for each channel": (of_channels, ""),
+    "capitals": (as_csv(renamed("T", "VOLTAGE", "THETA", "ALPHA")), ""),
+    "degrees and milliseconds by the header": (
+        as_csv(
+            table(t=1e3 * T, theta=np.rad2deg(THETA), alpha=np.rad2deg(ALPHA)).set_axis(
+                ["Time [ms]", "Voltage [V]", "Theta [deg]", "Alpha [°]"], axis=1
+            )
+        ),
+        "",
+    ),
+    "a mark of the byte order": (as_csv(table(), encoding="utf-8-sig"), ""),
+    "a line of units": (
+        of_text(
+            "run.csv",
+            "t,voltage,theta,alpha\ns,V,rad,rad\n"
+            + "\n".join(",".join(f"{x:.9g}" for x in row) for row in np.column_stack([T, U, THETA, ALPHA])),
+        ),
+        "",
+    ),
 }  # fmt: skip
 """File, options; the recording is the one that was written."""
 
@@ -99,6 +171,8 @@ CURED = {
     ),
     "milliseconds": (as_csv(table(t=1e3 * T)), "milliseconds", "--time-unit ms"),
     "jitter": (as_csv(table(t=T + jitter)), "", "--resample auto"),
+    "the arm's angle in the room": (in_the_room, "in the room", "--arm-absolute"),
+    "some rows lost": (as_csv(table().drop(index=[700, 701, 1500])), "samples lost", "--resample auto"),
 }  # fmt: skip
 """File, what is said of it, the option that is named and works."""
 
@@ -116,6 +190,18 @@ REFUSED = {
     "no such effect": (as_csv(table()), "simulate --add glue@hub", "glue"),
     "no such method": (as_csv(table()), "compare --methods magic", "magic"),
     "a report on a file": (as_csv(table()), "discover --report FILE", "folder"),
+    "the same file twice": (as_csv(table()), "discover FILE", "twice"),
+    "no such file": (as_csv(table()), "discover other.csv", "other.csv"),
+    "a constant voltage": (as_csv(table(voltage=0 * U + 1)), "check", "voltage"),
+    "a sensor at rest": (as_csv(table(alpha=0 * ALPHA)), "check", "alpha"),
+    "a current as the voltage": (
+        as_csv(renamed("t", "Current [A]", "theta", "alpha")),
+        "discover --input Current",
+        "driven in V",
+    ),
+    "millivolts": (as_csv(table(voltage=1e3 * U)), "check", "millivolts"),
+    "too short": (as_csv(table().head(30)), "check", "50 samples"),
+    "an unknown command": (as_csv(table()), "dicsover", "dicsover"),
 }  # fmt: skip
 """File, command, what the one sentence names."""
 
@@ -147,6 +233,13 @@ def test_it_is_refused(case: str, run, tmp_path: Path) -> None:  # noqa: F811
     status, _, err = run(first, file, *options)
     assert status == 2
     assert_one_sentence(err, named)
+
+
+def test_the_documentation_lists_them_all() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "files_tried.md").read_text()
+    for case in (*READ, *CURED, *REFUSED):
+        assert f"| {case} |" in page, case
+    assert len(READ) + len(CURED) + len(REFUSED) >= 40
 
 
 def test_a_fitted_model_is_exported_without_another_word(run, tmp_path: Path) -> None:  # noqa: F811

@@ -87,7 +87,7 @@ def test_a_timetable_of_version_7_3_is_refused_with_its_cure(tmp_path):
     pytest.importorskip("h5py")
     pd = pytest.importorskip("pandas")
     path = timetable(tmp_path / "run.mat", pd.to_timedelta(2 * K, unit="ms"), "v7.3")
-    refused(path, r"log \(timetable\): save .* a timetable with -v7", **PARTS)
+    refused(path, r"log \(timetable\): save a timetable or a timeseries with -v7", **PARTS)
 
 
 def test_a_damaged_timetable_is_left_out_and_named(tmp_path):
@@ -110,6 +110,54 @@ def test_a_damaged_timetable_is_left_out_and_named(tmp_path):
         at += 8 + size
     path.write_bytes(b"".join(parts))
     refused(path, r"objects that only MATLAB reads .* log \(timetable\)", **PARTS)
+
+
+def timeseries(path: Path, wanted: dict, units: str = "seconds", implicit: bool = False) -> Path:
+    """A file of timeseries as MATLAB keeps them, written by another implementation of its objects."""
+    matio = pytest.importorskip("matio")
+    from matio.utils import MatlabOpaque
+
+    def one(t, x):
+        about = {"Units": units}
+        if implicit:  # Simulink's: an even step and no times, and time along the last axis
+            x, step = x[None, None], float(t[1] - t[0])
+            about |= {
+                "Start_": np.array([[t[0]]]),
+                "Increment_": np.array([[step]]),
+                "Length": np.array([[len(t)]]),
+            }
+        info = MatlabOpaque(about, "tsdata.timemetadata")
+        kept = {"Data_": x if implicit else x[:, None], "TimeInfo": info, "Name": "signal"}
+        return MatlabOpaque(kept if implicit else {**kept, "Time_": t[:, None]}, "timeseries")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        matio.save_to_mat(str(path), {name: one(t, x) for name, (t, x) in wanted.items()}, version="v7")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("units", "factor", "implicit"),
+    [("seconds", 1.0, False), ("milliseconds", 1e3, False), ("seconds", 1.0, True)],
+)
+def test_timeseries_of_matlab_are_read_with_their_times(tmp_path, units, factor, implicit):
+    wanted = {name: (factor * T, x) for name, x in SIGNALS.items()}
+    path = timeseries(tmp_path / "run.mat", wanted, units, implicit)
+    exact(load(path))
+    exact(load(path, input="voltage.Data", outputs=("theta.Data", "alpha.Data")))
+
+
+def test_timeseries_of_other_times_are_brought_together_on_request(tmp_path):
+    late = T[::2] + 0.001
+    wanted = {name: (T, x) for name, x in SIGNALS.items()} | {"alpha": (late, np.interp(late, T, ALPHA))}
+    path = timeseries(tmp_path / "run.mat", wanted)
+    refused(path, "times of their own.*resample")
+    assert load(path, resample=0.002).N < N
+
+
+def test_a_timeseries_without_its_step_is_left_out_and_named(tmp_path):
+    path = timeseries(tmp_path / "run.mat", {n: (T, x) for n, x in SIGNALS.items()}, units="fortnights")
+    refused(path, r"objects that only MATLAB reads .* \(timeseries\): save")
 
 
 # -- LabVIEW ---------------------------------------------------------------------------------------------

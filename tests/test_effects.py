@@ -390,6 +390,8 @@ def test_what_may_be_negative():
         "cogging.cosine",
         "voltage_offset.offset",
         "voltage_drift.rate",
+        "periodic_disturbance.sine",
+        "periodic_disturbance.cosine",
         "viscous_asymmetric.asymmetry",
         "sensor_bias.bias",
         "sensor_gain.error",
@@ -481,7 +483,7 @@ def test_candidates_cover_the_first_family():
     assert {(name, p) for name in ("dahl", "lugre") for p in ("hub", "joint")} <= pairs
     assert {("sensor_cubic", "alpha"), ("rectifier", "alpha"), ("cross_talk", "alpha")} <= pairs
     assert {("eccentric_encoder", "theta"), ("channel_delay", "theta"), ("channel_delay", "alpha")} <= pairs
-    assert ("voltage_drift", "input") in pairs
+    assert {("voltage_drift", "input"), ("periodic_disturbance", "input")} <= pairs
     # What ties with a simpler effect on most recordings is tried on request only.
     assert not {"load_friction", "amplifier_saturation", "elastic_backlash"} & {n for n, _ in pairs}
     assert ("heating", "arm") not in pairs and ("heating", "joint") not in pairs  # no motor there

@@ -409,7 +409,7 @@ def test_objects_that_only_matlab_reads_are_named(measured) -> None:
     from rotflex_jax.data.datasets import fetch
 
     measured("rotflex")
-    with pytest.raises(InputError, match=r"objects that only MATLAB reads .*\(string\): save their"):
+    with pytest.raises(InputError, match=r"objects that only MATLAB reads .*\(string\): save a timetable"):
         rf.load(fetch("rotflex")[0])
 
 

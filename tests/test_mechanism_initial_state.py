@@ -157,13 +157,22 @@ def test_each_window_looks_at_its_own_first_samples_only(truth):
     np.testing.assert_allclose(run[200:400], part, rtol=0, atol=1e-8)
 
 
+def sine_means(sine: float, cosine: float, w: float, t: np.ndarray) -> np.ndarray:
+    """Means of a sine and a cosine between times, by their integrals."""
+    return np.diff((sine * -np.cos(w * t) + cosine * np.sin(w * t)) / w) / np.diff(t)
+
+
 @pytest.mark.parametrize(
     ("effect", "driven"),
     [
         (fx.VoltageDrift(rate=0.5), lambda u: u + 0.5 * 0.004 * (np.arange(len(u)) + 0.5)),
+        (
+            fx.PeriodicDisturbance(sine=0.3, cosine=0.2, frequency=5.0),
+            lambda u: u + sine_means(0.3, 0.2, 2 * np.pi * 5.0, 0.004 * np.arange(len(u) + 1)),
+        ),
         (fx.Delay(time=0.1), lambda u: np.concatenate([np.full(25, u[0]), u[:-25]])),
     ],
-    ids=["drift", "delay"],
+    ids=["drift", "disturbance", "delay"],
 )
 def test_the_voltage_of_a_window_is_that_of_the_whole_recording(effect, driven):
     """The bare joint under a voltage that was changed by hand is what every window has to repeat."""

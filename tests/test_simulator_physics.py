@@ -506,6 +506,7 @@ LADEN = {
         fx.SensorCubic("alpha", cubic=6.0),
         fx.Rectifier("alpha", loss=0.15),
         fx.VoltageDrift(rate=0.2),
+        fx.PeriodicDisturbance(sine=0.2, cosine=-0.1, frequency=7.0),
         fx.ViscousAsymmetric("hub", 0.002),
     ],
     "sensors and load": [

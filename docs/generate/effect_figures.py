@@ -148,6 +148,13 @@ def _drift(ax: Axes, effect: Effect) -> None:
     _labels(ax, "time since the first sample [s]", "added voltage [mV]")
 
 
+def _disturbance(ax: Axes, effect: Effect) -> None:
+    assert isinstance(effect, Actuation)
+    t = np.linspace(0, 3, 601)
+    ax.plot(t, 1e3 * np.asarray(effect.drive(jnp.zeros(len(t)), float(t[1]))), **LINE)
+    _labels(ax, "time since the first sample [s]", "added voltage [mV]")
+
+
 def _sensing(ax: Axes, effect: Effect) -> None:
     """Reading over the true value."""
     assert isinstance(effect, Sensing)
@@ -277,6 +284,7 @@ DRAWINGS: dict[type, Draw] = {
     fx.Delay: _in_time,
     fx.Lag: _in_time,
     fx.VoltageDrift: _drift,
+    fx.PeriodicDisturbance: _disturbance,
     fx.Heating: _heating,
     fx.Backlash: _gear,
     fx.ElasticBacklash: _elastic_gear,

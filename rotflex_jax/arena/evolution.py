@@ -151,6 +151,7 @@ _LEFT_OUT = frozenset(
         "lugre",
         "second_mode",
         "voltage_drift",
+        "periodic_disturbance",
     }
 )
 # Points that are run at a time; one program serves all numbers of points.

@@ -236,6 +236,8 @@ def _timetables(values: Mapping[str, Any], prefix: str = "") -> list[str]:
             found.append(f"{prefix}{key}.")
         elif isinstance(value, Mapping):
             found += _timetables(value, f"{prefix}{key}.")
+        elif (parts := _parts(value)) is not None:
+            found += _timetables(parts, f"{prefix}{key}")
     return found
 
 

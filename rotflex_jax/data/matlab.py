@@ -1,8 +1,8 @@
-"""MATLAB files up to version 7.2: arrays, timetables and tables.
+"""MATLAB files up to version 7.2: arrays, timetables, timeseries and tables.
 
 MATLAB keeps the insides of objects apart from the variables, in a part of the file without a name: names,
 then for each object the numbers of its class and of its properties, then the values. Of those objects,
-timetables and tables are signals; durations and dates are their times.
+timetables, timeseries and tables are signals; durations and dates are their times.
 
 SciPy's reader trusts the sizes and types that it finds, and a damaged file can end the interpreter; here
 each is compared with the bytes that are there before it is used.
@@ -27,6 +27,9 @@ from rotflex_jax.data.tables import check_size
 REFERENCE = 0xDD000000
 """First number of what stands for an object."""
 
+SECONDS = {"milliseconds": 1e-3, "seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+"""Units of the times of a timeseries [s]."""
+
 _NEWEST = 4  # version of the part
 _VALUE = 1  # kind of a property that has a value of its own
 _FIRST_VALUE = 2  # values before those of properties
@@ -35,7 +38,7 @@ _MOST_RECORDS = 100_000
 
 @dataclass(frozen=True)
 class MatlabObject:
-    """Stands for an object whose insides only MATLAB knows, such as a timeseries.
+    """Stands for an object whose insides only MATLAB knows, such as a Simulink Dataset.
 
     Args:
         kind: its class.
@@ -47,7 +50,7 @@ class MatlabObject:
 
 
 class Timetable(dict[str, Any]):
-    """Columns of a timetable by name, `Time` with the times of all [s]."""
+    """Columns of a timetable by name, `Time` with the times of all [s]; `Data` of a timeseries."""
 
 
 class StoredObjects:
@@ -115,19 +118,45 @@ class StoredObjects:
         inside = self.properties(reference)
         return dict(zip(_cells(inside["varnames"]), _cells(inside["data"]), strict=True))
 
+    def timeseries(self, reference: Any) -> Timetable:
+        """Data and times of a timeseries: stored, or those of a first time and a step."""
+        inside = self.properties(reference)
+        about = self.properties(inside["TimeInfo"]) if "TimeInfo" in inside else {}
+        data, t = (_either(inside, name) for name in ("Data", "Time"))
+        t = np.atleast_1d(np.asarray([] if t is None else t, float)).ravel()
+        if not len(t):
+            count = _either(about, "Length")
+            count = len(np.atleast_1d(data)) if count is None else int(count)
+            t = float(_either(about, "Start") or 0.0) + float(_either(about, "Increment")) * np.arange(count)
+        data = np.atleast_1d(np.asarray(data))
+        if data.shape[0] != len(t):  # Simulink has the time last
+            data = np.moveaxis(data, -1, 0)
+        if data.shape[0] != len(t) or data.dtype == object:
+            raise ValueError("a timeseries has not as many values as times")
+        data = data.reshape(len(t), -1)
+        values = data[:, 0] if data.shape[1] == 1 else data
+        return Timetable({"Time": SECONDS[about.get("Units", "seconds")] * t, "Data": values})
+
     def opened(self, value: Any) -> Any:
-        """A value with the timetables and tables in it as columns; other objects stay as they are."""
+        """A value with timetables, timeseries and tables in it as columns; other objects stay as they are."""
         if isinstance(value, dict):
             return {name: self.opened(part) for name, part in value.items()}
-        if not isinstance(value, MatlabObject) or value.kind not in ("timetable", "table"):
+        if isinstance(value, list):
+            return [self.opened(part) for part in value]
+        read = {"timetable": self.timetable, "timeseries": self.timeseries, "table": self.table}
+        if not isinstance(value, MatlabObject) or value.kind not in read:
             return value
         try:
-            read = self.timetable if value.kind == "timetable" else self.table
-            return read(value.content)
+            return read[value.kind](value.content)
         except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError):
             return (
                 value  # of a version that is not known, or damaged: an error names it where it is asked for
             )
+
+
+def _either(inside: dict[str, Any], name: str) -> Any:
+    """A property that MATLAB keeps under its name with an underscore behind it, or without."""
+    return inside.get(f"{name}_", inside.get(name))
 
 
 def referred(value: Any) -> int | None:

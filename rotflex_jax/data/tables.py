@@ -12,7 +12,7 @@ from jaxtyping import Float, Shaped
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.quality import Finding
-from rotflex_jax.recording.samples import finite, sampling_period
+from rotflex_jax.recording.samples import LONGEST_STEP, finite, sampling_period
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ class Table:
         if not isinstance(name, str) or name in self.columns:
             return name
         wanted = {other.casefold() for other in (name, *others)}
+        wanted |= {f"{other}.data" for other in wanted}  # of a timeseries of MATLAB
         like = [column for column in self.columns if name_and_unit(column)[0].casefold() in wanted]
         return like[0] if len(like) == 1 else name
 
@@ -97,7 +98,7 @@ class Table:
         names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
         if objects:
-            cure = "save their .Time and .Data, a timetable with -v7"
+            cure = "save a timetable or a timeseries with -v7, and of others .Time and .Data"
             then += f"; objects that only MATLAB reads are left out, {objects}: {cure}"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
 
@@ -298,8 +299,6 @@ def _are_numbers(cells: list[str]) -> bool:
         return False
 
 
-# Longest step that is bridged, in median steps.
-LONGEST_STEP = 5.0
 # A step longer than this, in median steps, has lost rows.
 LOST = 1.5
 

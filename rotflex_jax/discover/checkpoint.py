@@ -220,10 +220,12 @@ def restored(problem: LikelihoodProblem, written: Mapping[str, Any]) -> Hypothes
     """The hypothesis that was written, with the whitener and the likelihood that its innovations give."""
     locations = tuple(EffectLocation(*map(str, p)) for p in written["locations"])
     numbers = {name: np.array(written[name], float) for name in _NUMBERS}
+    local = tuple(map(int, written["local"]))
     h = Hypothesis(
         locations=locations,
         free=tuple(map(int, written["free"])),
-        local=tuple(map(int, written["local"])),
+        local=local,
+        phased=problem.supermodel.phased(local),
         process_noise={str(p): float(q) for p, q in written["process_noise"].items()},
         whitener=Whitener.of_noise(problem.noise),
         **numbers,

@@ -119,10 +119,11 @@ def errors_with_own_calibration(
 def errors_as_trained(
     validation: ValidationSet, h: Hypothesis, locations: Sequence[EffectLocation]
 ) -> RunErrors:
-    """Errors over recordings with the trained model as it is; arguments as before."""
+    """Errors over recordings with the trained model as it is, less a disturbance; arguments as before."""
+    known = [i not in h.phased for i in h.local]
     trained = dataclasses.replace(
         h,
-        local_z=h.local_z.mean(axis=0, keepdims=True),
+        local_z=h.local_z.mean(axis=0, keepdims=True) * known,
         x0=h.x0[:1],
         K=h.K[:1],
         densities=np.array(-np.inf),
@@ -151,6 +152,7 @@ def evaluate(
     h, s, trained = validated.hypothesis, problem.supermodel, validated.with_trained_calibrations
     every = range(len(validation.problem.dataset.recordings))
     runs = free_runs(validation, [validation.model_of(trained, locations, i) for i in every])
+    of_each = [s.clean(trained.values(s)[i], locations) for i in every] if trained.phased else []
     return Stage(
         model=Model(s.clean(h.mean_values(s), locations), solver),
         estimates=estimates(problem, h),
@@ -163,6 +165,7 @@ def evaluate(
         process_noise_nats=0.0 if problem.free_run else process_noise_gain(problem, h),
         log_likelihood=validated.log_likelihood,
         horizon="free_run" if problem.free_run else "prediction",
+        of_validation=tuple(Model(m, solver) for m in of_each),
     )
 
 

@@ -52,7 +52,7 @@ def model_tests(found: SearchResult) -> ModelTests:
     recording = found.validation[i]
     stages = {"baseline": found.baseline} | ({"final model": found.final} if found.rounds else {})
     measured = np.asarray(found.baseline.model.measured(recording), float)
-    residuals = {name: tests for name, s in stages.items() if (tests := _innovations(found, s, recording))}
+    residuals = {name: tests for name, s in stages.items() if (tests := _innovations(found, s, i))}
     runs = {name: np.asarray(s.simulated[i], float) for name, s in stages.items()}
     simulated = {
         name: frequency_response(recording.u, run, recording.Ts)
@@ -64,12 +64,13 @@ def model_tests(found: SearchResult) -> ModelTests:
     )
 
 
-def _innovations(found: SearchResult, stage: Stage, recording: Recording) -> ResidualTests | None:
-    """Tests of a stage's innovations; None where its predictions run away."""
-    channels, m = stage.model.mechanism.channels, recording.n_init
+def _innovations(found: SearchResult, stage: Stage, i: int) -> ResidualTests | None:
+    """Tests of a stage's innovations over validation recording `i`; None where its predictions run away."""
+    recording, model = found.validation[i], stage.model_on(i)
+    channels, m = model.mechanism.channels, recording.n_init
     noise = [found.noise_floor.get(c) or stage.held_out_rmse_windows[c] for c in channels]
-    predicted = np.asarray(stage.model.predict(recording, stage.process_noise, noise), float)
-    e = (np.asarray(stage.model.measured(recording), float) - predicted)[m:]
+    predicted = np.asarray(model.predict(recording, stage.process_noise, noise), float)
+    e = (np.asarray(model.measured(recording), float) - predicted)[m:]
     if len(e) < 60 or not np.all(np.isfinite(e)):
         return None
     return residual_tests(e, recording.u[m:].astype(float), recording.Ts, channels)

@@ -135,6 +135,7 @@ class Hypothesis:
         densities: Log-likelihood of each sample [nat]; minus infinity before it is evaluated.
         blocks: What each half second says for the hypothesis, to be compared with another one on the same
             recordings: its log-likelihood [nat], or for free runs minus the logarithm of its error.
+        phased: Those of `local` that no other recording tells: amplitudes that have a phase.
     """
 
     locations: tuple[EffectLocation, ...]
@@ -150,6 +151,7 @@ class Hypothesis:
         default_factory=lambda: np.array(-np.inf)
     )
     blocks: Float[np.ndarray, " B"] = dataclasses.field(default_factory=lambda: np.zeros(0))
+    phased: tuple[int, ...] = ()
 
     def initial_state_for(
         self, s: SuperModel, locations: tuple[EffectLocation, ...]
@@ -168,8 +170,11 @@ class Hypothesis:
         return self.physical(s)[0]
 
     def mean_values(self, s: SuperModel) -> Float[np.ndarray, " P"]:
-        """Physical values, of local parameters the mean over recordings."""
-        return self.values(s).mean(axis=0)
+        """Physical values, of local parameters the mean over recordings; of phases those of the first one."""
+        values, phased = self.values(s), list(self.phased)
+        mean = values.mean(axis=0)
+        mean[phased] = values[0, phased]
+        return mean
 
     def physical(self, s: SuperModel) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, "R P"]]:
         """Physical values and their derivative by the unconstrained ones."""
@@ -279,9 +284,18 @@ def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: floa
     locations = (*h.locations, start.location)
     x0 = h.initial_state_for(s, locations)
     if CATALOG[start.location.effect].per_recording:
-        own = np.tile(z[list(c.parameters)], (len(x0), 1))
-        local, local_z = (*h.local, *c.parameters), np.hstack([h.local_z, own])
-        return dataclasses.replace(h, locations=locations, local=local, local_z=local_z, z=z, x0=x0)
+        shared = () if c.line is None else (c.parameters[c.line],)
+        own = tuple(i for i in c.parameters if i not in shared)
+        return dataclasses.replace(
+            h,
+            locations=locations,
+            free=(*h.free, *shared),
+            local=(*h.local, *own),
+            local_z=np.hstack([h.local_z, np.tile(z[list(own)], (len(x0), 1))]),
+            z=z,
+            x0=x0,
+            phased=s.phased((*h.local, *own)),
+        )
     return dataclasses.replace(h, locations=locations, free=(*h.free, *c.parameters), z=z, x0=x0)
 
 

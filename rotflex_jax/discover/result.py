@@ -117,6 +117,8 @@ class Stage:
         test: Errors on recordings that had no say in the choice of the model, if there are any.
         test_calibrated: The same with each recording's own offsets.
         calibrate_seconds: What a recording's own offsets are fitted to [s].
+        of_validation: The model with the phase that a disturbance has in each validation recording; empty
+            without one.
     """
 
     model: Model
@@ -134,6 +136,11 @@ class Stage:
     test: RunErrors | None = None
     test_calibrated: RunErrors | None = None
     calibrate_seconds: float = 0.0
+    of_validation: tuple[Model, ...] = ()
+
+    def model_on(self, i: int) -> Model:
+        """The model of validation recording `i`."""
+        return self.of_validation[i] if self.of_validation else self.model
 
     def errors(self) -> dict[str, Any]:
         """All errors as plain JSON."""

@@ -23,6 +23,7 @@ from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ReducedMo
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.coordinates import FitCoordinates, Projection
 from rotflex_jax.fit.problem import each_recording
+from rotflex_jax.latent.in_time import periodic_torques
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.sensitivities import (
@@ -210,9 +211,11 @@ def _directions(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> Direction
         if not any(c.amplitudes):
             d.gates[row, c.effect] = 1.0
             continue
+        # Recordings have each their own phase of a disturbance: the first one is asked.
+        asked = slice(None) if c.line is None else 0
         for k, i in enumerate(c.parameters):
             if c.amplitudes[k]:
-                d.values[row, :, i] = c.probes[p.shape][p.member][k]
+                d.values[row, asked, i] = c.probes[p.shape][p.member][k]
     return d
 
 
@@ -221,10 +224,46 @@ def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
     return score_test(problem, h).listed
 
 
-def score_test(problem: LikelihoodProblem, h: Hypothesis) -> "ScoreTest":
-    """The test of all candidates that are not yet in the hypothesis."""
+# Lines beside which a disturbance is tried, the clearest ones.
+MOST_LINES = 2
+
+
+def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[float, ...]:
+    """Frequencies [Hz] at which predictions have a line that the input has not, the clearest first.
+
+    Args:
+        problem: Predictions of recordings.
+        h: Fitted to them.
+    """
+    found: list[tuple[float, float]] = []
+    data, windows = problem.dataset.recordings, problem.innovations([h])[0]
+    for recording, e, seen in zip(data, windows, problem.seen, strict=True):
+        first, last = recording.n_init, int(np.sum(seen))
+        for x in e[first:last].T if np.all(np.isfinite(e[:last])) else ():
+            lines = periodic_torques(x, recording.u[first:last], recording.Ts)
+            found += [
+                (line.amplitude / max(line.interval[1] - line.amplitude, 1e-300), line.frequency)
+                for line in lines
+            ]
+    longest = max(r.duration for r in data)
+    chosen: list[float] = []
+    for _, frequency in sorted(found, reverse=True):
+        if all(abs(frequency - other) > 2 / longest for other in chosen):
+            chosen.append(frequency)
+    return tuple(chosen[:MOST_LINES])
+
+
+def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[float] = ()) -> "ScoreTest":
+    """The test of all candidates that are not yet in the hypothesis.
+
+    Args:
+        problem: Recordings at one horizon.
+        h: What the candidates are beside.
+        lines: Frequencies at which a disturbance is tried [Hz]; none is tried without.
+    """
     s, seen = problem.supermodel, problem.seen
-    candidates = [c for c in s.candidates.values() if c.location not in h.locations]
+    absent = (c for c in s.candidates.values() if c.location not in h.locations)
+    candidates = [c for c in (c.at_lines(lines) for c in absent) if c is not None]
     if not candidates:
         return ScoreTest([], {}, None)
     families = s.families([c for c in candidates if not c.threshold])

@@ -16,9 +16,10 @@ from rotflex_jax.discover.checkpoint import (
     restored,
 )
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
+from rotflex_jax.discover.input_reading import nats_if_smooth, smooth_note
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.result import HorizonGain
-from rotflex_jax.discover.score_test import Score, ScoreTest, score_test
+from rotflex_jax.discover.score_test import Score, ScoreTest, residual_lines, score_test
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
 from rotflex_jax.discover.stepwise import far_from_given, fit_baseline, fit_free_run_baseline, without_fit
 from rotflex_jax.discover.supermodel import EffectLocation
@@ -62,6 +63,7 @@ class SearchState:
         tested: The model whose score tests were made last.
         nominal: The user's model with the values that it has, where the fit has moved far away from these.
         resumed: After how many rounds of a search that was stopped this one went on.
+        smooth_nats: What the model gains with an input that is smooth between samples [nat]; zero if unclear.
         digest: Of all that the models depend on.
     """
 
@@ -71,6 +73,7 @@ class SearchState:
     current: ValidatedHypothesis
     digest: str = ""
     resumed: int = 0
+    smooth_nats: float = 0.0
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
@@ -159,9 +162,10 @@ class SearchState:
         assert beside.free_run
         if self.tests is None or self.tested is not beside.hypothesis:
             self.tested = beside.hypothesis
+            lines = residual_lines(self.problem, beside.hypothesis)
             self.tests = (
-                score_test(self.problem, beside.hypothesis),
-                score_test(self.horizons.free_run.problem, beside.free_run.hypothesis),
+                score_test(self.problem, beside.hypothesis, lines),
+                score_test(self.horizons.free_run.problem, beside.free_run.hypothesis, lines),
             )
         return self.tests
 
@@ -192,6 +196,9 @@ def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
     _set_nominal(state)
+    state.smooth_nats = nats_if_smooth(state.problem, h)
+    for line in smooth_note(state.smooth_nats):
+        say(line)
     return state
 
 

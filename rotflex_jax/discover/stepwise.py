@@ -514,3 +514,21 @@ def calibration_notes(
                 f"but not carried over."
             )
     return tuple(out)
+
+
+def disturbance_notes(s: SuperModel, final: ValidatedHypothesis) -> tuple[str, ...]:
+    """Which disturbances belong to each recording, in sentences."""
+    out = []
+    for location in [p for p in final.hypothesis.locations if CATALOG[p.effect].line]:
+        amplitudes = [i for i in s.parameter_indices(location) if i in final.hypothesis.phased]
+        unit = s.mechanism.parameter_specifications[amplitudes[0]].unit
+        trained, adapted = (
+            ", ".join(f"{np.hypot(*row):.3g} {unit}" for row in h.values(s)[:, amplitudes])
+            for h in (final.hypothesis, final.adapted)
+        )
+        out.append(
+            f"{titled(location)} comes from outside and belongs to each recording, not to the machine: "
+            f"{trained} in the training data, {adapted} in the validation data. Size and phase were fitted "
+            "to each, so that errors on validation data are those with it; no other run has that phase."
+        )
+    return tuple(out)

@@ -19,6 +19,7 @@ from rotflex_jax.discover.evaluation import (
     process_noise_gain,
 )
 from rotflex_jax.discover.hypothesis import Hypothesis, without
+from rotflex_jax.discover.input_reading import smooth_note
 from rotflex_jax.discover.likelihood import choose_process_noise, refit
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
@@ -33,9 +34,9 @@ from rotflex_jax.discover.result import (
 )
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import helps
-from rotflex_jax.discover.stepwise import calibration_notes, far_from_given, nested_models
+from rotflex_jax.discover.stepwise import calibration_notes, disturbance_notes, far_from_given, nested_models
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import ValidatedHypothesis, at_horizon, validate
+from rotflex_jax.discover.validation import ValidatedHypothesis, validate
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.fit.plausibility import Remark, at_bounds, beyond_recordings
 from rotflex_jax.recording import Recording
@@ -128,9 +129,11 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
         noise_floor=state.noise_floor,
         elapsed_s=time.perf_counter() - started,
         notes=(
+            *smooth_note(state.smooth_nats),
             *_resumed(state.resumed),
             *conditional_note(conditional),
             *calibration_notes(supermodel, evaluated.final, state.own),
+            *disturbance_notes(supermodel, evaluated.final),
             *difference_notes(supermodel, evaluated.pairs),
             *_far_baseline(state),
             *state.notes,
@@ -197,7 +200,11 @@ def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stag
     problem = state.problem
     if stage.horizon == "prediction":
         return stage
-    h = at_horizon(problem, h, state.current.hypothesis.process_noise)
+    near = state.current.hypothesis
+    # First states that were fitted: a run from measured ones drifts, which would count as random torque.
+    fitted = dataclasses.replace(h, x0=near.initial_state_for(problem.supermodel, h.locations))
+    start = problem.with_process_noise(fitted, near.process_noise)
+    h = problem.evaluated(start, problem.innovations([start])[0])
     h = choose_process_noise(problem, h, wide=True)
     gain = process_noise_gain(problem, h)
     return dataclasses.replace(stage, process_noise=h.process_noise, process_noise_nats=gain)

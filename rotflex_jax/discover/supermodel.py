@@ -96,6 +96,8 @@ class Candidate:
         one_sided: Whether a negative amplitude would not be physical.
         threshold: Whether a small amplitude does nothing at all, so that only runs at full size show what the
             effect does.
+        line: Which of its parameters is a frequency, tried only where a model's errors have a line; None for
+            other effects.
     """
 
     location: EffectLocation
@@ -105,6 +107,17 @@ class Candidate:
     amplitudes: tuple[bool, ...]
     one_sided: bool
     threshold: bool = False
+    line: int | None = None
+
+    def at_lines(self, frequencies: Sequence[float]) -> "Candidate | None":
+        """The candidate as it is tried beside these lines [Hz]: one shape for each; None without any."""
+        k = self.line
+        if k is None:
+            return self
+        shapes = tuple(
+            tuple((*member[:k], f, *member[k + 1 :]) for member in self.probes[0]) for f in frequencies
+        )
+        return dataclasses.replace(self, probes=shapes) if shapes else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,6 +230,11 @@ class SuperModel:
         """Parameters that each recording has for itself."""
         return [i for location in self.calibrations for i in self.parameter_indices(location)]
 
+    def phased(self, local: Iterable[int]) -> tuple[int, ...]:
+        """Those of some recordings' own parameters that are amplitudes of a disturbance with a phase."""
+        disturbances = [c for c in self.candidates.values() if c.line is not None]
+        return tuple(i for i in local if any(i in c.parameters for c in disturbances))
+
     @functools.cached_property
     def baseline_free(self) -> list[int]:
         """Free parameters of the baseline."""
@@ -304,5 +322,6 @@ def build(
             tuple(n in cls.amplitudes for n in names),
             all(max(s.lower, s.physical[0]) >= 0 for n, s in cls.declared().items() if n in cls.amplitudes),
             threshold=not cls.slope_at_zero,
+            line=names.index(cls.line) if cls.line else None,
         )
     return SuperModel(baseline, mechanism, tuple(calibrations), candidates)

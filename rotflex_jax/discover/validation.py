@@ -134,13 +134,18 @@ class ValidatedHypothesis:
 
     @property
     def with_trained_calibrations(self) -> Hypothesis:
-        """The hypothesis on the validation recordings with calibrations as trained, not as adapted."""
+        """The hypothesis on the validation recordings with calibrations as trained, not as adapted.
+
+        The phase of a disturbance is never that of another recording: it stays as adapted.
+        """
         if self.folds:
             trained = [h.local_z[k] for k, h in enumerate(self.folds)]
             local_z = self.adapted.local_z.copy()
             local_z[:, len(self.hypothesis.free) :] = trained
         else:
             local_z = np.tile(self.hypothesis.local_z.mean(axis=0), (len(self.adapted.x0), 1))
+        own = [k for k, i in enumerate(self.adapted.local) if i in self.adapted.phased]
+        local_z[:, own] = self.adapted.local_z[:, own]
         return dataclasses.replace(self.adapted, local_z=local_z)
 
     @property
@@ -451,19 +456,14 @@ class Horizons:
         return dataclasses.replace(found, free_run=runs)
 
 
-def at_horizon(problem: LikelihoodProblem, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
-    """The parameters of a hypothesis at another horizon, from measured first states; not fitted.
+def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
+    """The parameters of a hypothesis of predictions in free runs from measured first states; not fitted.
 
     Args:
-        problem: The same recordings at that horizon.
+        problem: The same recordings as free runs.
         h: Its parameters.
-        intensity: Port -> process noise [(N m)^2 s]; a free run has none.
     """
     x0 = embed_initial_state(problem.supermodel, h.locations, problem.windows.first_states)
-    start = problem.with_process_noise(dataclasses.replace(h, x0=x0), intensity)
+    no_noise = dict.fromkeys(problem.ports, 0.0)
+    start = problem.with_process_noise(dataclasses.replace(h, x0=x0), no_noise)
     return problem.evaluated(start, problem.innovations([start])[0])
-
-
-def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
-    """A hypothesis of predictions as one of free runs; `problem` is that of free runs."""
-    return at_horizon(problem, h, dict.fromkeys(problem.ports, 0.0))

@@ -9,6 +9,7 @@ from rotflex_jax.effects.actuation import (
     DeadZone,
     Delay,
     Lag,
+    PeriodicDisturbance,
     Saturation,
     VoltageDrift,
     VoltageOffset,
@@ -101,6 +102,7 @@ __all__ = [
     "AmplifierSaturation",
     "VoltageOffset",
     "VoltageDrift",
+    "PeriodicDisturbance",
     "Delay",
     "Lag",
     # sensing

@@ -1,6 +1,7 @@
-"""Effects on the voltage before the motor: dead zone, hard and soft saturation, offset, drift, delay, lag."""
+"""Effects on the voltage before the motor: dead zone, saturation, offset, drift, disturbance, delay, lag."""
 
 import dataclasses
+import math
 from typing import ClassVar
 
 import jax
@@ -219,6 +220,67 @@ class VoltageDrift(Actuation):
     def sentence(self) -> str:
         """In words."""
         return f"the offset of the voltage drifts by {1e3 * self.rate:+.3g} mV per second"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class PeriodicDisturbance(Actuation):
+    """A sine from outside that acts on the motor: ripple of the supply, a fan, an unbalance nearby.
+
+        v -> v + sine sin(2 pi frequency t) + cosine cos(2 pi frequency t)
+
+    A periodic torque at the motor's port is the same as this voltage times torque constant over resistance.
+    One at another port is not: the two angles then ask for different sizes, and something is left. It
+    belongs to a recording rather than to a machine, and nothing tells its phase in another run: not for
+    predictions of one. Time counts from the first sample of the recording that a model is given, as for a
+    drifting offset.
+    Not for a torque of the angle, which has lines where a machine turns evenly (`cogging`).
+
+    Args:
+        at: Always `input`.
+        sine: Amplitude of the sine that begins with the recording [V].
+        cosine: Amplitude of the cosine [V].
+        frequency: [Hz].
+
+    Source: L. Ljung, System Identification, 2nd ed., 1999, section 14.1 (disturbances in the data).
+    """
+
+    name: ClassVar[str] = "periodic_disturbance"
+    title: ClassVar[str] = "periodic disturbance"
+    equation: ClassVar[str] = (
+        "v -> v + sine * sin(2 * pi * frequency * t) + cosine * cos(2 * pi * frequency * t)"
+    )
+    amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")
+    searched: ClassVar[tuple[str, ...]] = ("input",)
+    per_recording: ClassVar[bool] = True
+    line: ClassVar[str] = "frequency"
+    stage: ClassVar[int] = 1
+
+    sine: float = parameter(0.0, unit="V", typical=0.05, meaning="amplitude of the sine")
+    cosine: float = parameter(0.0, unit="V", typical=0.05, meaning="amplitude of the cosine")
+    frequency: float = parameter(1.0, unit="Hz", lower=1e-3, meaning="frequency")
+
+    def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
+        """Voltage [V] with the disturbance, its mean over each sample."""
+        middle = 2 * jnp.pi * self.frequency * Ts * (jnp.arange(voltage.shape[0], dtype=voltage.dtype) + 0.5)
+        wave = self.sine * jnp.sin(middle) + self.cosine * jnp.cos(middle)
+        return voltage + jnp.sinc(self.frequency * Ts) * wave
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two directions, a quarter of a period apart; a search sets the frequency."""
+        amplitude = 0.05 * scale.voltage
+        return [
+            [
+                {"sine": amplitude, "cosine": 0.0, "frequency": 1.0},
+                {"sine": 0.0, "cosine": amplitude, "frequency": 1.0},
+            ]
+        ]
+
+    def sentence(self) -> str:
+        """In words."""
+        size = math.hypot(self.sine, self.cosine)
+        return f"a disturbance of {self.frequency:.4g} Hz acts on the motor like {size:.3g} V of the input"
 
 
 @register

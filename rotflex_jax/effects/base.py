@@ -101,6 +101,9 @@ class Effect(abc.ABC):
     volts_of_input: ClassVar[bool] = False
     turning: ClassVar[bool] = False  # a function of an angle: no meaning where a port moves along a line
     per_recording: ClassVar[bool] = False  # its parameters belong to a recording, not to the machine
+    # Its frequency [Hz], if it is tried only at lines that the errors of a model have and the input has not.
+    # All recordings share it; its amplitudes have a phase, so no recording tells those of another.
+    line: ClassVar[str] = ""
 
     # -- declared by each kind
     kind_label: ClassVar[str]

@@ -11,6 +11,9 @@ from jaxtyping import Float, Real
 from rotflex_jax.checks import positive, real, shown
 from rotflex_jax.errors import InputError
 
+# Longest step that resampling bridges, in median steps.
+LONGEST_STEP = 5.0
+
 
 def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0) -> Real[np.ndarray, "..."]:
     """An array of real numbers, text parsed strictly.
@@ -171,10 +174,12 @@ def even_spacing(t: Real[np.ndarray, " N"], label: str, where: str = "sample", f
         )
     worst = int(np.argmax(np.abs(steps - period)))
     if steps[worst] > 1.5 * period:
+        cure = "load the parts before and after it as recordings of their own"
+        if np.max(steps) <= LONGEST_STEP * period:
+            cure = f"pass resample='auto' to bridge it by a line, or {cure}"
         raise InputError(
             f"{label} has a gap of {steps[worst]:g} s {place(worst)} at a sampling period of "
-            f"{period:g} s, about {float(steps[worst]) / period - 1:.0f} samples lost; "
-            "load the parts before and after it as recordings of their own."
+            f"{period:g} s, about {float(steps[worst]) / period - 1:.0f} samples lost; {cure}."
         )
     if abs(steps[worst] - period) > 0.01 * period:
         raise InputError(

@@ -137,6 +137,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         ],
         "gain": plain_number(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
         "status_sentence": status_sentence(added),
+        "is_established": added.status == "established",
         "score": plain_number(added.score),
         "falls": ", ".join(falls),
     }

@@ -76,7 +76,7 @@ def _overlay_caption(discovery: SearchResult) -> str:
     long = shown(discovery).recording.duration > OVERLAY_SECONDS
     part = f" {OVERLAY_SECONDS:g} s of it are shown." if long else ""
     return (
-        "Top rows: where a coloured line covers the grey one, the model is right. Bottom rows: "
+        "Top rows: where a thin line covers the broad grey one, the model is right. Bottom rows: "
         f"measured minus simulated; the grey band is what the sensor alone makes.{part}"
     )
 
