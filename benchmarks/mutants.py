@@ -27,6 +27,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Iterator
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
@@ -47,7 +48,10 @@ class Tested(NamedTuple):
 
 AREAS: dict[str, tuple[Tested, ...]] = {
     "decision": (
-        Tested("discover/selection.py", ("test_limits_of_decisions.py", "test_decide.py")),
+        Tested(
+            "discover/selection.py",
+            ("test_limits_of_decisions.py", "test_evaluation.py", "test_decide.py"),
+        ),
         Tested("discover/probabilities.py", ("test_probabilities.py",)),
     ),
     "covariance": (Tested("fit/inference.py", ("test_limits_of_intervals.py", "test_covariance.py")),),
@@ -201,6 +205,7 @@ def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
         "-o",
         "addopts=--import-mode=importlib --doctest-modules",
     ]
+    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of libraries that are loaded already
     files = [f"rotflex_jax/{tested.module}", *(f"tests/{test}" for test in tested.tests)]
     return int(pytest.main([*options, *files]))
 
@@ -210,8 +215,12 @@ def noticed(folder: Path, tested: Tested, tree: ast.AST | None, limit: float) ->
     child = os.fork()
     if not child:
         status = 1
-        with contextlib.suppress(BaseException):  # a module that cannot be loaded is noticed
+        try:
             status = run_tests(folder, tested, tree)
+        except BaseException:  # a module that cannot be loaded is noticed
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
         os._exit(status)
     begun = time.monotonic()
     while time.monotonic() - begun < limit:
