@@ -150,3 +150,6 @@ def test_correlation_length_of_white_noise_and_of_nothing():
     assert correlation_length(np.zeros((100, 2))) == 2
     drift = np.linspace(-1, 1, 500)[:, None]
     assert correlation_length(drift) == 50  # never more than a tenth of the recording
+    assert correlation_length(1e-9 * drift) == 50  # whatever its unit
+    assert correlation_length(drift[:15]) == bandwidth(drift[:15]) == 1
+    assert correlation_length(drift[:5]) == bandwidth(drift[:5]) == 1

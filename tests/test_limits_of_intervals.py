@@ -65,3 +65,15 @@ def test_nats_of_errors_that_go_on_count_less() -> None:
         parts = [RecordingSlopes(np.ones((N, 1, 1)), e[:, None] / e.std(), np.arange(1))]
         most.append(nats_that_count(parts, curvature(parts, 1)))
     assert np.mean(most) == pytest.approx((1 + a) / (1 - a), rel=0.25)
+
+
+def test_slopes_or_errors_that_are_no_numbers_determine_nothing() -> None:
+    rng = np.random.default_rng(6)
+    J, e = rng.standard_normal((2, N, 1))
+    for bad_slope, bad_error in ((np.nan, 0.0), (0.0, np.inf), (0.0, np.nan)):
+        slopes, errors = J.copy(), e.copy()
+        slopes[7] += bad_slope
+        errors[7] += bad_error
+        assert np.isnan(spread(slopes, errors[:, 0])).all()
+    parts = [RecordingSlopes(np.full((N, 1, 1), np.nan), e, np.arange(1))]
+    assert nats_that_count(parts, curvature(parts, 1)) == 1.0
