@@ -68,7 +68,7 @@ AREAS: dict[str, tuple[Tested, ...]] = {
         ),
         Tested("discover/verdict.py", ("test_limits_of_verdict.py", "test_assessment.py")),
     ),
-    "localisation": (Tested("discover/localise.py", ("test_locate.py",)),),
+    "localisation": (Tested("discover/localise.py", ("test_limits_of_places.py", "test_locate.py")),),
     "friction": (Tested("mechanism/friction.py", ("test_contacts.py",), traced=True),),
 }
 LEAST_LIMIT, LIMIT = 60.0, 6.0

@@ -4,12 +4,17 @@ import numpy as np
 import pytest
 
 from rotflex_jax.fit.inference import (
+    Combination,
     RecordingSlopes,
     bandwidth,
+    combined_covariance,
+    correlation_length,
     curvature,
+    estimates,
     nats_that_count,
     sandwich,
 )
+from rotflex_jax.parameters import Specification
 
 N = 10_000
 
@@ -77,3 +82,35 @@ def test_slopes_or_errors_that_are_no_numbers_determine_nothing() -> None:
         assert np.isnan(spread(slopes, errors[:, 0])).all()
     parts = [RecordingSlopes(np.full((N, 1, 1), np.nan), e, np.arange(1))]
     assert nats_that_count(parts, curvature(parts, 1)) == 1.0
+
+
+@pytest.mark.parametrize("samples", [100_000, 400])
+@pytest.mark.parametrize(("share", "length"), [(0.99, 2), (1.01, 4)])
+def test_errors_are_correlated_above_a_twentieth_and_above_their_scatter(
+    samples: int, share: float, length: int
+) -> None:
+    """Neighbours whose correlation is that by construction: 0.05, or 2 over the root of the samples."""
+    limit, w = max(0.05, 2 / np.sqrt(samples)), np.random.default_rng(7).standard_normal(samples)
+
+    def neighbours(part: float) -> tuple[np.ndarray, float]:
+        e = w + part * np.roll(w, 1)
+        e -= e.mean()
+        return e, float(e[1:] @ e[:-1] / (e @ e))
+
+    low, high = -0.5, 0.5
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if neighbours(middle)[1] < share * limit else (low, middle)
+    assert correlation_length(neighbours(low)[0][:, None]) == length
+
+
+def test_a_parameter_is_a_weighted_sum_of_what_was_fitted() -> None:
+    A = np.random.default_rng(8).standard_normal((3, 3)) * 1e-3
+    covariance = A @ A.T
+    sums = [Combination([0, 2], np.array([1.0, -2.0])), Combination([1], np.array([3.0]))]
+    W = np.array([[1.0, 0.0, -2.0], [0.0, 3.0, 0.0]])
+    np.testing.assert_allclose(combined_covariance(covariance, sums), W @ covariance @ W.T)
+    spec = Specification("N m", 0.01)
+    first, held = estimates(["a", "b"], np.array([1.0, 2.0]), [spec] * 2, [sums[0], None], covariance)
+    assert first.std == pytest.approx(np.sqrt((W @ covariance @ W.T)[0, 0]))
+    assert (held.value, held.free) == (2.0, False) and np.isnan(held.std)

@@ -63,9 +63,10 @@ def test_times_are_even_to_a_hundredth(late: float, said: str | None) -> None:
         even_spacing(t, "Time")
 
 
-@pytest.mark.parametrize(("volts", "accepted"), [(0.0, False), (1e-13, False), (1e-11, True)])
-def test_input_is_constant_below_a_trillionth(volts: float, accepted: bool) -> None:
-    u = 1.0 + volts * np.where(K % 2, 0.5, -0.5)
+@pytest.mark.parametrize(("volts", "accepted"), [(0.0, False), (8e-13, False), (1.2e-12, True)])
+@pytest.mark.parametrize("scale", [0.01, 1.0, 50.0])
+def test_input_is_constant_below_a_trillionth(volts: float, accepted: bool, scale: float) -> None:
+    u = scale * (1.0 + volts * np.where(K % 2, 0.5, -0.5))
     if accepted:
         assert kinds(u=u) is not None
         return
