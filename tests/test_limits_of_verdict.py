@@ -1,12 +1,16 @@
 """Each limit of the rule that ends a search, from both sides; the limits are written out here."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from rotflex_jax.discover.conclusion import end_state
-from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.discover.conclusion import end_state, seen_limits, window_sizes
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.verdict import Assessment, Grade, Verdict, assess, grade
+from rotflex_jax.recording import Recording
 
 SAMPLES = 1000  # of each of the two channels
 NEAR = 1.5  # times the noise of the sensor
@@ -58,3 +62,108 @@ def test_more_than_half_of_the_candidates_must_have_shown() -> None:
     assert ended(excited=1, candidates=4) == Verdict.NOT_EXCITED
     assert ended(excited=2, candidates=5) == Verdict.NOT_EXCITED
     assert ended(excited=0, candidates=0) == Verdict.NOTHING_MISSING
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [(1.499, Grade.NOISE), (1.501, Grade.NEAR), (4.99, Grade.NEAR), (5.01, Grade.FAR), (math.nan, None)],
+)
+def test_the_grade_of_an_error(times: float, expected: Grade | None) -> None:
+    assert grade(times) is expected
+    # That of the channel which is furthest, of those whose noise is known.
+    assert Assessment({}, {"theta": times, "alpha": 0.5, "beta": math.nan}, 0.0).grade is (
+        expected or Grade.NOISE
+    )
+
+
+def test_a_sensor_of_unknown_noise_leaves_the_verdict_open() -> None:
+    unknown = Assessment({}, {"theta": math.nan, "alpha": 1.0}, 0.0)
+    assert not unknown.is_explained and "noise of theta is not known" in unknown.criterion
+    worse = Assessment({}, {"theta": math.nan, "alpha": 7.0, "beta": 6.0}, 0.0)
+    assert "the error of alpha in short runs is above 1.5" in worse.criterion
+    assert Assessment({}, {"theta": math.nan}, 0.0).grade is None
+    assert "ask for no random torque" in Assessment({}, {"theta": 1.0}, 0.0).criterion
+
+
+def test_shares_and_nats_of_nothing_are_no_numbers() -> None:
+    end = assess({"theta": 0.0, "alpha": 2.0}, {"theta": 0.1, "alpha": 1.0}, {}, 5.0, 10)
+    assert math.isnan(end.explained["theta"]) and end.explained["alpha"] == 75.0
+    assert end.torque_nats == 0.5  # without a floor as for one channel
+    assert end.explained_text == "alpha 75.0 % of the baseline's squared error is explained"
+    assert math.isnan(assess({}, {}, {"theta": 0.1}, 5.0, 0).torque_nats)
+    written = end.to_dict()
+    assert written["explained_percent"] == {"theta": None, "alpha": 75.0}
+    assert written["remaining_over_noise"] == {"theta": None, "alpha": None}
+    assert assess({}, {}, {}, 5.0, 0).to_dict()["random_torque_nats_per_value"] is None
+
+
+def test_candidates_that_could_not_have_shown_are_a_step() -> None:
+    said = "2 of 9 candidates could not have shown here"
+    for verdict in Verdict:
+        steps = verdict.next_steps([("friction", "lag"), ("play", "delay")], 2, 9)
+        assert any(said in s for s in steps) is (verdict is not Verdict.NOT_EXCITED)
+        assert not any("candidates could not" in s for s in verdict.next_steps([], 0, 9))
+        pairs = [s for s in steps if "friction from lag" in s or "play from delay" in s]
+        assert len(pairs) == (2 if verdict is Verdict.AMBIGUOUS else 0)
+
+
+def test_the_machine_has_borne_the_most_of_any_recording() -> None:
+    """Of voltage, slew and deflection each for itself."""
+    k = np.arange(60)
+    slow, quick = (np.sin(k / 20), 0.5 * np.sin(k))
+    y = np.column_stack([np.cos(k / 9), 0.1 * np.cos(k / 9)])
+    both = tuple(
+        Recording(u=u, y=y * scale, Ts=Ts) for u, scale, Ts in ((slow, 2.0, 0.01), (quick, 1.0, 0.02))
+    )
+    limits = seen_limits(both)
+    assert limits.voltage == pytest.approx(np.max(np.abs(slow)))
+    assert limits.slew == pytest.approx(np.max(np.abs(np.diff(quick))) / 0.02)
+    assert limits.deflection == pytest.approx(0.2)
+    assert limits.margin == 0.0
+    alone = tuple(Recording(u=r.u, y=r.y[:, :1], Ts=r.Ts) for r in both)
+    assert seen_limits(alone).deflection == np.inf
+
+
+def test_sizes_in_windows_by_hand() -> None:
+    """One Gauss-Newton step of the amplitudes in each window, beside what a window moves of its own."""
+    rng = np.random.default_rng(0)
+    R, N, C = 2, 60, 2
+    names = ("hub.coulomb.level", "arm.inertia.inertia", "offset of a recording")
+    J, e = rng.standard_normal((3, R, N, C)), rng.standard_normal((R, N, C))
+    value, derivative = 0.03, 0.5
+    J[0] *= 20.0
+    problem: Any = SimpleNamespace(
+        supermodel=SimpleNamespace(mechanism=SimpleNamespace(parameter_names=names)),
+        seen=np.ones((R, N)),
+        slopes=lambda hypotheses: (
+            e[None],
+            np.concatenate([J, J[:1]])[None],
+        ),  # first states are beyond `moved`
+        windows=SimpleNamespace(of=lambda r: [(0, slice(0, 25)), (1, slice(25, N))]),
+    )
+    h: Any = SimpleNamespace(
+        whitener=lambda x, seen: x,
+        moved=3,
+        free=(1, 0),
+        local=(2,),
+        physical=lambda s: (
+            np.tile([value, 1.0, 0.2], (R, 1)),
+            np.tile([derivative, 1.0, 1.0], (R, 1)),
+        ),
+    )
+    sizes = window_sizes(problem, h, [EffectLocation("coulomb", "hub"), EffectLocation("lugre", "arm")])
+    wanted = acts = rest = 0.0
+    for r in range(R):
+        for samples in (slice(0, 25), slice(25, N)):
+            # Columns follow the free parameters, then those of a recording: the level is the second.
+            slope, other = J[1, r, samples].ravel() / derivative, J[2, r, samples].ravel()
+            left = e[r, samples].ravel()
+            slope, left = (x - other * (other @ x) / (other @ other) for x in (slope, left))
+            step = (slope @ left) / (slope @ slope)
+            wanted += np.sum((step * slope) ** 2)
+            acts += np.sum((value * slope) ** 2)
+            rest += left @ left
+    assert list(sizes) == [EffectLocation("coulomb", "hub")]
+    (found,) = sizes.values()
+    assert found.scatter == pytest.approx(np.sqrt(wanted / acts))
+    assert found.change == pytest.approx(np.sqrt(acts / rest))
