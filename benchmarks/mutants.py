@@ -55,12 +55,7 @@ AREAS: dict[str, tuple[Tested, ...]] = {
         Tested("discover/probabilities.py", ("test_probabilities.py",)),
     ),
     "covariance": (Tested("fit/inference.py", ("test_limits_of_intervals.py", "test_covariance.py")),),
-    "quality": (
-        Tested(
-            "recording/quality.py",
-            ("test_limits_of_quality.py", "test_recording.py", "test_recording_quality.py"),
-        ),
-    ),
+    "quality": (Tested("recording/quality.py", ("test_limits_of_quality.py", "test_recording.py")),),
     "verdict": (
         Tested(
             "discover/conclusion.py",
