@@ -9,8 +9,9 @@ its changed form, so the files stay as they are and compiled programs are found 
 traced into programs those are not kept. Tests stop at the first failure.
 
 Each answer is stored, and what is known of the same text of a module is not run again; `--again` runs those
-that survived once more, after tests were added. A survivor is to be read: it is a missing test, or it changes
-nothing that counts; then the reason goes into its row of the store, as "equivalent".
+that survived once more, after tests were added ("first" is what came out when they were drawn). A survivor is
+to be read: it is a missing test, or it changes nothing that counts; then the reason goes into its row of the
+store, as "equivalent".
 """
 
 import argparse
@@ -263,9 +264,10 @@ def tally(rows: list[dict[str, Any]]) -> str:
     from scipy.stats import beta
 
     n, k = len(rows), sum(r["noticed"] for r in rows)
-    same = sum("equivalent" in r for r in rows)
+    same, first = sum("equivalent" in r for r in rows), sum(r["first"] for r in rows)
     least = 100 * float(beta.ppf(0.05, k, n - k + 1)) if k else 0.0
     text = f"{k} of {n} noticed ({100 * k / n:.0f} %, at least {least:.0f} %)"
+    text += f", {first} when they were drawn" if first != k else ""
     return text + (f", {same} of the others change nothing" if same else "")
 
 
@@ -308,7 +310,8 @@ def main() -> None:
                 print(f"{tested.module}: its tests take {took:.0f} s", flush=True)
             begun = time.monotonic()
             found = noticed(folder, tested, tree, limits[tested])
-            kept[key] = {"area": area, "line": line, "change": what, "noticed": found}
+            first = old["first"] if old else found
+            kept[key] = {"area": area, "line": line, "change": what, "first": first, "noticed": found}
             write(asked.store, kept)
             word, took = "noticed " if found else "SURVIVED", time.monotonic() - begun
             print(f"  {word} {tested.module} {line}: {what[:90]} ({took:.0f} s)", flush=True)

@@ -116,10 +116,11 @@ def test_masked_rows_are_solved_and_others_kept(k: int, many: bool) -> None:
         np.testing.assert_allclose(found[:, n], expected, rtol=1e-7, atol=1e-8)
 
 
-def test_contacts_that_share_one_motion_share_the_torque() -> None:
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_contacts_that_share_one_motion_share_the_torque(size: float) -> None:
     """The ridge of 1e-10 of the largest entry: the solution of least norm, to the rounding it amplifies."""
-    matrix, mask = np.full((2, 2), 3.0), np.ones((2, 1), bool)
-    found = run(solve_masked, matrix, mask, np.full((2, 1), 6.0), np.zeros((2, 1)))
+    matrix, mask = np.full((2, 2), 3.0 * size), np.ones((2, 1), bool)
+    found = run(solve_masked, matrix, mask, np.full((2, 1), 6.0 * size), np.zeros((2, 1)))
     np.testing.assert_allclose(found, 1.0, rtol=1e-4)
 
 

@@ -110,6 +110,8 @@ def test_times_after_a_reversal() -> None:
     np.testing.assert_array_equal(found.masks, list(masks.values()))
     np.testing.assert_array_equal(found.edges, [0.0, *times, np.inf])
     np.testing.assert_array_equal(found.bins, np.searchsorted(times, since + 1e-9, side="right"))
+    at_the_end = localise._reversals(np.append(np.ones(29), -1.0), 0.0, 0.01, "the hub")
+    assert at_the_end is not None and at_the_end.masks[:, -1].all() and not at_the_end.masks[:, :-1].any()
 
 
 def share_of(share: float, expected: float, p: float, kind: str = "speed") -> ErrorShare:

@@ -159,6 +159,16 @@ def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: boo
     assert not found or cut_off(x, None, x, 0.01) == (1.0, 10)
 
 
+@pytest.mark.parametrize(("more", "found"), [(0, False), (1, True)])
+def test_twelve_samples_on_the_way_are_enough(more: int, found: bool) -> None:
+    """From a tenth away and back, at 11 or 12 a visit: a straight way. From a fifth away it is none."""
+    far = np.linspace(1.0, 0.25, 200)
+    close = [0.15, 0.15, 0.15, 0.09, *[0.045] * 3]
+    arrives = np.concatenate([far, close, [0.04] * more, [0.01]])
+    leaves = np.concatenate([[0.01], close[::-1], far[::-1]])
+    assert is_cut(1.0 - np.tile(np.concatenate([arrives, np.zeros(5), leaves]), 2)) == found
+
+
 @pytest.mark.parametrize(("samples", "found"), [(19, False), (20, True)])
 def test_a_push_both_ways_takes_twenty_samples(samples: int, found: bool) -> None:
     """A single stay at the end, in which the input, sampled slowly, is strongest both ways."""

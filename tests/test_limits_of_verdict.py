@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rotflex_jax.discover.conclusion import end_state, seen_limits, window_sizes
+from rotflex_jax.discover import conclusion
+from rotflex_jax.discover.conclusion import end_state, proposed, seen_limits, window_sizes
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.verdict import Assessment, Grade, Verdict, assess, grade
 from rotflex_jax.recording import Recording
@@ -16,25 +17,31 @@ SAMPLES = 1000  # of each of the two channels
 NEAR = 1.5  # times the noise of the sensor
 
 
-def ended(
+def told(
     *,
+    before: float = 100.0,
     ratio: float = 1.0,
     noise_nats: float = 0.0,
     rounds: tuple[tuple[str, ...], ...] = (),
     excited: int = 4,
     candidates: int = 4,
-) -> Verdict:
-    """The verdict of a search that ended so near to the noise, with these equivalents of each round."""
+) -> tuple[Verdict, str]:
+    """Verdict and sentence of a search that ended so near to the noise, with equivalents of each round."""
     floor = {"theta": 5e-4, "alpha": 2e-3}
     errors = {"theta": 5e-4, "alpha": 2e-3 * ratio}
-    baseline: Any = SimpleNamespace(held_out_rmse_windows={"theta": 5e-2, "alpha": 2e-1})
+    baseline: Any = SimpleNamespace(held_out_rmse_windows={c: before * e for c, e in errors.items()})
     final: Any = SimpleNamespace(
         held_out_rmse_windows=errors, process_noise_nats=noise_nats, window_seconds=2.0
     )
     found: Any = [SimpleNamespace(effect="coulomb", port="hub", equivalent=others) for others in rounds]
     ranking: Any = [SimpleNamespace(excited=k < excited) for k in range(candidates)]
     recordings: Any = [SimpleNamespace(N=SAMPLES // 2)] * 2
-    return end_state(baseline, found, final, floor, ranking, recordings)[0]
+    return end_state(baseline, found, final, floor, ranking, recordings)
+
+
+def ended(**given: Any) -> Verdict:
+    """The verdict alone."""
+    return told(**given)[0]
 
 
 @pytest.mark.parametrize(("share", "explained"), [(0.999, True), (1.001, False)])
@@ -167,3 +174,79 @@ def test_sizes_in_windows_by_hand() -> None:
     (found,) = sizes.values()
     assert found.scatter == pytest.approx(np.sqrt(wanted / acts))
     assert found.change == pytest.approx(np.sqrt(acts / rest))
+    # Nothing is said of what is nowhere, or of runs without an error.
+    e[:] = 0.0
+    assert window_sizes(problem, h, [EffectLocation("coulomb", "hub")]) == {}
+    e[:], J[1] = 1.0, 0.0
+    assert window_sizes(problem, h, [EffectLocation("coulomb", "hub")]) == {}
+
+
+HUB = "Coulomb friction at the hub"
+REACHED = "the held-out error over 2 s is theta 1.00, alpha 1.00 times the sensor noise"
+SHARE = "; theta > 99.99 %, alpha > 99.99 % of the baseline's squared error is explained"
+REMAINS = "something remains that no candidate explains"
+TORQUE = "predictions still ask for a random torque (0.1 nat per measured value, at most 0.07)"
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({}, f"Nothing is missing: {REACHED}."),
+        ({"excited": 3}, f"Nothing is missing: {REACHED}; 1 of 4 candidates could not have shown."),
+        ({"rounds": ((),)}, f"{HUB} explains the recording: {REACHED}{SHARE}."),
+        ({"rounds": ((),), "before": 1.0}, f"{HUB} explains the recording: {REACHED}."),
+        (
+            {"rounds": (("lag",),)},
+            f"{HUB} explains the recording, but it cannot distinguish this from others (listed with it): "
+            f"{REACHED}{SHARE}.",
+        ),
+        (
+            {"rounds": ((), ("lag",))},
+            f"{HUB} and {HUB} explain the recording, but it cannot distinguish some of them from others "
+            f"(listed with each): {REACHED}{SHARE}.",
+        ),
+        ({"ratio": 3.0}, f"S{REMAINS[1:]}: {REACHED.replace('alpha 1.', 'alpha 3.')}."),
+        (
+            {"noise_nats": 200.0, "rounds": ((),)},
+            f"{HUB} found, but {REMAINS}: {REACHED}; short runs are at the noise, but {TORQUE}{SHARE}.",
+        ),
+        (
+            {"excited": 1},
+            "Nothing was found, but 3 of 4 candidates could not have shown in this recording: move the "
+            "machine more, over more speeds and voltages.",
+        ),
+    ],
+)
+def test_the_sentence_gives_the_reason(given: dict[str, Any], sentence: str) -> None:
+    given = {"before": 1e4} | given
+    assert told(**given)[1] == sentence
+
+
+def test_the_first_effect_with_an_equal_is_asked_about(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the settings of the longest recording, whose first ten seconds the rival is fitted to."""
+    monkeypatch.setattr(conclusion, "next_experiment", lambda *given, **settings: (given, settings))
+    k = np.arange(3000)
+    y = np.column_stack([np.cos(k / 9), 0.1 * np.cos(k / 9)])
+    long, short = (Recording(u=np.sin(k[:n] / 20), y=y[:n], Ts=Ts) for n, Ts in ((3000, 0.01), (100, 0.02)))
+    rounds = [
+        SimpleNamespace(effect=effect, port="hub", equivalent=others)
+        for effect, others in (
+            ("cogging", ()),
+            ("coulomb", (("stribeck", "hub"), ("lag", "input"))),
+            ("dahl", (("lugre", "hub"),)),
+        )
+    ]
+    found: Any = SimpleNamespace(
+        rounds=rounds,
+        train=(short,),
+        validation=(long,),
+        noise_floor={"theta": 1e-3},
+        final=SimpleNamespace(process_noise={"hub": 0.0}),
+        model="the model",
+    )
+    given, settings = proposed(found, Ts=0.5)  # pyright: ignore[reportGeneralTypeIssues]
+    assert given == ("the model", ("coulomb", "hub"), ("stribeck", "hub"))
+    assert settings["Ts"] == 0.5 and settings["limits"] == seen_limits((short, long))
+    np.testing.assert_array_equal(settings["reference"], long.u[:1000])
+    found.rounds = rounds[:1]
+    assert proposed(found) is None
