@@ -283,7 +283,11 @@ def main() -> None:
     asked = parser.parse_args()
     kept: dict[str, dict[str, Any]] = json.loads(asked.store.read_text()) if asked.store.exists() else {}
     drawn = sample(asked.number, asked.seed)
-    import jax  # noqa: F401 - loaded once for all, and not started
+    # Loaded once for all, and not started.
+    import equinox  # noqa: F401
+    import hypothesis  # noqa: F401
+    import jax  # noqa: F401
+    import jinja2  # noqa: F401
     import matplotlib.pyplot  # noqa: F401
     import pytest  # noqa: F401
     import scipy.signal

@@ -76,6 +76,16 @@ def test_a_contact_alone_moves_from_event_to_event() -> None:
     assert 20 < rests < CASES / 2
 
 
+def test_a_contact_at_rest_without_a_drive_has_derivatives() -> None:
+    """It holds against what little drives it: the torque is less that over the mobility."""
+
+    def torque(v0, free, stop, up, down):
+        return independent_contacts(v0, free, stop, up, down).torque
+
+    slopes = run(jax.grad(torque, argnums=(0, 1, 2, 3, 4)), 0.0, 0.0, 2.0, 0.3, 0.4)
+    np.testing.assert_array_equal(slopes, [0.0, -0.5, 0.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize("side", [0.999, 1.001])
 def test_a_speed_is_zero_to_64_units_of_rounding(side: float) -> None:
     """Of the speeds that drive and friction give it in a step."""

@@ -47,13 +47,16 @@ def test_the_acceleration_of_a_parabola_is_known_between_the_jumps() -> None:
 def test_what_moves_is_five_times_its_error(share: float, moves: bool) -> None:
     x = np.where(RNG.random(400) < 0.5, 1.0, -1.0)
     x[:6] = 30.0  # two in a hundred may be further
-    assert (localise._sides("speed", x, "m/s", share / 5, WORDS) is not None) == moves
+    found = localise._sides("speed", x, "m/s", share / 5, WORDS)
+    assert (found is not None) == moves
+    assert found is None or found.edges[-1] == pytest.approx(1.0)  # ten steps of a tenth, no fewer
+    assert localise._sides("speed", np.zeros(400), "m/s", -1.0, WORDS) is None
 
 
 @pytest.mark.parametrize(("unit", "factor", "step"), [("m/s", 1.0, 0.1), ("rad", 180 / np.pi, 5.0)])
 def test_conditions_hold_where_they_say(unit: str, factor: float, step: float) -> None:
     """An eighth of what is reached, a round number in the unit that is read; for 3 to 60 % of the time."""
-    x = np.linspace(-0.83, 0.87, 1700)
+    x = np.concatenate([np.linspace(-0.83, 0.87, 1700), np.tile(0.1 * np.arange(-8, 9), 10)])
     reach = float(np.quantile(np.abs(x), 0.98))
     found = localise._sides("deflection", x, unit, 0.0, WORDS)
     assert found is not None
@@ -203,3 +206,8 @@ def test_bands_hold_their_share_of_the_power() -> None:
     np.testing.assert_allclose(found.where.profile, [power[m].sum() / power.sum() for m in inside])
     np.testing.assert_allclose(found.where.expected, [m.mean() for m in inside])
     assert found.where.p_value == 1 / 1000
+
+
+def test_a_share_of_all_or_of_nothing_has_a_divergence() -> None:
+    assert localise.relative_entropy(1.0, 0.2) == pytest.approx(np.log(5.0))
+    assert localise.relative_entropy(0.0, 0.2) == localise.relative_entropy(1.0, 1.0) == 0.0

@@ -174,6 +174,10 @@ def test_sizes_in_windows_by_hand() -> None:
     (found,) = sizes.values()
     assert found.scatter == pytest.approx(np.sqrt(wanted / acts))
     assert found.change == pytest.approx(np.sqrt(acts / rest))
+    e *= 1e-6
+    J *= 1e-6
+    again = window_sizes(problem, h, [EffectLocation("coulomb", "hub")])[EffectLocation("coulomb", "hub")]
+    assert again == pytest.approx(found)  # whatever the unit
     # Nothing is said of what is nowhere, or of runs without an error.
     e[:] = 0.0
     assert window_sizes(problem, h, [EffectLocation("coulomb", "hub")]) == {}
