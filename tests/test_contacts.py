@@ -1,5 +1,6 @@
 """Dry friction over one step against motion from event to event, and against all modes in turn."""
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -179,6 +180,16 @@ def test_coupled_contacts_take_the_one_mode_that_fits(k: int, missed: float) -> 
     np.testing.assert_array_equal(found.crossed, rest)
     assert (found.holds[at_zero] == 1).all() and (found.holds[~rest] == 0).all()
     assert (found.t[rest] == 0).all()
+
+
+def test_a_single_pass_lets_no_contact_go() -> None:
+    """Torques that would hold all, each limited to its level."""
+    rng = np.random.default_rng(7)
+    stop, free = positive_definite(rng, 2, 2), rng.normal(size=(2, CASES))
+    up, down = rng.uniform(0.2, 1.5, size=(2, 2, CASES))
+    once = functools.partial(coupled_contacts, passes=1)
+    found = run(once, np.zeros((2, CASES)), free, stop, up, down)
+    np.testing.assert_allclose(found.torque, np.clip(-np.linalg.solve(stop, free), -up, down), atol=1e-9)
 
 
 def test_three_contacts_on_two_coordinates_rest_together() -> None:

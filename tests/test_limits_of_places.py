@@ -211,3 +211,19 @@ def test_bands_hold_their_share_of_the_power() -> None:
 def test_a_share_of_all_or_of_nothing_has_a_divergence() -> None:
     assert localise.relative_entropy(1.0, 0.2) == pytest.approx(np.log(5.0))
     assert localise.relative_entropy(0.0, 0.2) == localise.relative_entropy(1.0, 1.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("share", "said"),
+    [
+        (1e-5, "0.1 %"),
+        (0.0099, "1.0 %"),
+        (0.01, "1 %"),
+        (0.9949, "99 %"),
+        (0.995, "99.5 %"),
+        (0.9994, "99.9 %"),
+        (0.9996, "all"),
+    ],
+)
+def test_shares_as_they_are_read(share: float, said: str) -> None:
+    assert localise.percent(share) == said

@@ -73,7 +73,7 @@ def test_more_than_half_of_the_candidates_must_have_shown() -> None:
 
 @pytest.mark.parametrize(
     ("times", "expected"),
-    [(1.499, Grade.NOISE), (1.501, Grade.NEAR), (4.99, Grade.NEAR), (5.01, Grade.FAR), (math.nan, None)],
+    [(1.499, Grade.NOISE), (1.5, Grade.NEAR), (4.99, Grade.NEAR), (5.0, Grade.FAR), (math.nan, None)],
 )
 def test_the_grade_of_an_error(times: float, expected: Grade | None) -> None:
     assert grade(times) is expected
