@@ -614,3 +614,10 @@ def mutants_noticed() -> str:
 def mutants_same() -> str:
     """How many of the others change nothing."""
     return str(sum("equivalent" in r for r in _mutants()))
+
+
+@named
+def mutants_fresh() -> str:
+    """How many of a second sample were noticed when they were drawn."""
+    rows = results("mutants_fresh.json").values()
+    return f"{sum(r['first'] for r in rows)} of {len(rows)}"
