@@ -585,3 +585,41 @@ for _name, (_row_name, _base) in BESIDE.items():
     NAMED[f"{_name}_beside"] = lambda base=_base: _digits(_cost(base))
     NAMED[f"{_name}_ratio"] = lambda row=_row_name, base=_base: f"{_cost(row) / _cost(base):.2g}"
     NAMED[f"{_name}_gain"] = lambda row=_row_name, base=_base: _digits(_cost(base) / _cost(row))
+
+
+# -- mutants ------------------------------------------------------------------------------------------------
+
+
+def _mutants() -> list[dict[str, Any]]:
+    return list(results("mutants.json").values())
+
+
+@named
+def mutants_drawn() -> str:
+    """Changes of a constant or an operator that were tried in modules that decide."""
+    return str(len(_mutants()))
+
+
+@named
+def mutants_first() -> str:
+    """How many of them the tests noticed when they were drawn."""
+    return str(sum(r["first"] for r in _mutants()))
+
+
+@named
+def mutants_noticed() -> str:
+    """How many of them the tests notice now."""
+    return str(sum(r["noticed"] for r in _mutants()))
+
+
+@named
+def mutants_same() -> str:
+    """How many of the others change nothing."""
+    return str(sum("equivalent" in r for r in _mutants()))
+
+
+@named
+def mutants_fresh() -> str:
+    """How many of a second sample were noticed when they were drawn."""
+    rows = results("mutants_fresh.json").values()
+    return f"{sum(r['first'] for r in rows)} of {len(rows)}"

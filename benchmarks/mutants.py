@@ -1,36 +1,76 @@
 """Change one constant or operator of a module at a time and run its tests: which changes does no test notice?
 
-    python benchmarks/mutants.py [--number 48] [--seed 0] [--only selection]
+    python benchmarks/mutants.py [--number 150] [--seed 21] [--only selection] [--again] [--store FILE]
 
-The sample is fixed by its seed. The working tree is copied, each mutant gets a process of its own, and the
-tests stop at the first failure. A mutant that survives is printed with its line, to be read: it is a missing
-test, or it changes nothing that counts.
+The sample is fixed by its seed: as many places from each area of `AREAS`. Left out are annotations and what
+guards against a mistake of the programmer and changes no result (`strict` of zip, `frozen` of a dataclass).
+The working tree is copied once. Each mutant is a process of its own at low priority that loads the module in
+its changed form, so the files stay as they are and compiled programs are found again; for modules that are
+traced into programs those are not kept. Tests stop at the first failure.
+
+Each answer is stored, and what is known of the same text of a module is not run again; `--again` runs those
+that survived once more, after tests were added ("first" is what came out when they were drawn). A survivor is
+to be read: it is a missing test, or it changes nothing that counts; then the reason goes into its row of the
+store, as "equivalent".
 """
 
 import argparse
 import ast
+import contextlib
+import hashlib
+import importlib
+import importlib.util
+import itertools
+import json
 import os
 import random
 import shutil
+import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Iterator
+from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
+from types import CodeType
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = {
-    "discover/selection.py": ("test_discover_selection.py",),
-    "discover/probabilities.py": ("test_discover_probabilities.py",),
-    "discover/localise.py": ("test_discover_localise.py",),
-    "discover/conclusion.py": (
-        "test_discover_conclusion.py",
-        "test_discover_verdict.py",
+STORE = Path(__file__).with_name("results") / "mutants.json"
+
+
+class Tested(NamedTuple):
+    """A module, its tests (files, cheap ones first), and whether it is traced into programs."""
+
+    module: str
+    tests: tuple[str, ...]
+    traced: bool = False
+
+
+AREAS: dict[str, tuple[Tested, ...]] = {
+    "decision": (
+        Tested(
+            "discover/selection.py",
+            ("test_discover_selection.py", "test_discover_evaluation.py"),
+        ),
+        Tested("discover/probabilities.py", ("test_discover_probabilities.py",)),
     ),
-    "mechanism/friction.py": ("test_mechanism.py", "test_mechanism_load_friction.py"),
+    "covariance": (Tested("fit/inference.py", ("test_fit_inference.py",)),),
+    "quality": (Tested("recording/quality.py", ("test_recording_quality.py",)),),
+    "verdict": (
+        Tested(
+            "discover/conclusion.py",
+            ("test_discover_conclusion.py", "test_discover_verdict.py"),
+        ),
+        Tested("discover/verdict.py", ("test_discover_conclusion.py", "test_discover_verdict.py")),
+    ),
+    "localisation": (Tested("discover/localise.py", ("test_discover_localise.py",)),),
+    "friction": (Tested("mechanism/friction.py", ("test_mechanism_friction.py",), traced=True),),
 }
-LONGEST = 600.0
-"""A mutant whose tests take longer hangs, and counts as noticed [s]."""
+LEAST_LIMIT, LIMIT = 60.0, 6.0
+"""A mutant hangs, and counts as noticed, after so many seconds or times what its tests take."""
+_GUARDS = ("strict", "frozen")
 _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -51,11 +91,16 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
 }
 
 
+# -- what is changed --------------------------------------------------------------------------------
+
+
 def places(tree: ast.AST) -> Iterator[ast.AST]:
-    """Nodes that can be changed; not texts, and not what annotations say."""
+    """Nodes that can be changed."""
     skipped: set[int] = set()
     for node in ast.walk(tree):
-        for part in (getattr(node, "annotation", None), getattr(node, "returns", None)):
+        parts = [getattr(node, "annotation", None), getattr(node, "returns", None)]
+        parts += [node.value] if isinstance(node, ast.keyword) and node.arg in _GUARDS else []
+        for part in parts:
             skipped |= {id(inner) for inner in ast.walk(part)} if part is not None else set()
     for node in ast.walk(tree):
         if id(node) in skipped:
@@ -66,8 +111,8 @@ def places(tree: ast.AST) -> Iterator[ast.AST]:
             yield node
 
 
-def mutant(text: str, number: int) -> tuple[str, int, str]:
-    """The text with one place changed, the line of it, and what was changed."""
+def mutant(text: str, number: int) -> tuple[ast.AST, int, str]:
+    """The tree of a text with one place changed, the line of it, and what was changed."""
     tree = ast.parse(text)
     node = list(places(tree))[number]
     before = ast.unparse(node)
@@ -84,64 +129,209 @@ def mutant(text: str, number: int) -> tuple[str, int, str]:
         node.ops[0] = _SWAPPED[type(node.ops[0])]()  # type: ignore[assignment]
     else:
         node.op = _SWAPPED[type(node.op)]()  # type: ignore[attr-defined]
-    return ast.unparse(tree), getattr(node, "lineno", 0), f"{before} -> {ast.unparse(node)}"
+    return tree, getattr(node, "lineno", 0), f"{before} -> {ast.unparse(node)}"
 
 
-def noticed(folder: Path, tests: tuple[str, ...]) -> bool:
-    """Whether the tests of a copy fail, in a process of its own that has only the libraries in common."""
+def sample(number: int, seed: int) -> dict[str, list[tuple[Tested, int]]]:
+    """So many places in all, evenly from the areas: module and number of the place."""
+    draw, drawn = random.Random(seed), dict[str, list[tuple[Tested, int]]]()
+    left = number
+    for k, (area, modules) in enumerate(AREAS.items()):
+        there = [(m, n) for m in modules for n in range(len(list(places(ast.parse(source(m))))))]
+        count = min(round(left / (len(AREAS) - k)), len(there))
+        drawn[area] = sorted(draw.sample(there, count), key=there.index)
+        left -= count
+    return drawn
+
+
+def in_turn(drawn: dict[str, list[tuple[Tested, int]]]) -> Iterator[tuple[str, Tested, int]]:
+    """One of each area after the other, so that all have had some where it is stopped."""
+    for row in itertools.zip_longest(
+        *([(area, *place) for place in chosen] for area, chosen in drawn.items())
+    ):
+        yield from (place for place in row if place is not None)
+
+
+def row_name(tested: Tested, number: int) -> str:
+    """Name of a mutant in the store: module, version of its text, place."""
+    return f"{tested.module} {hashlib.sha256(source(tested).encode()).hexdigest()[:12]} {number}"
+
+
+def source(tested: Tested) -> str:
+    """Text of a module."""
+    return (ROOT / "rotflex_jax" / tested.module).read_text()
+
+
+# -- a process with the changed module --------------------------------------------------------------
+
+
+class Changed(SourceFileLoader):
+    """Finds one module by its name, and loads other code in its place."""
+
+    def __init__(self, name: str, path: str, code: CodeType) -> None:
+        super().__init__(name, path)
+        self._code = code
+
+    def get_code(self, fullname: str) -> CodeType:
+        """The changed code."""
+        del fullname
+        return self._code
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """Of this module alone."""
+        del path, target
+        return (
+            importlib.util.spec_from_file_location(name, self.path, loader=self)
+            if name == self.name
+            else None
+        )
+
+
+def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
+    """Runs in the child: status of the tests; the module as it is where there is no tree."""
+    os.setpgid(0, 0)
+    os.nice(10)
+    os.chdir(folder)
+    with open(folder / "said.log", "w") as said:
+        os.dup2(said.fileno(), 1)
+        os.dup2(said.fileno(), 2)
+    os.environ["PYTHONPATH"] = str(folder)
+    if tested.traced:
+        os.environ["ROTFLEX_PROGRAMS"] = "off"  # they are known by the files, which do not change
+    sys.path[:0] = [str(folder)]
+    name = "rotflex_jax." + tested.module.removesuffix(".py").replace("/", ".")
+    if tree is not None:
+        file = str(folder / "rotflex_jax" / tested.module)
+        sys.meta_path.insert(0, Changed(name, file, compile(tree, file, "exec", dont_inherit=True)))
+    importlib.import_module(name)
+    import pytest
+
+    # Shapes are not checked, which saves time; so no mutant is noticed by a shape alone.
+    options = [
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-o",
+        "addopts=--import-mode=importlib --doctest-modules",
+    ]
+    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of libraries that are loaded already
+    files = [f"rotflex_jax/{tested.module}", *(f"tests/{test}" for test in tested.tests)]
+    return int(pytest.main([*options, *files]))
+
+
+def noticed(folder: Path, tested: Tested, tree: ast.AST | None, limit: float) -> bool:
+    """Whether tests fail, or go on for longer than the limit [s]."""
     child = os.fork()
     if not child:
-        import pytest
-
-        os.chdir(folder)
-        sys.path[:0] = [str(folder)]
-        with open(folder / "said.log", "w") as said:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
-        status = pytest.main(["-x", "-q", "-p", "no:warnings", *(f"tests/{name}" for name in tests)])
-        os._exit(int(status))
+        status = 1
+        try:
+            status = run_tests(folder, tested, tree)
+        except BaseException:  # a module that cannot be loaded is noticed
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
     begun = time.monotonic()
-    while time.monotonic() - begun < LONGEST:
+    while time.monotonic() - begun < limit:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
             return status != 0
-        time.sleep(0.1)
-    os.kill(child, 9)
+        time.sleep(0.05)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
     return True
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--number", type=int, default=48)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="")
-    asked = parser.parse_args()
-    draw = random.Random(asked.seed)
-    each = -(-asked.number // len(TESTS))
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary) / "tree"
-        ignored = shutil.ignore_patterns(".git", "__pycache__", "_build", ".venv")
-        shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
-        import jax  # noqa: F401 - loaded once for all, and not started
-        import pytest  # noqa: F401
+def copy(folder: Path) -> None:
+    """The working tree without what is not read, and with the folder of compiled code in common."""
+    ignored = shutil.ignore_patterns(".git", "__pycache__", "_build", ".venv", ".*_cache", ".hypothesis")
+    shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
+    (ROOT / ".pytest_cache").mkdir(exist_ok=True)
+    (folder / ".pytest_cache").symlink_to(ROOT / ".pytest_cache")
 
-        for name, tests in TESTS.items():
-            text = (ROOT / "rotflex_jax" / name).read_text()
-            count = sum(1 for _ in places(ast.parse(text)))
-            chosen = sorted(draw.sample(range(count), min(each, count)))
-            if asked.only not in name:
+
+# -- what is known ----------------------------------------------------------------------------------
+
+
+def tally(rows: list[dict[str, Any]]) -> str:
+    """How many are noticed, with the least share that 95 % allow (Clopper and Pearson)."""
+    from scipy.stats import beta
+
+    n, k = len(rows), sum(r["noticed"] for r in rows)
+    same, first = sum("equivalent" in r for r in rows), sum(r["first"] for r in rows)
+    least = 100 * float(beta.ppf(0.05, k, n - k + 1)) if k else 0.0
+    text = f"{k} of {n} noticed ({100 * k / n:.0f} %, at least {least:.0f} %)"
+    text += f", {first} when they were drawn" if first != k else ""
+    return text + (f", {same} of the others change nothing" if same else "")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--number", type=int, default=150, help="mutants in all")
+    parser.add_argument("--seed", type=int, default=21)
+    parser.add_argument("--only", default="", help="part of an area or of the name of a module")
+    parser.add_argument("--again", action="store_true", help="run survivors once more")
+    parser.add_argument("--store", type=Path, default=STORE)
+    asked = parser.parse_args()
+    kept: dict[str, dict[str, Any]] = json.loads(asked.store.read_text()) if asked.store.exists() else {}
+    drawn = sample(asked.number, asked.seed)
+    # Loaded once for all, and not started.
+    import equinox  # noqa: F401
+    import hypothesis  # noqa: F401
+    import jax  # noqa: F401
+    import jinja2  # noqa: F401
+    import matplotlib.pyplot  # noqa: F401
+    import pytest  # noqa: F401
+    import scipy.signal
+    import scipy.stats  # noqa: F401
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, limits = Path(temporary) / "tree", dict[Tested, float]()
+        copy(folder)
+        for area, tested, number in in_turn(drawn):
+            text = source(tested)
+            tree, line, what = mutant(text, number)
+            key = row_name(tested, number)
+            old = kept.get(key)
+            known = old and (old["noticed"] or "equivalent" in old or not asked.again)
+            if known or (asked.only not in area and asked.only not in tested.module):
                 continue
-            begun = time.perf_counter()
-            if noticed(folder, tests):
-                sys.exit(f"{name}: its tests fail as it is\n" + (folder / "said.log").read_text()[-2000:])
-            print(f"{name}: {count} places, tests take {time.perf_counter() - begun:.0f} s", flush=True)
-            for number in chosen:
-                changed, line, what = mutant(text, number)
-                (folder / "rotflex_jax" / name).write_text(changed)
-                word = "noticed " if noticed(folder, tests) else "SURVIVED"
-                print(f"  {word} line {line}: {what[:90]}", flush=True)
-            (folder / "rotflex_jax" / name).write_text(text)
+            if tested not in limits:
+                begun = time.monotonic()
+                if noticed(folder, tested, None, 3600):
+                    said = (folder / "said.log").read_text()[-2000:]
+                    sys.exit(f"{tested.module}: its tests fail as it is\n{said}")
+                took = time.monotonic() - begun
+                limits[tested] = max(LEAST_LIMIT, LIMIT * took)
+                print(f"{tested.module}: its tests take {took:.0f} s", flush=True)
+            begun = time.monotonic()
+            found = noticed(folder, tested, tree, limits[tested])
+            first = old["first"] if old else found
+            kept[key] = {"area": area, "line": line, "change": what, "first": first, "noticed": found}
+            write(asked.store, kept)
+            word, took = "noticed " if found else "SURVIVED", time.monotonic() - begun
+            print(f"  {word} {tested.module} {line}: {what[:90]} ({took:.0f} s)", flush=True)
+    total = []
+    for area, chosen in drawn.items():
+        keys = [row_name(*place) for place in chosen]
+        rows = [kept[key] for key in keys if key in kept]
+        total += rows
+        if rows:
+            print(f"{area}: {tally(rows)}")
+    if total:
+        print(f"all: {tally(total)}")
+
+
+def write(store: Path, kept: dict[str, dict[str, Any]]) -> None:
+    """Beside the file and renamed, so that a stop loses nothing."""
+    store.parent.mkdir(parents=True, exist_ok=True)
+    beside = store.with_name(f".{store.name}")
+    beside.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
+    beside.replace(store)
 
 
 if __name__ == "__main__":

@@ -97,6 +97,20 @@ def test_candidates_whose_score_the_winner_took_are_refitted_too():
     # Two at most, those that promised most over both horizons.
     gone = ({}, {})
     assert replaced(before, gone) == ["gravity", "cogging"]
+    # However little they promised.
+    assert replaced(({"gravity": 1.5, "coulomb": 0.5}, {}), gone) == ["gravity", "coulomb"]
+
+
+@pytest.mark.parametrize(("nats", "taken"), [(24.9, False), (25.1, True)])
+def test_a_quarter_of_the_best_score_was_much(nats: float, taken: bool):
+    before = ({"gravity": 100.0, "coulomb": nats}, {})
+    assert ("coulomb" in replaced(before, ({"gravity": 100.0}, {}))) is taken
+
+
+@pytest.mark.parametrize(("left", "taken"), [(4.9, True), (5.1, False)])
+def test_a_tenth_of_a_score_is_nothing(left: float, taken: bool):
+    before = ({"gravity": 100.0, "coulomb": 50.0}, {})
+    assert ("coulomb" in replaced(before, ({"gravity": 100.0, "coulomb": left}, {}))) is taken
 
 
 def test_errors_name_the_data_they_are_on():

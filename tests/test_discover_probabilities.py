@@ -1,6 +1,7 @@
 """Probabilities of sets of effects: known evidence, scatter, credible sets, what is told of them."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ from rotflex_jax.discover.probabilities import (
     FittedSet,
     Probabilities,
     SetProbability,
+    best_blocks,
+    fitted_sets,
     probabilities,
     set_probabilities,
 )
+from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.errors import InputError
 
 BLOCKS = 12
@@ -161,6 +165,44 @@ def test_a_sentence_names_three_sets_at_most_and_none_below_a_hundredth():
     assert "delay" in told(0.5, 0.2, 0.15, 0.13) and "cogging" not in told(0.5, 0.2, 0.15, 0.13)
     # Of many that are all unlikely the first is named.
     assert "Coulomb friction at hub < 1 %; none" in told(0.009, 0.008)
+
+
+def fit_of(*names: str, train=0.0, held_out=0.0, free_run=None):
+    """A fit of effects at the hub with log-likelihoods in training and on validation data."""
+    locations = tuple(EffectLocation(n, "hub") for n in names)
+    hypothesis = SimpleNamespace(locations=locations, log_likelihood=train)
+    blocks = np.array([train, held_out])
+    return SimpleNamespace(hypothesis=hypothesis, log_likelihood=held_out, blocks=blocks, free_run=free_run)
+
+
+def test_of_fits_that_are_as_likely_in_training_the_better_on_validation_data_counts():
+    """To one nat; a fit that missed the minimum does not count, however well it does there."""
+    first, as_likely, missed = (
+        fit_of(train=10.0),
+        fit_of(train=9.1, held_out=3.0),
+        fit_of(train=8.9, held_out=9.0),
+    )
+    assert best_blocks([first, as_likely, missed]) is as_likely.blocks
+    assert best_blocks([first, missed]) is first.blocks
+    assert best_blocks([]) is None
+
+
+@pytest.mark.parametrize("at", ["prediction", "free_run"])
+def test_a_set_has_what_its_fits_say_at_each_horizon(at):
+    offset = EffectLocation("voltage_offset", "hub")
+    model = SimpleNamespace(calibrations=(offset, EffectLocation("sensor_bias", "hub")))
+    horizons = SimpleNamespace(
+        prediction=SimpleNamespace(problem=SimpleNamespace(supermodel=model)), free_run=SimpleNamespace()
+    )
+    runs = fit_of("coulomb", train=5.0)
+    both = fit_of("coulomb", "sensor_bias", train=1.0, free_run=runs)
+    alone = fit_of("lag", train=2.0)
+    first, second = fitted_sets(horizons, [both], [alone], getattr(horizons, at), [offset])
+    assert first.effects == {"coulomb@hub", "voltage_offset@hub"}
+    assert first.prediction is both.blocks and first.free_run is runs.blocks
+    assert second.effects == {"lag@hub", "voltage_offset@hub"}
+    assert second.prediction is (alone.blocks if at == "prediction" else None)
+    assert second.free_run is (alone.blocks if at == "free_run" else None)
 
 
 def test_calibration_error_by_hand():

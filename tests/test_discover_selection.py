@@ -9,7 +9,19 @@ import small_problem as sp
 from rotflex_jax.discover import selection
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
 from rotflex_jax.discover.likelihood import in_blocks, levenberg_marquardt
-from rotflex_jax.discover.selection import admissible, choose, distinguished, paired_gain, runs_clearly_better
+from rotflex_jax.discover.result import HorizonGain
+from rotflex_jax.discover.selection import (
+    admissible,
+    best_window_rmse,
+    choose,
+    describe,
+    distinguished,
+    helps,
+    horizon_gains,
+    paired_gain,
+    runs_clearly_better,
+    shares_of_gain,
+)
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.fit.dataset import StackedRecordings
@@ -468,3 +480,61 @@ def test_uncertain_free_runs_are_enough_where_predictions_run_a_tenth_better(sid
 def test_or_where_predictions_are_three_and_a_half_deviations_sure(side: float) -> None:
     found = at_both(not_quite_sure(3.5 * side, windows=10.0 * np.exp(-0.05)), {"windows": 10.0}, COULOMB)
     assert admissible(found, FAR, DATA, NOISE) is (side > 1)
+
+
+@SIDES
+def test_far_from_the_noise_a_rival_with_nine_tenths_of_the_gain_is_alike(side: float) -> None:
+    """On validation and on training data together, although the likelihood distinguishes the two."""
+    strong = trial(ARM, held_out=1000.0, train=1000.0, windows=5.0)
+    weak = trial(COULOMB, held_out=900.0 * side, train=900.0, windows=5.0)
+    assert distinguished(strong, weak)
+    assert (choose([strong, weak], BASE, DATA, NOISE)[1] == [weak]) is (side > 1)
+
+
+@SIDES
+def test_a_horizon_helps_beyond_one_and_a_half_deviations(side: float) -> None:
+    assert helps(HorizonGain(10.0, 1.5 * side, 1.0)) is (side > 1)
+    assert not helps(HorizonGain(-10.0, 1.5 * side, 1.0))
+
+
+def both_gains():
+    """A candidate and the model before it, with leads by hand at both horizons."""
+    predicts = {"held_out": 40.0, "train": 60.0, "windows": 5.0, "scatter": scatter_for(4.0, 40.0)}
+    runs = {"held_out": 20.0, "train": 30.0, "windows": 2.0, "scatter": scatter_for(5.0, 20.0)}
+    return at_both(predicts, runs, COULOMB), at_both({"windows": 10.0}, {"windows": 8.0})
+
+
+def test_gains_at_both_horizons_are_told_with_their_certainty() -> None:
+    candidate, before = both_gains()
+    prediction, runs = horizon_gains(candidate, before)
+    assert runs is not None
+    assert prediction == pytest.approx((40.0, 4.0, 0.5, 60.0))
+    assert runs == pytest.approx((20.0, 5.0, 0.25, 30.0))
+    said = "coulomb at the hub: 40 nats on validation data (z 4.0), 60 on training data (z 6.0), "
+    said += "free-run error 0.5 times as large"
+    more = "; fitted to free runs 0.25 times (z 5.0, training 7.5)"
+    assert describe(candidate, before).endswith(said.partition(": ")[2] + more)
+    # Where one of the two was fitted to predictions alone, they are all there is.
+    for pair in (
+        (dataclasses.replace(candidate, free_run=None), before),
+        (candidate, dataclasses.replace(before, free_run=None)),
+    ):
+        assert horizon_gains(*pair) == (prediction, None)
+        assert describe(*pair).endswith(said.partition(": ")[2])
+
+
+def test_shares_of_the_most_add_up_over_the_horizons() -> None:
+    candidate, before = both_gains()
+    half = at_both({"held_out": 20.0}, {"held_out": 15.0}, ARM)
+    worse = at_both({"held_out": -9.0}, {"held_out": -9.0}, ARM)
+    np.testing.assert_allclose(shares_of_gain([candidate, half, worse], before), [2.0, 0.5 + 0.75, 0.0])
+    # One without free runs leaves the comparison to predictions.
+    alone = dataclasses.replace(half, free_run=None)
+    np.testing.assert_allclose(shares_of_gain([candidate, alone], before), [1.0, 0.5])
+
+
+@SIDES
+def test_parameters_of_predictions_suit_free_runs_better_by_a_hundredth(side: float) -> None:
+    found = at_both({"windows": 5.0 * np.exp(-0.01 * side)}, {"windows": 5.0}, COULOMB)
+    best = found if side > 1 else found.free_run
+    np.testing.assert_array_equal(best_window_rmse(found), best.window_rmse)

@@ -5,14 +5,18 @@ import pytest
 from scipy.signal import lfilter
 
 from rotflex_jax.fit.inference import (
+    Combination,
     RecordingSlopes,
     bandwidth,
     by_recording,
+    combined_covariance,
     correlation_length,
     curvature,
+    estimates,
     nats_that_count,
     sandwich,
 )
+from rotflex_jax.parameters import Specification
 
 N, RUNS = 1000, 600
 
@@ -151,6 +155,9 @@ def test_correlation_length_of_white_noise_and_of_nothing():
     assert correlation_length(np.zeros((100, 2))) == 2
     drift = np.linspace(-1, 1, 500)[:, None]
     assert correlation_length(drift) == 50  # never more than a tenth of the recording
+    assert correlation_length(1e-9 * drift) == 50  # whatever its unit
+    assert correlation_length(drift[:15]) == bandwidth(drift[:15]) == 1
+    assert correlation_length(drift[:5]) == bandwidth(drift[:5]) == 1
 
 
 COUNT = 10_000
@@ -209,3 +216,47 @@ def test_nats_of_errors_that_go_on_count_less() -> None:
         parts = [RecordingSlopes(np.ones((COUNT, 1, 1)), e[:, None] / e.std(), np.arange(1))]
         most.append(nats_that_count(parts, curvature(parts, 1)))
     assert np.mean(most) == pytest.approx((1 + a) / (1 - a), rel=0.25)
+
+
+def test_slopes_or_errors_that_are_no_numbers_determine_nothing() -> None:
+    rng = np.random.default_rng(6)
+    J, e = rng.standard_normal((2, COUNT, 1))
+    for bad_slope, bad_error in ((np.nan, 0.0), (0.0, np.inf), (0.0, np.nan)):
+        slopes, errors = J.copy(), e.copy()
+        slopes[7] += bad_slope
+        errors[7] += bad_error
+        assert np.isnan(spread(slopes, errors[:, 0])).all()
+    parts = [RecordingSlopes(np.full((COUNT, 1, 1), np.nan), e, np.arange(1))]
+    assert nats_that_count(parts, curvature(parts, 1)) == 1.0
+
+
+@pytest.mark.parametrize("samples", [100_000, 400])
+@pytest.mark.parametrize(("share", "length"), [(0.99, 2), (1.01, 4)])
+def test_errors_are_correlated_above_a_twentieth_and_above_their_scatter(
+    samples: int, share: float, length: int
+) -> None:
+    """Neighbours whose correlation is that by construction: 0.05, or 2 over the root of the samples."""
+    limit, w = max(0.05, 2 / np.sqrt(samples)), np.random.default_rng(7).standard_normal(samples)
+
+    def neighbours(part: float) -> tuple[np.ndarray, float]:
+        e = w + part * np.roll(w, 1)
+        e -= e.mean()
+        return e, float(e[1:] @ e[:-1] / (e @ e))
+
+    low, high = -0.5, 0.5
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if neighbours(middle)[1] < share * limit else (low, middle)
+    assert correlation_length(neighbours(low)[0][:, None]) == length
+
+
+def test_a_parameter_is_a_weighted_sum_of_what_was_fitted() -> None:
+    A = np.random.default_rng(8).standard_normal((3, 3)) * 1e-3
+    covariance = A @ A.T
+    sums = [Combination([0, 2], np.array([1.0, -2.0])), Combination([1], np.array([3.0]))]
+    W = np.array([[1.0, 0.0, -2.0], [0.0, 3.0, 0.0]])
+    np.testing.assert_allclose(combined_covariance(covariance, sums), W @ covariance @ W.T)
+    spec = Specification("N m", 0.01)
+    first, held = estimates(["a", "b"], np.array([1.0, 2.0]), [spec] * 2, [sums[0], None], covariance)
+    assert first.std == pytest.approx(np.sqrt((W @ covariance @ W.T)[0, 0]))
+    assert (held.value, held.free) == (2.0, False) and np.isnan(held.std)

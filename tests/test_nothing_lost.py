@@ -180,7 +180,7 @@ def test_rounds_of_an_earlier_start_are_not_overwritten_by_fewer(tmp_path: Path)
 def test_killed_at_random_moments_nothing_is_lost(tmp_path: Path) -> None:
     """A slice of `benchmarks/kills.py`, with the programs of other tests."""
     programs = Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled" / "programs"
-    assert len(list(kills(3, 1, tmp_path, programs, kinds=("search",)))) == 3
+    assert len(list(kills(2, 1, tmp_path, programs, kinds=("search",)))) == 2
 
 
 SCRIPT = """

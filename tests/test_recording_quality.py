@@ -10,7 +10,13 @@ import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import INPUTS, make_record
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.quality import is_absolute
+from rotflex_jax.recording.quality import (
+    cut_off,
+    is_absolute,
+    is_swapped,
+    quantisation_step,
+    whole_numbers,
+)
 from rotflex_jax.recording.samples import even_spacing
 
 # Effects that could look like it: they hold the arm, pull it, bend an angle, or act while nothing moves.
@@ -125,11 +131,233 @@ def test_times_are_even_to_a_hundredth(late: float, said: str | None) -> None:
         even_spacing(t, "Time")
 
 
-@pytest.mark.parametrize(("volts", "accepted"), [(0.0, False), (1e-13, False), (1e-11, True)])
-def test_input_is_constant_below_a_trillionth(volts: float, accepted: bool) -> None:
-    u = 1.0 + volts * np.where(K % 2, 0.5, -0.5)
+@pytest.mark.parametrize(("volts", "accepted"), [(0.0, False), (8e-13, False), (1.2e-12, True)])
+@pytest.mark.parametrize("scale", [0.01, 1.0, 50.0])
+def test_input_is_constant_below_a_trillionth(volts: float, accepted: bool, scale: float) -> None:
+    u = scale * (1.0 + volts * np.where(K % 2, 0.5, -0.5))
     if accepted:
         assert kinds(u=u) is not None
         return
     with pytest.raises(InputError, match="throughout"):
         kinds(u=u)
+
+
+# -- steps of an encoder ----------------------------------------------------------------------------
+
+EPS = np.finfo(float).eps
+
+
+@pytest.mark.parametrize(("levels", "step"), [(9, None), (10, 0.25)])
+def test_a_step_needs_ten_levels(levels: int, step: float | None) -> None:
+    assert quantisation_step(0.25 * (np.arange(200.0) % levels)) == step
+
+
+@pytest.mark.parametrize(("repeated", "step"), [(0, None), (1, 0.25)])
+def test_a_step_needs_a_level_that_comes_back(repeated: int, step: float | None) -> None:
+    assert quantisation_step(0.25 * np.append(np.arange(50.0), np.arange(repeated))) == step
+
+
+@pytest.mark.parametrize(("off", "found"), [(0.0498, True), (0.0502, False)])
+def test_levels_lie_on_a_lattice_to_a_twentieth_of_its_step(off: float, found: bool) -> None:
+    levels = np.arange(4001.0)
+    levels[2000] += off  # in the middle, where it moves the lattice by a 4001st of that
+    step = quantisation_step(np.append(levels, levels))
+    assert (step is not None) == found
+    assert step is None or step == pytest.approx(1.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("smallest", range(1, 6))
+def test_the_smallest_gap_may_be_up_to_five_steps(smallest: int) -> None:
+    gaps = [smallest, *range(-(-3 * smallest // 2), 2 * smallest + 3)]
+    gaps = np.random.default_rng(smallest).choice(gaps, 60)
+    levels = 0.1 * np.cumsum(np.append(smallest, gaps))
+    assert quantisation_step(np.append(levels, levels)) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("apart", "found"), [(16, True), (18, False)])
+def test_values_that_differ_by_16_units_of_rounding_are_one_level(apart: int, found: bool) -> None:
+    levels = np.arange(32, 65) / 64  # at most one
+    assert (quantisation_step(np.append(levels, levels - apart * EPS)) is not None) == found
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.996, False), (1.004, True)])
+def test_a_step_is_a_hundred_times_what_makes_values_equal(share: float, found: bool) -> None:
+    levels = 1.0 - share * 1600 * EPS * np.arange(20)
+    assert (quantisation_step(np.append(levels, levels)) is not None) == found
+
+
+# -- the end of a sensor's range --------------------------------------------------------------------
+
+
+def visits(near: int, far: int, at_end: int, number: int = 2, leaving: int | None = None) -> np.ndarray:
+    """A signal of range one that comes to its upper end so often, from a tenth away in `far` samples.
+
+    The last fortieth takes `near` of them. It leaves in the same way, or its last tenth takes `leaving`.
+    """
+    away = leaving or far
+
+    def ramp(full: int) -> np.ndarray:
+        start = np.linspace(1.0, 0.1, 200, endpoint=False)
+        middle = np.linspace(0.1, 0.025, full - near, endpoint=False)
+        return np.concatenate([start, middle, np.linspace(0.025, 0.0, near, endpoint=False)])
+
+    one = np.concatenate([ramp(far), np.zeros(at_end), ramp(away)[::-1]])
+    return 1.0 - np.tile(one, number)
+
+
+def is_cut(x: np.ndarray, u: np.ndarray | None = None, Ts: float = 0.01, step: float | None = None) -> bool:
+    return cut_off(x, step, np.zeros(len(x)) if u is None else u, Ts) is not None
+
+
+@pytest.mark.parametrize(("ratio", "found"), [(2.47, False), (2.53, True), (5.95, True), (6.05, False)])
+def test_an_end_is_reached_straight_where_four_times_as_far_takes_longer(ratio: float, found: bool) -> None:
+    """Above 2.5 times as long; above six times it has paused, which says nothing."""
+    far = round(400 * ratio)
+    assert is_cut(visits(400, far, 20)) == found
+    # Arriving and leaving must both be straight; a parabola takes twice as long.
+    assert is_cut(visits(400, far, 20, leaving=800)) is False
+    # The lower end is looked at as the upper.
+    assert is_cut(-visits(400, far, 20)) == found
+
+
+@pytest.mark.parametrize(("at_end", "found"), [((5, 4), False), ((5, 5), True), ((10,), False)])
+def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: bool) -> None:
+    x = np.concatenate([visits(100, 400, n, number=1) for n in at_end])
+    assert is_cut(x) == found
+    assert not found or cut_off(x, None, x, 0.01) == (1.0, 10)
+
+
+@pytest.mark.parametrize(("more", "found"), [(0, False), (1, True)])
+def test_twelve_samples_on_the_way_are_enough(more: int, found: bool) -> None:
+    """From a tenth away and back, at 11 or 12 a visit: a straight way. From a fifth away it is none."""
+    far = np.linspace(1.0, 0.25, 200)
+    close = [0.15, 0.15, 0.15, 0.09, *[0.045] * 3]
+    arrives = np.concatenate([far, close, [0.04] * more, [0.01]])
+    leaves = np.concatenate([[0.01], close[::-1], far[::-1]])
+    assert is_cut(1.0 - np.tile(np.concatenate([arrives, np.zeros(5), leaves]), 2)) == found
+
+
+@pytest.mark.parametrize(("samples", "found"), [(19, False), (20, True)])
+def test_a_push_both_ways_takes_twenty_samples(samples: int, found: bool) -> None:
+    """A single stay at the end, in which the input, sampled slowly, is strongest both ways."""
+    x = visits(400, 800, samples, number=1)
+    u = 0.1 * np.sin(np.arange(len(x)))
+    first = np.flatnonzero(x == 1.0)[0]
+    u[first + 2 : first + 6], u[first + 8 : first + 12] = 1.0, -1.0
+    assert is_cut(x, u, Ts=0.1) == found
+
+
+@pytest.mark.parametrize(
+    ("up", "down", "found"), [(0.79, 0.9, False), (0.9, 0.79, False), (0.81, 0.81, True)]
+)
+def test_a_push_is_four_fifths_of_the_strongest(up: float, down: float, found: bool) -> None:
+    x = visits(400, 800, 100, number=1)
+    u = np.zeros(len(x))
+    u[50:90], u[100:140] = 1.0, -1.0
+    first = np.flatnonzero(x == 1.0)[0]
+    u[first + 10 : first + 40], u[first + 50 : first + 80] = up, -down
+    assert is_cut(x, u) == found
+
+
+@pytest.mark.parametrize(("lasts", "found"), [(7, False), (9, True)])
+def test_a_push_is_the_mean_over_a_tenth_of_a_second(lasts: int, found: bool) -> None:
+    """Ten samples: of seven 70 % are left, of nine 90 %, beside pushes that last."""
+    x = visits(400, 800, 100, number=1)
+    u = np.zeros(len(x))
+    u[50:90], u[100:140] = 1.0, -1.0
+    first = np.flatnonzero(x == 1.0)[0]
+    u[first + 20 : first + 20 + lasts], u[first + 60 : first + 60 + lasts] = 1.0, -1.0
+    assert is_cut(x, u) == found
+
+
+# -- the input --------------------------------------------------------------------------------------
+
+
+def is_clipped(u: np.ndarray) -> bool:
+    y = np.column_stack([WAVE, 0.1 * WAVE[::-1]])[: len(u)]
+    return any(f.kind == "clipped_input" for f in Recording(u=u, y=y, Ts=TS).findings)
+
+
+@pytest.mark.parametrize(
+    ("samples", "held", "often"), [(2000, 1, 10), (500, 1, 5), (2000, 4, 20)], ids=["share", "few", "held"]
+)
+@pytest.mark.parametrize("end", [1, -1])
+def test_a_limit_is_stood_at_unusually_often(samples: int, held: int, often: int, end: int) -> None:
+    """A two-hundredth of the samples, five, or five times as often as at a usual level."""
+    free = np.repeat(np.random.default_rng(0).uniform(-1, 1, samples // held), held)
+    for count, found in ((often - 1, False), (often, True)):
+        u = free.copy()
+        u[:count] = 2.0 * end
+        assert is_clipped(u) == found
+    u = np.abs(free) + 0.5 if end > 0 else -np.abs(free) - 0.5
+    u[:often] = 0.0  # standing still is no limit
+    assert not is_clipped(u)
+
+
+@pytest.mark.parametrize(("levels", "found"), [(9, False), (10, True)])
+def test_an_input_of_a_few_levels_is_not_clipped(levels: int, found: bool) -> None:
+    u = np.append(np.arange(1.0, levels), np.full(200, float(levels)))
+    assert is_clipped(np.append(u, np.tile(u[: levels - 1], 10))) == found
+
+
+def test_whole_numbers_over_twenty_are_counts() -> None:
+    k = np.arange(100.0)
+    assert not whole_numbers(k % 20) and whole_numbers(k % 21)
+    assert not whole_numbers(np.append(k, 0.5))
+
+
+# -- the angle in the room, and swapped columns -----------------------------------------------------
+
+TURN = 2 * np.pi * np.arange(4096) / 4096
+
+
+def slow(first: float, second: float, fast: float = 0.0) -> np.ndarray:
+    """Sines in the two slow bands, and one far above them."""
+    return first * np.cos(2 * TURN) + second * np.cos(6 * TURN) + fast * np.cos(100 * TURN)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("share", "found"), [(0.99, True), (1.01, False)])
+def test_the_angle_in_the_room_follows_to_a_twentieth_and_then_to_three(
+    share: float, found: bool, sign: int
+) -> None:
+    theta = slow(0.1, 1.0)
+    assert is_absolute(theta, slow(0.1 * (1 + sign * 0.05 * share), 1.0)) == found
+    assert is_absolute(theta, slow(0.1, 1.0 + sign * 0.15 * share)) == found
+
+
+@pytest.mark.parametrize(("apart", "found"), [(0.1, True), (0.3, False)])
+def test_it_follows_with_a_coherence_of_99_hundredths(apart: float, found: bool) -> None:
+    """Two sines of one band of which one is larger by as much as the other is smaller."""
+    theta = slow(1.0, 0.0) + np.cos(4.5 * TURN) + np.cos(6.5 * TURN)
+    alpha = slow(1.0, 0.0) + (1 + apart) * np.cos(4.5 * TURN) + (1 - apart) * np.cos(6.5 * TURN)
+    assert is_absolute(theta, alpha) == found
+
+
+@pytest.mark.parametrize(("size", "found"), [(0.0030, False), (0.0034, True)])
+def test_slow_motion_is_three_thousandths_of_all(size: float, found: bool) -> None:
+    """Of the transform with low side lobes, in which a sine of amplitude one has 0.95 in its band."""
+    theta = slow(size, 0.1, np.sqrt(0.99))
+    assert is_absolute(theta, theta) == found
+    theta = 0.1 * np.cos(TURN) + slow(0.0, 0.95 * size, np.sqrt(0.99))
+    assert is_absolute(theta, theta) == found
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.99, False), (1.01, True)])
+def test_swapped_is_three_times_the_motion_of_the_hub(share: float, found: bool) -> None:
+    theta = slow(0.3, 1.0)
+    assert is_swapped(theta, slow(3 * 0.3 * share, 4.0)) == found
+    assert is_swapped(theta, slow(3 * 0.4, 3.0 * share)) == found
+
+
+@pytest.mark.parametrize(("size", "found"), [(0.030, False), (0.034, True)])
+def test_swapped_needs_slow_motion_of_three_hundredths(size: float, found: bool) -> None:
+    alpha = slow(size, 0.1, np.sqrt(0.99))
+    assert is_swapped(0.1 * alpha, alpha) == found
+
+
+@pytest.mark.parametrize(("samples", "found"), [(15, False), (16, True)])
+def test_what_is_slow_needs_two_samples_in_the_shortest_period(samples: int, found: bool) -> None:
+    x = np.cos(np.linspace(0, 4 * np.pi, samples)) + 0.7 * np.random.default_rng(3).normal(size=samples)
+    assert is_absolute(x, x) == found
+    assert is_swapped(0.1 * x, x) == found

@@ -125,7 +125,9 @@ def coupled_contacts(
 
     Contacts at rest are first assumed to stick and are eliminated; the others respond with the remaining
     mobility, and those that exceed their level slide in the next pass. One pass more than there are contacts
-    solves any case; two solve all but those in which several contacts stop or break away in one step.
+    solves any case of two; of three that break away together, one in a hundred lets a contact go for that
+    step which the others would hold again. Two passes solve all but cases in which several contacts stop or
+    break away in one step.
 
     Args:
         v0: Port speeds at the start [rad/s].
