@@ -6,10 +6,10 @@
 
 An XL-330 lifts a pendulum at four gains in three motions. Every motion and every gain is left out once: M1
 to M6 are fitted to the rest by evolution, as their authors do (`servo/friction_models.py` has the laws), the
-grey box by `rf.fit` with the frictions of the catalogue and with what `rf.discover` finds. Compared are free
-runs of what was left out. Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by
-`ROTFLEX_DATA`. What `results/B10.json` has already is kept unless `--fresh` is given; writes it and
-`results/B10.md`.
+grey box by `rf.fit` with the frictions of the catalogue and with what `rf.discover` finds, and one of them by
+evolution over the same numbers. Compared are free runs of what was left out, and of joints of an SO-101.
+Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by `ROTFLEX_DATA`. What
+`results/B10.json` has already is kept unless `--fresh` is given; writes it and `results/B10.md`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ rf.enable_compilation_cache()
 from servo.arm import arm
 from servo.evolved import evolved
 from servo.friction_models import MODELS
-from servo.grey_box import FRICTION, direction, fitted, searched, servo
+from servo.grey_box import ALIKE, FRICTION, direction, evolved_grey_box, fitted, searched, servo
 from servo.page import page, summary
 from servo.recordings import Split, splits
 
@@ -73,6 +73,7 @@ def rows(split: Split, parts: list[str], rollouts: int, say: Callable[[str], Non
     jobs: dict[str, Callable[[], dict[str, Any]]] = {}
     if "models" in parts:
         jobs |= {name: lambda name=name: evolved(name, split, rollouts, seed=1) for name in MODELS}
+        jobs[f"{ALIKE}, CMA-ES"] = lambda: evolved_grey_box(split, rollouts)
     if "fits" in parts:
         jobs |= {name: lambda e=effects: fitted(servo(e), split)[1] for name, effects in FRICTION.items()}
     if "search" in parts:
@@ -115,7 +116,7 @@ def main() -> None:
         found["direction"] = direction(known["gain 200"], say)
         keep()
     if "so101" in given.parts and ("so101" not in found or given.fresh):
-        found["so101"] = arm(say)
+        found["so101"] = arm(say, given.rollouts // 5)
         keep()
     keep()
     print(page(found))

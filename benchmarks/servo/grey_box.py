@@ -15,6 +15,7 @@ from rotflex_jax.effects import DryFriction, Probe, Scale, register
 from rotflex_jax.effects.base import Scalar
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.parameters import parameter
+from servo.evolved import evolved_alike
 from servo.recordings import LENGTH, MASS, Split, errors
 
 
@@ -76,10 +77,30 @@ FRICTION: dict[str, tuple[fx.Effect, ...]] = {
     "Coulomb": (fx.Coulomb("hub", level=0.03),),
     "Stribeck": (fx.Stribeck("hub", level=0.03, excess=0.01),),
     "LuGre": (fx.LuGre("hub"),),
+    "load friction": (fx.LoadFriction("hub", tied=True),),
+    "load friction, viscous, delay": (
+        fx.LoadFriction("hub", tied=True),
+        fx.Viscous("hub", coefficient=0.01),
+        fx.Delay(time=0.005),
+    ),
     "weight friction": (WeightFriction("hub"),),
+    "weight friction, delay": (WeightFriction("hub"), fx.Delay(time=0.005)),
     "weight friction, Stribeck": (WeightFriction("hub"), fx.Stribeck("hub", level=0.003, excess=0.01)),
 }
 """Structures that are fitted everywhere, beside the one that a search finds."""
+
+ALIKE = "weight friction, delay"
+"""The one whose numbers are found by evolution too."""
+
+BOX = {
+    "hub.inertia.inertia": (0.0050, 0.0549),
+    "hub.position_servo.torque_constant": (0.1, 3.0),
+    "hub.position_servo.resistance": (0.5, 10.0),
+    "hub.gravity.cosine": (-0.048, 0.048),
+    "hub.weight_friction.level": (0.0, 0.48),
+    "input.delay.time": (0.0, 0.05),
+}
+"""Where they are looked for: as far as those of M1 to M6."""
 
 
 def servo(effects: tuple[fx.Effect, ...] = ()) -> rf.Mechanism:
@@ -101,6 +122,16 @@ def fitted(mechanism: rf.Mechanism, split: Split) -> tuple[rf.Fit, dict[str, Any
         "seconds": seconds,
         "rollouts": fit.steps * len(split.train),
         "parameters": {e.name: [e.value, e.std] for e in fit.parameters if e.free},
+        "train": errors(runs(split.train), split.train),
+        "test": errors(runs(split.test), split.test),
+    }
+
+
+def evolved_grey_box(split: Split, rollouts: int) -> dict[str, Any]:
+    """The numbers of one structure by CMA-ES, and its row of the results."""
+    model, row = evolved_alike(servo(FRICTION[ALIKE]), split.train, BOX, rollouts, seed=1)
+    runs = lambda of: [model.simulate(r) for r in of]  # noqa: E731
+    return row | {
         "train": errors(runs(split.train), split.train),
         "test": errors(runs(split.test), split.test),
     }

@@ -83,17 +83,23 @@ def page(found: dict[str, Any]) -> str:
             "friction from another torque constant.",
         ]
     if "so101" in found:
+        rows = found["so101"]
+        names = [n for n in rows[0] if all(n in r["takes"] for r in rows)]
+        lines += ["", "## SO-101", "", "| model | " + " | ".join(r["joint"] for r in rows) + " |"]
+        lines += ["|---|" + "---:|" * len(rows)]
+        for name in ("range", "goal", *names):
+            said = {"range": "range of the angle", "goal": "the goal itself"}.get(name, name)
+            lines.append(f"| {said} | " + " | ".join(f"{r[name]:.2f}" for r in rows) + " |")
         lines += [
             "",
-            "## SO-101",
+            "Root mean square errors [deg] of free runs over `step_response`, which was left out.",
             "",
-            "| joint | motion left out | range | goal itself | no friction | Coulomb |",
         ]
-        lines += ["|---|---|---:|---:|---:|---:|"]
-        for row in found["so101"]:
-            cells = [f"{row[k]:.2f}" for k in ("range", "goal", "no friction", "Coulomb")]
-            lines.append(f"| {row['joint']} | {row['motion']} | " + " | ".join(cells) + " |")
-        lines += ["", "Root mean square errors of free runs, and the range of the angle [deg]."]
+        lines += ["| model | free runs of a recording | fit [s] |", "|---|---:|---:|"]
+        for name in names:
+            took = [r["takes"][name] for r in rows]
+            runs, seconds = (statistics.median(t[k] for t in took) for k in ("rollouts", "seconds"))
+            lines.append(f"| {name} | {runs:.0f} | {seconds:.1f} |")
     m = found["machine"]
     lines += [
         "",
