@@ -44,12 +44,23 @@ rf.enable_compilation_cache()
 from servo.arm import arm
 from servo.evolved import evolved
 from servo.friction_models import MODELS
-from servo.grey_box import ALIKE, FRICTION, direction, evolved_grey_box, fitted, searched, servo
+from servo.grey_box import (
+    ALIKE,
+    FRICTION,
+    YIELDING,
+    direction,
+    evolved_grey_box,
+    fitted,
+    searched,
+    servo,
+    supply,
+    yielding,
+)
 from servo.page import page, summary
 from servo.recordings import Split, splits
 
 RESULTS = HERE / "results"
-PARTS = ("models", "fits", "search", "direction", "so101")
+PARTS = ("models", "fits", "search", "direction", "supply", "so101")
 
 from rotflex_jax.text.files import write_file
 
@@ -76,6 +87,7 @@ def rows(split: Split, parts: list[str], rollouts: int, say: Callable[[str], Non
         jobs[f"{ALIKE}, CMA-ES"] = lambda: evolved_grey_box(split, rollouts)
     if "fits" in parts:
         jobs |= {name: lambda e=effects: fitted(servo(e), split)[1] for name, effects in FRICTION.items()}
+        jobs[YIELDING] = lambda: fitted(yielding(), split)[1]
     if "search" in parts:
         jobs["search"] = lambda: searched(split, own=False, say=say)
         jobs["search, own effect"] = lambda: searched(split, own=True, say=say)
@@ -114,6 +126,9 @@ def main() -> None:
             keep()
     if "direction" in given.parts and ("direction" not in found or given.fresh):
         found["direction"] = direction(known["gain 200"], say)
+        keep()
+    if "supply" in given.parts and ("supply" not in found or given.fresh):
+        found["supply"] = supply(known["gain 200"])
         keep()
     if "so101" in given.parts and ("so101" not in found or given.fresh):
         found["so101"] = arm(say, given.rollouts // 5)

@@ -82,6 +82,13 @@ def page(found: dict[str, Any]) -> str:
             f"its derivative unconfounded, verdict `{d['verdict']}`. One mass does not tell a directional "
             "friction from another torque constant.",
         ]
+    if "supply" in found:
+        motion, logged = (f"{v:.3g} ± {1.96 * s:.2g} ohm" for v, s in found["supply"].values())
+        lines += ["", "## A supply that gives way", ""]
+        lines += [
+            f"By the motion its resistance is {motion}, by the voltage of the supply in the logs {logged}: "
+            "what takes torque away at large duty and current is not the supply."
+        ]
     if "so101" in found:
         rows = found["so101"]
         names = [n for n in rows[0] if all(n in r["takes"] for r in rows)]
