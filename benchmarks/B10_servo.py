@@ -130,9 +130,10 @@ def main() -> None:
     if "supply" in given.parts and ("supply" not in found or given.fresh):
         found["supply"] = supply(known["gain 200"])
         keep()
-    if "so101" in given.parts and ("so101" not in found or given.fresh):
-        found["so101"] = arm(say, given.rollouts // 5)
-        keep()
+    if "so101" in given.parts:
+        if given.fresh:
+            found["so101"] = []
+        arm(say, given.rollouts // 5, found.setdefault("so101", []), keep)
     keep()
     print(page(found))
 

@@ -23,6 +23,9 @@ def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
                 kind: statistics.mean(mean(r, "test", kind) for r in rows) for kind in ("mean", "rms")
             }
             out[name] |= {key: statistics.median(r[key] for r in rows) for key in ("rollouts", "seconds")}
+            for way in ("motion", "gain"):
+                left = [case[name] for left_out, case in splits.items() if left_out.startswith(way)]
+                out[name][f"{way} mean"] = statistics.mean(mean(r, "test", "mean") for r in left)
     return out
 
 
@@ -89,8 +92,7 @@ def page(found: dict[str, Any]) -> str:
             f"By the motion its resistance is {motion}, by the voltage of the supply in the logs {logged}: "
             "what takes torque away at large duty and current is not the supply."
         ]
-    if "so101" in found:
-        rows = found["so101"]
+    if rows := found.get("so101", []):
         names = [n for n in rows[0] if all(n in r["takes"] for r in rows)]
         lines += ["", "## SO-101", "", "| model | " + " | ".join(r["joint"] for r in rows) + " |"]
         lines += ["|---|" + "---:|" * len(rows)]
