@@ -514,6 +514,17 @@ NAMED["next_ratio"] = functools.partial(_next_ratio, "delay or lag")
 NAMED["next_ratio_mode"] = functools.partial(_next_ratio, "second mode or sensor gain")
 
 
+# -- servos -------------------------------------------------------------------------------------------------
+
+
+@named
+def servo_rollouts() -> str:
+    """Free runs of the evolution of the grey box over those of its fit."""
+    name = "weight friction, delay"
+    took = [results("B10.json")["summary"][n]["rollouts"] for n in (f"{name}, CMA-ES", name)]
+    return f"{took[0] / took[1]:.0f}"
+
+
 # -- speed --------------------------------------------------------------------------------------------------
 
 # Name -> row of B7.json and the row of the same table that it is set beside.
