@@ -9,7 +9,8 @@ to M6 are fitted to the rest by evolution, as their authors do (`servo/friction_
 grey box by `rf.fit` with the frictions of the catalogue and with what `rf.discover` finds, and one of them by
 evolution over the same numbers. Compared are free runs of what was left out, and of joints of an SO-101.
 Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by `ROTFLEX_DATA`. What
-`results/B10.json` has already is kept unless `--fresh` is given; writes it and `results/B10.md`.
+`results/B10.json` has already is kept unless `--fresh` is given; writes it, `results/B10.md` and, where the
+results are the kept ones, `docs/figures/servo.png`.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ rf.enable_compilation_cache()
 
 from servo.arm import arm
 from servo.evolved import evolved
+from servo.figure import draw
 from servo.friction_models import MODELS
 from servo.grey_box import (
     ALIKE,
@@ -60,6 +62,7 @@ from servo.page import page, summary
 from servo.recordings import Split, splits
 
 RESULTS = HERE / "results"
+FIGURE = HERE.parent / "docs" / "figures" / "servo.png"
 PARTS = ("models", "fits", "search", "direction", "supply", "so101")
 
 from rotflex_jax.text.files import write_file
@@ -135,6 +138,8 @@ def main() -> None:
             found["so101"] = []
         arm(say, given.rollouts // 5, found.setdefault("so101", []), keep)
     keep()
+    if given.out.parent == RESULTS:
+        draw(found["summary"], FIGURE)
     print(page(found))
 
 

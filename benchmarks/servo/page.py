@@ -14,18 +14,23 @@ def mean(row: dict[str, Any], part: str, kind: str) -> float:
 
 
 def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """What each model has over all that was left out: errors [deg], medians of free runs and times [s]."""
-    out = {}
-    for name in next(iter(splits.values()), {}):
-        if all(name in case for case in splits.values()):
-            rows = [case[name] for case in splits.values()]
-            out[name] = {
-                kind: statistics.mean(mean(r, "test", kind) for r in rows) for kind in ("mean", "rms")
-            }
-            out[name] |= {key: statistics.median(r[key] for r in rows) for key in ("rollouts", "seconds")}
-            for way in ("motion", "gain"):
-                left = [case[name] for left_out, case in splits.items() if left_out.startswith(way)]
-                out[name][f"{way} mean"] = statistics.mean(mean(r, "test", "mean") for r in left)
+    """What each model has over all that was left out: errors [deg], medians of free runs and times [s].
+
+    A mean over motions, gains or all is there where nothing of it is missing.
+    """
+    out: dict[str, dict[str, float]] = {}
+    for name in dict.fromkeys(name for case in splits.values() for name in case):
+        rows = {left_out: case[name] for left_out, case in splits.items() if name in case}
+        ways = {"": "", "motion ": "motion", "gain ": "gain"}
+        for label, way in ways.items():
+            if all(left_out in rows for left_out in splits if left_out.startswith(way)):
+                listed = [r for left_out, r in rows.items() if left_out.startswith(way)]
+                for kind in ("mean", "rms"):
+                    value = statistics.mean(mean(r, "test", kind) for r in listed)
+                    out.setdefault(name, {})[label + kind] = value
+        if name in out:
+            for key in ("rollouts", "seconds"):
+                out[name][key] = statistics.median(r[key] for r in rows.values())
     return out
 
 
