@@ -532,7 +532,18 @@ def _arm_runs(name: str) -> str:
     return f"{statistics.median(took):,.0f}"
 
 
-ARM = ("no friction", "Coulomb", "Coulomb, delay, CMA-ES", "M1", "M2", "M3", "M4", "M5", "M6")
+ARM = (
+    "no friction",
+    "Coulomb",
+    "Coulomb, slow",
+    "Coulomb, delay, CMA-ES",
+    "M1",
+    "M2",
+    "M3",
+    "M4",
+    "M5",
+    "M6",
+)
 for _k, _model in enumerate(ARM):
     NAMED[f"servo_arm_runs_{_k}"] = functools.partial(_arm_runs, _model)
 

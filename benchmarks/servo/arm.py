@@ -45,10 +45,10 @@ GREY_BOX: Box = {
 STRUCTURES: dict[str, tuple[fx.Effect, ...]] = {
     "no friction": (),
     "Coulomb": (fx.Coulomb("hub", level=0.05),),
-    "Coulomb, delay": (fx.Coulomb("hub", level=0.05), fx.Delay(time=0.01)),
 }
-ALIKE = "Coulomb, delay"
-EVOLVED = f"{ALIKE}, CMA-ES"
+# Fitted without the fast end of the chirp, where every model is away by a multiple of what it is elsewhere.
+SLOW, SLOW_SAMPLES = "Coulomb, slow", 4000
+EVOLVED = "Coulomb, delay, CMA-ES"
 
 
 def logs(recordings: list[rf.Recording]) -> Logs:
@@ -123,10 +123,12 @@ def arm(
             if name not in row["takes"]:
                 fit, row["takes"][name] = fitted(effects, train)
                 row[name] = away(fit.model.simulate(test)[:, 0])
+        if SLOW not in row["takes"]:
+            slow = [r.slice(0, SLOW_SAMPLES) if r is of["chirp_sweep"] else r for r in train]
+            fit, row["takes"][SLOW] = fitted(STRUCTURES["Coulomb"], slow)
+            row[SLOW] = away(fit.model.simulate(test)[:, 0])
         if EVOLVED not in row["takes"]:
-            mechanism = starts()[0]
-            for effect in STRUCTURES[ALIKE]:
-                mechanism = mechanism + effect
+            mechanism = starts()[0] + fx.Coulomb("hub", level=0.05) + fx.Delay(time=0.01)
             model = rf.Model(mechanism, rf.Exponential(substeps=SUBSTEPS))
             model, row["takes"][EVOLVED] = evolved_alike(model, train, GREY_BOX, rollouts, seed=1)
             row[EVOLVED] = away(model.simulate(test)[:, 0])
