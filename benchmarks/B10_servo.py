@@ -6,10 +6,11 @@
 
 An XL-330 lifts a pendulum at four gains in three motions. Every motion and every gain is left out once: M1
 to M6 are fitted to the rest by evolution, as their authors do (`servo/friction_models.py` has the laws), the
-grey box by `rf.fit` with the frictions of the catalogue and with what `rf.discover` finds. Compared are free
-runs of what was left out. Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by
-`ROTFLEX_DATA`. What `results/B10.json` has already is kept unless `--fresh` is given; writes it and
-`results/B10.md`.
+grey box by `rf.fit` with the frictions of the catalogue and with what `rf.discover` finds, and one of them by
+evolution over the same numbers. Compared are free runs of what was left out, and of joints of an SO-101.
+Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by `ROTFLEX_DATA`. What
+`results/B10.json` has already is kept unless `--fresh` is given; writes it, `results/B10.md` and, where the
+results are the kept ones, `docs/figures/servo.png`.
 """
 
 from __future__ import annotations
@@ -43,13 +44,26 @@ rf.enable_compilation_cache()
 
 from servo.arm import arm
 from servo.evolved import evolved
+from servo.figure import draw
 from servo.friction_models import MODELS
-from servo.grey_box import FRICTION, direction, fitted, searched, servo
+from servo.grey_box import (
+    ALIKE,
+    FRICTION,
+    YIELDING,
+    direction,
+    evolved_grey_box,
+    fitted,
+    searched,
+    servo,
+    supply,
+    yielding,
+)
 from servo.page import page, summary
 from servo.recordings import Split, splits
 
 RESULTS = HERE / "results"
-PARTS = ("models", "fits", "search", "direction", "so101")
+FIGURE = HERE.parent / "docs" / "figures" / "servo.png"
+PARTS = ("models", "fits", "search", "direction", "supply", "so101")
 
 from rotflex_jax.text.files import write_file
 
@@ -73,8 +87,10 @@ def rows(split: Split, parts: list[str], rollouts: int, say: Callable[[str], Non
     jobs: dict[str, Callable[[], dict[str, Any]]] = {}
     if "models" in parts:
         jobs |= {name: lambda name=name: evolved(name, split, rollouts, seed=1) for name in MODELS}
+        jobs[f"{ALIKE}, CMA-ES"] = lambda: evolved_grey_box(split, rollouts)
     if "fits" in parts:
         jobs |= {name: lambda e=effects: fitted(servo(e), split)[1] for name, effects in FRICTION.items()}
+        jobs[YIELDING] = lambda: fitted(yielding(), split)[1]
     if "search" in parts:
         jobs["search"] = lambda: searched(split, own=False, say=say)
         jobs["search, own effect"] = lambda: searched(split, own=True, say=say)
@@ -114,10 +130,16 @@ def main() -> None:
     if "direction" in given.parts and ("direction" not in found or given.fresh):
         found["direction"] = direction(known["gain 200"], say)
         keep()
-    if "so101" in given.parts and ("so101" not in found or given.fresh):
-        found["so101"] = arm(say)
+    if "supply" in given.parts and ("supply" not in found or given.fresh):
+        found["supply"] = supply(known["gain 200"])
         keep()
+    if "so101" in given.parts:
+        if given.fresh:
+            found["so101"] = []
+        arm(say, given.rollouts // 5, found.setdefault("so101", []), keep)
     keep()
+    if given.out.parent == RESULTS:
+        draw(found["summary"], FIGURE)
     print(page(found))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import statistics
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -514,6 +515,39 @@ def _next_ratio(pair: str) -> str:
 
 NAMED["next_ratio"] = functools.partial(_next_ratio, "delay or lag")
 NAMED["next_ratio_mode"] = functools.partial(_next_ratio, "second mode or sensor gain")
+
+
+# -- servos -------------------------------------------------------------------------------------------------
+
+
+@named
+def servo_rollouts() -> str:
+    """Free runs of the evolution of the grey box over those of its fit."""
+    name = "weight friction, delay"
+    took = [results("B10.json")["summary"][n]["rollouts"] for n in (f"{name}, CMA-ES", name)]
+    return f"{took[0] / took[1]:.0f}"
+
+
+def _arm_runs(name: str) -> str:
+    """Free runs of a recording that a model of the SO-101 took, the median of its joints."""
+    took = (row["takes"][name]["rollouts"] for row in results("B10.json")["so101"])
+    return f"{statistics.median(took):,.0f}"
+
+
+ARM = (
+    "no friction",
+    "Coulomb",
+    "Coulomb, slow",
+    "Coulomb, delay, CMA-ES",
+    "M1",
+    "M2",
+    "M3",
+    "M4",
+    "M5",
+    "M6",
+)
+for _k, _model in enumerate(ARM):
+    NAMED[f"servo_arm_runs_{_k}"] = functools.partial(_arm_runs, _model)
 
 
 # -- speed --------------------------------------------------------------------------------------------------

@@ -56,6 +56,14 @@ def columns(samples: int = 60) -> dict[str, np.ndarray]:
     return dict(zip(("t", "voltage", "theta", "alpha"), (0.002 * k, *signals), strict=True))
 
 
+def json_seeds() -> list[bytes]:
+    """A list of samples beside settings, one of their values a list; and lists under names."""
+    found = {name: values.tolist() for name, values in columns().items()}
+    samples = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
+    more = [row | {"effort": [0.1, 0.2], "mode": "a"} for row in samples]
+    return [json.dumps(content).encode() for content in ({"gain": 4, "entries": more}, found)]
+
+
 def csv_seeds() -> list[bytes]:
     """Commas, semicolons with decimal commas and a line of units, spaces below remarks."""
     rows = np.column_stack(list(columns().values())).tolist()
@@ -414,6 +422,7 @@ class Format:
 
 FORMATS = {
     "csv": Format(".csv", csv_seeds, text=True),
+    "json": Format(".JSON", json_seeds, text=True),  # in small letters it is read as a model
     "npz": Format(".npz", npz_seeds, mutated_npz),
     "mat": Format(".mat", mat_seeds, mutated_mat),
     "hdf5": Format(".mat", hdf5_seeds),

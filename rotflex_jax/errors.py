@@ -1,6 +1,8 @@
 """The error for bad input, and the import of optional packages."""
 
 import importlib
+import importlib.metadata
+import re
 from types import ModuleType
 
 
@@ -39,5 +41,18 @@ which is not installed; install it with `pip install "rotflex_jax[all]"`.
         package = module.partition(".")[0]
         raise InputError(
             f"{purpose} needs the package {package}, which is not installed; "
-            'install it with `pip install "rotflex_jax[all]"`.'
+            f'install it with `pip install "rotflex_jax[{_extra_with(package)}]"`.'
         ) from error
+
+
+def _extra_with(package: str) -> str:
+    """The first extra of this package that brings another one, but for "dev"; "all" where none does."""
+    try:
+        lines = importlib.metadata.requires("rotflex_jax") or []
+    except importlib.metadata.PackageNotFoundError:  # run from a folder
+        lines = []
+    for line in lines:
+        match = re.match(r"([\w.-]+).*extra == ['\"](?!all|dev)(\w+)['\"]", line)
+        if match and f"{match[1].replace('-', '_')}_".startswith(f"{package}_"):
+            return match[2]
+    return "all"

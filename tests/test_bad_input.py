@@ -382,4 +382,8 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
     with h5py.File(tmp_path / "run.mat", "w") as file:
         file["t"] = GOOD["t"]
     monkeypatch.setitem(sys.modules, "h5py", None)
+    lines = [f"h5py>=3.11; extra == '{extra}'" for extra in ("all", "dev", "io")]
+    monkeypatch.setattr("importlib.metadata.requires", lambda name: ["jax", "h5pyd; extra == 'x'", *lines])
+    refused(lambda: load(tmp_path / "run.mat"), r'needs the package h5py.*"rotflex_jax\[io\]"')
+    monkeypatch.setattr("importlib.metadata.requires", lambda name: ["jax"])
     refused(lambda: load(tmp_path / "run.mat"), r'needs the package h5py.*"rotflex_jax\[all\]"')

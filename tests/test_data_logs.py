@@ -1,6 +1,8 @@
-"""Logs of LabVIEW, MDF4 and ROS 2, each written by the library of its format; one file for each channel."""
+"""Logs of LabVIEW, MDF4 and ROS 2, each written by its library, and of JSON; one file for each channel."""
 
 import io
+import json
+import os
 import re
 import struct
 import warnings
@@ -158,6 +160,59 @@ def test_timeseries_of_other_times_are_brought_together_on_request(tmp_path):
 def test_a_timeseries_without_its_step_is_left_out_and_named(tmp_path):
     path = timeseries(tmp_path / "run.mat", {n: (T, x) for n, x in SIGNALS.items()}, units="fortnights")
     refused(path, r"objects that only MATLAB reads .* \(timeseries\): save")
+
+
+# -- JSON ------------------------------------------------------------------------------------------------
+
+SAMPLES = [
+    {"t": t, "voltage": u, "angles": [a, b], "on": True, "unit": {"a": 1}}
+    for t, u, a, b in zip(T.tolist(), VOLTAGE.tolist(), THETA.tolist(), ALPHA.tolist(), strict=True)
+]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [SAMPLES, {"gain": 400, "motion": "sines", "entries": SAMPLES, "notes": ["a"]}],
+    ids=["samples alone", "beside settings"],
+)
+def test_samples_in_a_json_file(tmp_path, content):
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(content))
+    exact(load(path, outputs=("angles[0]", "angles[1]")))
+
+
+def test_columns_in_a_json_file(tmp_path):
+    path = tmp_path / "run.json"
+    columns = {"t": T, "voltage": VOLTAGE, "theta": THETA, "alpha": ALPHA}
+    path.write_text(json.dumps({name: values.tolist() for name, values in columns.items()} | {"gain": 4}))
+    exact(load(path))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (json.dumps([SAMPLES[0], {"t": 1.0}]), r"has t in sample 2, but t, voltage, angles, on, unit in"),
+        (json.dumps({"a": SAMPLES, "b": SAMPLES}), "has no table in it; write a list of samples"),
+        (json.dumps([1, 2]), "has no table in it"),
+        ("[" * 100_000, "cannot be read as JSON"),
+        ('{"t": [0, 1', "cannot be read as JSON"),
+        (json.dumps({"t": [0.0, None], "voltage": [1, 1], "theta": [0, 0], "alpha": [0, 0]}), "."),
+    ],
+)
+def test_json_without_a_recording_is_refused(tmp_path, content, said):
+    path = tmp_path / "run.json"
+    path.write_text(content)
+    refused(path, said)
+
+
+def test_a_log_of_a_servo_is_read_by_its_columns(measured):
+    """Its own reader is the reference; the goal is resampled otherwise there, along straight lines."""
+    known = measured("bam_xl330")[0]
+    path = Path(os.environ["ROTFLEX_DATA"]) / "bam_xl330" / known.source.split(",")[0]
+    names = {"time": "timestamp", "input": "goal_position", "outputs": {"theta": "position"}}
+    found = load(path, units={"goal_position": "rad"}, resample=0.005, **names)
+    np.testing.assert_allclose(found.y, known.y, rtol=0, atol=1e-12)
+    assert found.input_unit == "rad"
 
 
 # -- LabVIEW ---------------------------------------------------------------------------------------------

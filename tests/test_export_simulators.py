@@ -26,6 +26,7 @@ from rotflex_jax.effects import (
     Lag,
     LoadFriction,
     LuGre,
+    PositionServo,
     Saturation,
     SecondMode,
     SensorBias,
@@ -39,7 +40,7 @@ from rotflex_jax.export import to_bam, to_fmu, to_mjcf, to_urdf
 from rotflex_jax.export.certificate import standard_input
 from rotflex_jax.export.fmu import platform_folder
 from rotflex_jax.export.mjcf import run_in_mujoco
-from rotflex_jax.joints import emps, paper, single_inertia, xl330_pendulum
+from rotflex_jax.joints import emps, paper, position_servo, single_inertia, xl330_pendulum
 from rotflex_jax.mechanism import simulate
 from rotflex_jax.models.model import Model
 
@@ -97,11 +98,16 @@ def test_mujoco_does_what_the_toolkit_does(name):
 
 
 def test_mujoco_has_the_servo_with_its_limit_and_its_weight():
-    servo = xl330_pendulum().with_values({"hub.position_servo.limit": 0.3}) + Coulomb("hub", level=0.03)
+    firmware = PositionServo(limit=0.3, derivative=0.03)
+    servo = position_servo(0.0069, servo=firmware, weight=0.48) + Coulomb("hub", level=0.03)
     certificate = certified(servo, 0.4 * U).certificate
     assert certificate.left_out == () and certificate.largest[0] < NOISE
     unlimited = simulate(servo.with_values({"hub.position_servo.limit": 1.0}), 0.4 * U, Ts)
     assert np.abs(unlimited - simulate(servo, 0.4 * U, Ts)).max() > 50 * NOISE  # the limit acts
+    weak = position_servo(0.0069, servo=PositionServo(dead_band=0.01, source_resistance=1.0), weight=0.48)
+    told = "\n".join(certified(weak, 0.4 * U[:50]).certificate.left_out)
+    assert "dead_band of 0.01 rad" in told and "source_resistance of 1 ohm" in told
+    assert "derivative of 0.03 s/rad" in "\n".join(to_bam(servo, u=U[:50]).certificate.left_out)
 
 
 def test_mujoco_has_an_axis_that_slides():
@@ -243,7 +249,7 @@ SERVO = xl330_pendulum().with_values({"hub.position_servo.period": 0.0})
     [
         ((Coulomb("hub", level=0.03), Viscous("hub", coefficient=0.005)), "m1", set()),
         ((Stribeck("hub"),), "m2", {"friction_stribeck", "dtheta_stribeck", "alpha"}),
-        ((LoadFriction("hub", driving=0.15, driven=0.15),), "m3", {"load_friction_base"}),
+        ((LoadFriction("hub", driving=0.15, tied=True),), "m3", {"load_friction_base"}),
     ],
     ids=["m1", "m2", "m3"],
 )

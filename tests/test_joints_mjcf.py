@@ -98,6 +98,10 @@ ACTUATORS = {
     "position": ('<position joint="shoulder" kp="8" kv="0.4"/>', 0.5),
     "position, filtered": ('<position joint="shoulder" kp="8" timeconst="0.02" gear="1.5"/>', 0.5),
     "position, limited": ('<position joint="shoulder" kp="30" forcerange="-3 3"/>', 0.5),
+    "position, limited with its damping": (
+        '<position joint="shoulder" kp="30" kv="1" forcerange="-3 3"/>',
+        0.5,
+    ),
     "motor in the parent": ('<motor jointinparent="shoulder" gear="3"/>', 1.0),
     "general": (
         '<general joint="shoulder" gainprm="2" biastype="affine" biasprm="0.3 0 -0.5" gear="1.2"'
@@ -200,7 +204,7 @@ def test_a_child_that_turns_the_other_way(tmp_path):
             "ctrlrange",
         ),
         (
-            {"actuator": '<position joint="a" kv="1" forcerange="-2 2"/>'},
+            {"actuator": '<position joint="a" gear="2" forcerange="-2 2"/>'},
             "forcerange at a position",
             "forcerange",
         ),

@@ -189,6 +189,24 @@ def test_a_fit_finds_both_shares():
     assert found["level"] == pytest.approx(FC, abs=0.002)
 
 
+def test_tied_shares_are_one_in_a_fit_and_in_a_file(tmp_path):
+    """A fit moves `driving` alone and `driven` follows; what is simulated is the effect with both alike."""
+    tied = paper(joint_damping=0.003) + fx.LoadFriction(
+        "hub", level=FC, driving=DRIVING, driven=9.0, tied=True
+    )
+    both = paper(joint_damping=0.003) + fx.LoadFriction("hub", level=FC, driving=DRIVING, driven=DRIVING)
+    u = steps(1500, 25, 4.0)
+    assert np.array_equal(simulate(tied, u, Ts), simulate(both, u, Ts))
+    name = "hub.load_friction.driven"
+    assert name in both.free_names and name not in tied.free_names
+    moved = tied.with_values({"hub.load_friction.driving": 0.5})
+    assert moved.effect("load_friction", "hub").values["driven"] == 0.5
+    back = rf.Model.load(rf.Model(moved).save(tmp_path / "tied.json"))
+    assert back == rf.Model(moved)
+    with pytest.raises(InputError, match="tied=1, but it needs True or False"):
+        fx.LoadFriction("hub", tied=1)  # pyright: ignore[reportArgumentType]
+
+
 def test_it_needs_a_motor_and_an_inertia():
     with pytest.raises(InputError, match="at 'arm', but it needs a port with a motor and an inertia"):
         _ = paper() + fx.LoadFriction("arm")

@@ -93,6 +93,14 @@ class Logs:
     inertia: float
 
 
+def _arguments(values: dict[str, float], logs: Logs) -> tuple[Any, ...]:
+    """What the compiled simulator takes; gain and weight are the logs' unless they are among the values."""
+    slope = np.full_like(logs.slope, values["slope"]) if "slope" in values else logs.slope
+    own = dataclasses.replace(logs, slope=slope, load=values.get("load", logs.load))
+    arrays = tuple(getattr(own, f.name) for f in dataclasses.fields(own))
+    return (flat({n: v for n, v in values.items() if n in NEUTRAL}), *arrays)
+
+
 def flat(values: dict[str, float]) -> np.ndarray:
     """Parameters in the order of the compiled simulator; absent ones do nothing."""
     return np.array([(NEUTRAL | values)[name] for name in ORDER])
@@ -100,12 +108,12 @@ def flat(values: dict[str, float]) -> np.ndarray:
 
 def rollouts(values: dict[str, float], logs: Logs) -> np.ndarray:
     """Angles (R, N) of free runs [rad]."""
-    return _rollouts(flat(values), *dataclasses.astuple(logs))
+    return _rollouts(*_arguments(values, logs))
 
 
 def mean_error(values: dict[str, float], logs: Logs) -> float:
     """Mean absolute error of the angle, averaged over recordings [rad], which the authors minimise."""
-    return float(_mean_error(flat(values), *dataclasses.astuple(logs)))
+    return float(_mean_error(*_arguments(values, logs)))
 
 
 @numba.njit(cache=True, fastmath=False)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import json
 import time
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 import rotflex_jax as rf
 from rotflex_jax import effects as fx
 from rotflex_jax.effects import DryFriction, Probe, Scale, register
 from rotflex_jax.effects.base import Scalar
+from rotflex_jax.effects.motor import DYNAMIXEL_GAIN_SCALE
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.parameters import parameter
+from servo.evolved import evolved_alike
 from servo.recordings import LENGTH, MASS, Split, errors
 
 
@@ -76,10 +81,33 @@ FRICTION: dict[str, tuple[fx.Effect, ...]] = {
     "Coulomb": (fx.Coulomb("hub", level=0.03),),
     "Stribeck": (fx.Stribeck("hub", level=0.03, excess=0.01),),
     "LuGre": (fx.LuGre("hub"),),
+    "load friction": (fx.LoadFriction("hub", tied=True),),
+    "load friction, viscous, delay": (
+        fx.LoadFriction("hub", tied=True),
+        fx.Viscous("hub", coefficient=0.01),
+        fx.Delay(time=0.005),
+    ),
     "weight friction": (WeightFriction("hub"),),
+    "weight friction, delay": (WeightFriction("hub"), fx.Delay(time=0.005)),
     "weight friction, Stribeck": (WeightFriction("hub"), fx.Stribeck("hub", level=0.003, excess=0.01)),
 }
 """Structures that are fitted in every case, beside the one that a search finds."""
+
+YIELDING = "weight friction, delay, a supply that gives way"
+"""The same with a resistance before the bridge, found beside the others: a loss at large duty and current."""
+
+ALIKE = "weight friction, delay"
+"""The one whose numbers are found by evolution too."""
+
+BOX = {
+    "hub.inertia.inertia": (0.0050, 0.0549),
+    "hub.position_servo.torque_constant": (0.1, 3.0),
+    "hub.position_servo.resistance": (0.5, 10.0),
+    "hub.gravity.cosine": (-0.048, 0.048),
+    "hub.weight_friction.level": (0.0, 0.48),
+    "input.delay.time": (0.0, 0.05),
+}
+"""Where they are looked for: as far as those of M1 to M6."""
 
 
 def servo(effects: tuple[fx.Effect, ...] = ()) -> rf.Mechanism:
@@ -88,6 +116,50 @@ def servo(effects: tuple[fx.Effect, ...] = ()) -> rf.Mechanism:
     for effect in effects:
         mechanism = mechanism + effect
     return mechanism
+
+
+def yielding() -> rf.Mechanism:
+    """The ready-made servo on a supply with a resistance, with the friction of `YIELDING`."""
+    name = "hub.position_servo.source_resistance"
+    mechanism = servo(FRICTION[ALIKE])
+    motor = mechanism.effect("position_servo", "hub").replace(source_resistance=0.3)
+    effects = tuple(motor if e.name == motor.name else e for e in mechanism.effects)
+    return dataclasses.replace(mechanism, effects=effects).release(name)
+
+
+def supply_resistance(servo: rf.Fit) -> list[float]:
+    """What the logged voltage of the supply says of its resistance: least squares over all logs [ohm].
+
+    The current before the bridge is the duty times that of the armature.
+
+    Args:
+        servo: The fit with the torque constant and the resistance of the armature.
+
+    Returns:
+        The resistance and its standard deviation, errors of the samples independent.
+    """
+    constant, armature = (servo[f"hub.position_servo.{n}"].value for n in ("torque_constant", "resistance"))
+    rows, volts = [], []
+    for path in rf.data.fetch("bam_xl330"):
+        log = json.loads(path.read_text(encoding="utf-8"))
+        entries = list(itertools.takewhile(lambda e: e["torque_enable"], log["entries"]))
+        names = ("timestamp", "position", "goal_position", "input_volts")
+        t, q, goal, v = (np.array([e[n] for e in entries]) for n in names)
+        duty = np.clip(log["kp"] * DYNAMIXEL_GAIN_SCALE * (goal - q), -1, 1)
+        current = duty * (v * duty - constant * np.gradient(q, t)) / armature
+        rows.append(np.column_stack([np.ones(len(t)), -current]))
+        volts.append(v)
+    A, v = np.concatenate(rows), np.concatenate(volts)
+    found, squares, _, _ = np.linalg.lstsq(A, v, rcond=None)
+    covariance = squares[0] / (len(v) - 2) * np.linalg.inv(A.T @ A)
+    return [float(found[1]), float(np.sqrt(covariance[1, 1]))]
+
+
+def supply(split: Split) -> dict[str, list[float]]:
+    """Resistance of the supply by the motion, and by the voltage that was logged [ohm], with deviations."""
+    fit, _ = fitted(yielding(), split)
+    found = fit["hub.position_servo.source_resistance"]
+    return {"motion": [found.value, found.std], "logged": supply_resistance(fit)}
 
 
 def fitted(mechanism: rf.Mechanism, split: Split) -> tuple[rf.Fit, dict[str, Any]]:
@@ -101,6 +173,16 @@ def fitted(mechanism: rf.Mechanism, split: Split) -> tuple[rf.Fit, dict[str, Any
         "seconds": seconds,
         "rollouts": fit.steps * len(split.train),
         "parameters": {e.name: [e.value, e.std] for e in fit.parameters if e.free},
+        "train": errors(runs(split.train), split.train),
+        "test": errors(runs(split.test), split.test),
+    }
+
+
+def evolved_grey_box(split: Split, rollouts: int) -> dict[str, Any]:
+    """The numbers of one structure by CMA-ES, and its row of the results."""
+    model, row = evolved_alike(servo(FRICTION[ALIKE]), split.train, BOX, rollouts, seed=1)
+    runs = lambda of: [model.simulate(r) for r in of]  # noqa: E731
+    return row | {
         "train": errors(runs(split.train), split.train),
         "test": errors(runs(split.test), split.test),
     }

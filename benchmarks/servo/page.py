@@ -16,15 +16,23 @@ def mean(row: dict[str, Any], part: str, kind: str) -> float:
 
 
 def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """What each model has over all that was left out: errors [deg], medians of free runs and times [s]."""
-    out = {}
-    for name in next(iter(splits.values()), {}):
-        if all(name in case for case in splits.values()):
-            rows = [case[name] for case in splits.values()]
-            out[name] = {
-                kind: statistics.mean(mean(r, "test", kind) for r in rows) for kind in ("mean", "rms")
-            }
-            out[name] |= {key: statistics.median(r[key] for r in rows) for key in ("rollouts", "seconds")}
+    """What each model has over all that was left out: errors [deg], medians of free runs and times [s].
+
+    A mean over motions, gains or all is there where nothing of it is missing.
+    """
+    out: dict[str, dict[str, float]] = {}
+    for name in dict.fromkeys(name for case in splits.values() for name in case):
+        rows = {left_out: case[name] for left_out, case in splits.items() if name in case}
+        ways = {"": "", "motion ": "motion", "gain ": "gain"}
+        for label, way in ways.items():
+            if all(left_out in rows for left_out in splits if left_out.startswith(way)):
+                listed = [r for left_out, r in rows.items() if left_out.startswith(way)]
+                for kind in ("mean", "rms"):
+                    value = statistics.mean(mean(r, "test", kind) for r in listed)
+                    out.setdefault(name, {})[label + kind] = value
+        if name in out:
+            for key in ("rollouts", "seconds"):
+                out[name][key] = statistics.median(r[key] for r in rows.values())
     return out
 
 
@@ -84,18 +92,30 @@ def page(found: dict[str, Any]) -> str:
             f"its derivative unconfounded, verdict `{d['verdict']}`. One mass does not tell a directional "
             "friction from another torque constant.",
         ]
-    if "so101" in found:
+    if "supply" in found:
+        motion, logged = (f"{v:.3g} ± {1.96 * s:.2g} ohm" for v, s in found["supply"].values())
+        lines += ["", "## A supply that gives way", ""]
+        lines += [
+            f"By the motion its resistance is {motion}, by the voltage of the supply in the logs {logged}: "
+            "what takes torque away at large duty and current is not the supply."
+        ]
+    if rows := found.get("so101", []):
+        names = [n for n in rows[0] if all(n in r["takes"] for r in rows)]
+        lines += ["", "## SO-101", "", "| model | " + " | ".join(r["joint"] for r in rows) + " |"]
+        lines += ["|---|" + "---:|" * len(rows)]
+        for name in ("range", "goal", *names):
+            said = {"range": "range of the angle", "goal": "the goal itself"}.get(name, name)
+            lines.append(f"| {said} | " + " | ".join(f"{r[name]:.2f}" for r in rows) + " |")
         lines += [
             "",
-            "## SO-101",
+            "Root mean square errors [deg] of free runs over `step_response`, which was left out.",
             "",
-            "| joint | motion left out | range | goal itself | no friction | Coulomb |",
         ]
-        lines += ["|---|---|---:|---:|---:|---:|"]
-        for row in found["so101"]:
-            cells = [f"{row[k]:.2f}" for k in ("range", "goal", "no friction", "Coulomb")]
-            lines.append(f"| {row['joint']} | {row['motion']} | " + " | ".join(cells) + " |")
-        lines += ["", "Root mean square errors of free runs, and the range of the angle [deg]."]
+        lines += ["| model | free runs of a recording | fit [s] |", "|---|---:|---:|"]
+        for name in names:
+            took = [r["takes"][name] for r in rows]
+            runs, seconds = (statistics.median(t[k] for t in took) for k in ("rollouts", "seconds"))
+            lines.append(f"| {name} | {runs:.0f} | {seconds:.1f} |")
     m = found["machine"]
     lines += [
         "",

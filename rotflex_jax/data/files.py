@@ -40,6 +40,7 @@ from rotflex_jax.data.tables import (
     name_and_unit,
     resampled,
     resampled_apart,
+    table_from_json,
     table_from_text,
     unreadable,
 )
@@ -94,7 +95,8 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
             told = f"The folder {folder!s:.100} as one recording with a file for each channel: {error}"
             raise InputError(told) from error
     path = readable_file(source)
-    reader = READERS.get(path.suffix.lower())
+    # Beside recordings JSON files hold settings and results: one is read where it is named itself.
+    reader = table_from_json if path.suffix.lower() == ".json" else READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(
             f"{path.name} has the ending {path.suffix or '(none)'}, but a recording is read from "

@@ -1,6 +1,7 @@
 """Tables of named columns, delimited text as a table, and resampling on an even grid on request."""
 
 import csv
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -202,6 +203,64 @@ def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     columns = _columns(rows, names, delimiter, path.name, first)
     cut = _cut(rows, delimiter, path.name, first) if text[-1] in "0123456789." else ""
     return Table(path.name, columns, "line", first, units, cut)
+
+
+def table_from_json(path: Path, max_bytes: int = MAX_BYTES) -> Table:
+    """The columns of a JSON file: a list of samples, each an object, or lists under the names of columns.
+
+    Such a list may stand under one name beside settings, as servo logs have it. A list of numbers in a sample
+    is several columns, `name[k]`.
+
+    Raises:
+        InputError: no JSON, no such list or more than one, or a sample with other names than the first.
+    """
+    try:
+        data = json.loads(_decoded(path, max_bytes))
+    except (ValueError, RecursionError, MemoryError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise unreadable(path, "JSON", error) from error
+    samples = lambda v: isinstance(v, list) and bool(v) and all(isinstance(r, dict) for r in v)  # noqa: E731
+    lists = (
+        [data]
+        if samples(data)
+        else [v for v in data.values() if samples(v)]
+        if isinstance(data, dict)
+        else []
+    )
+    if len(lists) == 1:
+        rows, names = lists[0], list(lists[0][0])
+        for k, row in enumerate(rows, 1):
+            if set(row) != set(names):
+                raise InputError(
+                    f"{path.name} has {', '.join(row)} in sample {k}, but {', '.join(names)} in the first; "
+                    "give each sample the same names."
+                )
+        found = {name: [row[name] for row in rows] for name in names}
+    elif not lists and isinstance(data, dict):
+        found = {name: v for name, v in data.items() if isinstance(v, list)}
+    else:
+        found = {}
+    columns = {}
+    for name, values in found.items():
+        whole = values and all(isinstance(v, list) and len(v) == len(values[0]) for v in values)
+        parts = {f"{name}[{k}]": part for k, part in enumerate(zip(*values, strict=True))} if whole else None
+        for column, cells in (parts or {name: values}).items():
+            if not any(isinstance(cell, list | dict) for cell in cells):
+                columns[column] = _numbers_or_text(["nan" if c is None else c for c in cells])
+    if not columns:
+        raise InputError(
+            f"{path.name} has no table in it; write a list of samples, such as "
+            '[{"t": 0.0, "goal": 0.1, "theta": 0.0}, ...], alone or under one name.'
+        )
+    return Table(path.name, columns, "sample")
+
+
+def _numbers_or_text(cells: Sequence[Any]) -> Shaped[np.ndarray, " N"]:
+    try:
+        return np.array([float(cell) for cell in cells])
+    except (ValueError, OverflowError):  # text stays text, so that the error can name its place
+        return np.array([str(cell)[:80] for cell in cells])
 
 
 def _decoded(path: Path, max_bytes: int) -> str:

@@ -6,6 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from rotflex_jax.effects.base import DryFriction, Probe, Scalar, Scale, register
+from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import parameter
 
 
@@ -178,6 +179,8 @@ class LoadFriction(DryFriction):
         level: Friction torque without load [N m].
         driving: Share of the load while the motor drives.
         driven: Share of the load while the load drives the motor.
+        tied: Whether `driven` is `driving`, whatever is given for it: model M3. For recordings of one weight
+            under a servo, which cannot tell the two from another torque constant.
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
     simulation of servo actuators, 2024, models M3 and M5 (load-dependent and directional friction).
@@ -203,6 +206,23 @@ class LoadFriction(DryFriction):
     driven: float = parameter(
         0.2, unit="", lower=0.0, meaning="share of the load that is lost while the load drives the motor"
     )
+
+    tied: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.tied, bool):
+            raise InputError(
+                f"LoadFriction was given tied={self.tied!r}, but it needs True or False; say whether both "
+                "shares are one."
+            )
+        if self.tied:
+            object.__setattr__(self, "driven", self.driving)
+        super().__post_init__()
+
+    @property
+    def follows(self) -> dict[str, str]:
+        """The share of a driven motor follows that of a driving one, where they are tied."""
+        return {"driven": "driving"} if self.tied else {}
 
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar, load: Scalar) -> Scalar:
         """Level [N m] that opposes motion in `direction` under the load [N m]."""

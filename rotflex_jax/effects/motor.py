@@ -196,6 +196,11 @@ class Heating(Memory):
         )
 
 
+def _within(x: Scalar, limit: Scalar) -> Scalar:
+    """`x`, at most `limit` in size; not `clip`, which splits the derivative at the limit itself."""
+    return jnp.where(x > limit, limit, jnp.where(x < -limit, -limit, x))
+
+
 DYNAMIXEL_GAIN_SCALE = 4096 / (2 * math.pi) / (256 * 885)
 """Duty per radian of error and per unit of the P gain of a Dynamixel X: counts of the encoder per radian, by
 the divisor 256 of the gain and the 885 counts of full duty [1/rad]. The logged duty of an XL-330 agrees to
@@ -210,12 +215,18 @@ class PositionServo(Linear, Force):
         duty = min(max(gain gain_scale (goal - (position - period / 2 speed)), -limit), limit)
         tau = torque_constant / resistance (supply duty - torque_constant speed)
 
+    and with the parts that are left out unless they are given
+
+        duty = min(max(gain gain_scale band(goal - ...) - derivative speed, -limit), limit),
+        band(e) = 0 for |e| <= dead_band,  e - dead_band sign(e) beyond
+        supply - source_resistance duty i  in the place of the supply,  i the current of the armature
+
     Angle, speed and torque are those of the output shaft, so that the torque constant contains the gear's
     ratio and stands for the back-EMF as well. Firmware computes a duty from the angle once in every period
     and holds it, so that on average it acts half a period late on the angle, here to first order: a loss of
     damping, which a fit would take for less back-EMF. That it reads whole counts makes steps in the torque
-    far below friction and is left out. Not for a servo whose I or D gain is set, or that plans a profile
-    towards its goal.
+    far below friction and is left out. The D gain acts on the measured speed alone, since a goal that is held
+    between samples has none. Not for a servo whose I gain is set, or that plans a profile towards its goal.
 
     Where the duty is below its limit, the loop is linear and the step integrates it exactly; the limit takes
     away a torque beyond that, by the rule for smooth torques. There a step must be short against the loop,
@@ -236,6 +247,9 @@ class PositionServo(Linear, Force):
         period: Control period of the firmware [s].
         torque_constant: Torque per current, equal to voltage per speed [N m/A].
         resistance: Of the armature [ohm].
+        derivative: Duty that the D gain takes away per speed [s/rad], or None.
+        dead_band: Error of the angle that the firmware takes for none [rad], or None.
+        source_resistance: Of supply and cable, by which the voltage falls under current [ohm], or None.
 
     Source: Duclusaud, Passault, Padois, Ly 2024, Extended friction models for the physics simulation of
         servo actuators, arXiv 2410.08650, section II; Robotis, XL330-M288-T e-manual, control tables 84 and
@@ -246,7 +260,9 @@ class PositionServo(Linear, Force):
     title: ClassVar[str] = "motor under a position loop"
     equation: ClassVar[str] = (
         "tau = torque_constant / resistance * (supply * duty - torque_constant * speed), "
-        "duty = min(max(gain * gain_scale * (v - position + period / 2 * speed), -limit), limit)"
+        "duty = min(max(gain * gain_scale * (v - position + period / 2 * speed), -limit), limit); where "
+        "given, dead_band off the error, derivative * speed off the duty, source_resistance * duty * current "
+        "off the supply"
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("torque_constant",)
     motor: ClassVar[bool] = True
@@ -264,6 +280,22 @@ class PositionServo(Linear, Force):
         0.35, unit="N m/A", lower=0.0, meaning="torque per current, voltage per speed"
     )
     resistance: float = parameter(3.4, unit="ohm", lower=1e-6, meaning="armature resistance")
+    derivative: float | None = parameter(
+        None, unit="s/rad", typical=0.05, lower=0.0, meaning="duty per speed of the D gain"
+    )
+    dead_band: float | None = parameter(
+        None, unit="rad", typical=0.003, lower=0.0, meaning="error that the firmware takes for none"
+    )
+    source_resistance: float | None = parameter(
+        None, unit="ohm", typical=0.3, lower=0.0, meaning="resistance of supply and cable"
+    )
+
+    @property
+    def further_parts(self) -> tuple[str, ...]:
+        """What was given of the parts that most servos lack, with its size."""
+        parts = {n: getattr(self, n) for n in ("derivative", "dead_band", "source_resistance")}
+        declared = self.declared()
+        return tuple(f"{n} of {v:.4g} {declared[n].unit}" for n, v in parts.items() if v)
 
     @property
     def _torque_per_duty(self) -> Scalar:
@@ -274,14 +306,28 @@ class PositionServo(Linear, Force):
         """Entries of the equations of motion below the limit."""
         stiffness = self._torque_per_duty * self.gain * self.gain_scale
         braking = self.torque_constant**2 / self.resistance - stiffness * self.period / 2
+        if self.derivative is not None:
+            braking = braking + self._torque_per_duty * self.derivative
         return Stamp(stiffness=stiffness, drive=stiffness, damping=braking)
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
-        """Torque [N m] that the limit takes away; `voltage` is the goal [rad]."""
-        duty = self.gain * self.gain_scale * (voltage - position + self.period / 2 * speed)
-        # Not `clip`, which splits the derivative between the two branches on the limit itself.
-        above = jnp.where(duty > self.limit, self.limit - duty, 0.0)
-        return self._torque_per_duty * jnp.where(duty < -self.limit, -self.limit - duty, above)
+        """Torque [N m] by which the motor differs from the linear loop; `voltage` is the goal [rad]."""
+        error = voltage - position + self.period / 2 * speed
+        linear = wanted = self.gain * self.gain_scale * error
+        if self.dead_band is not None:
+            wanted = self.gain * self.gain_scale * (error - _within(error, self.dead_band))
+        if self.derivative is not None:
+            linear, wanted = linear - self.derivative * speed, wanted - self.derivative * speed
+        # What the limit takes away, added: nothing is rounded below it.
+        off = _within(wanted, self.limit) - wanted
+        if self.dead_band is not None:
+            off = off + (wanted - linear)
+        if self.source_resistance is None:
+            return self._torque_per_duty * off
+        duty = linear + off
+        share = self.source_resistance / self.resistance * duty
+        supply = (self.supply + share * self.torque_constant * speed) / (1 + share * duty)
+        return self.torque_constant / self.resistance * ((supply - self.supply) * duty + self.supply * off)
 
     def sentence(self) -> str:
         """In words."""

@@ -121,6 +121,7 @@ def _parameters(
     approximated: list[str] = []
     if servo.period:
         left_out.append(f"half a control period of {servo.period:g} s by which the firmware acts late")
+    left_out += [f"{label(servo)}: {part}" for part in servo.further_parts]
     falls = loads = False
     for effect in mechanism.effects:
         if isinstance(effect, Coulomb):

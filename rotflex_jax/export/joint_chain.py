@@ -177,6 +177,8 @@ class Chain:
         stiffness = per_duty * effect.gain * effect.gain_scale
         drive = Drive(f"{effect.at}.{effect.name}", vector, stiffness, limit=per_duty * effect.limit)
         drive.at_position, drive.at_speed = -stiffness, stiffness * effect.period / 2
+        drive.at_speed -= per_duty * (effect.derivative or 0.0)
+        self.left_out += [f"{label(effect)}: {p}" for p in effect.further_parts if "derivative" not in p]
         self.drives.append(drive)
         place.damping += effect.torque_constant**2 / effect.resistance
 

@@ -436,8 +436,6 @@ class _Reader:
             return damping + brake
         if abs(torque - stiffness) > 1e-9 * stiffness:
             self.unable("a forcerange at a position loop with a gear or an offset", "forcerange")
-        if brake > 0:
-            self.unable("a forcerange at a position loop with a damping of its own (kv)", "forcerange")
         constant = math.sqrt(damping) if damping > 0 else _NO_BRAKE
         self.effects.append(
             PositionServo(
@@ -446,9 +444,10 @@ class _Reader:
                 gain_scale=stiffness / force,
                 limit=1.0,
                 supply=force / constant,
-                period=-2 * brake / stiffness,
+                period=max(-2 * brake / stiffness, 0.0),
                 torque_constant=constant,
                 resistance=1.0,
+                derivative=brake / force if brake > 0 else None,
             )
         )
         return min(damping, 0.0)

@@ -9,7 +9,16 @@ from rotflex_jax.mechanism.quantity import Units
 FREE_FALL = 9.80665
 """Acceleration of free fall [m/s^2]."""
 
-FIRMWARE = ("gain", "gain_scale", "limit", "supply", "period")
+FIRMWARE = (
+    "gain",
+    "gain_scale",
+    "limit",
+    "supply",
+    "period",
+    "derivative",
+    "dead_band",
+    "source_resistance",
+)
 """Parameters of `PositionServo` that its user has set."""
 
 
@@ -37,16 +46,13 @@ def position_servo(
     >>> position_servo().free_names[:2]
     ('hub.position_servo.torque_constant', 'hub.position_servo.resistance')
     """
+    driven = dataclasses.replace(servo or PositionServo(), at="hub")
     return Mechanism(
         coordinates=("theta",),
         ports={"hub": (1.0,)},
-        effects=(
-            Inertia(at="hub", inertia=inertia),
-            dataclasses.replace(servo or PositionServo(), at="hub"),
-            Gravity(at="hub", sine=weight),
-        ),
+        effects=(Inertia(at="hub", inertia=inertia), driven, Gravity(at="hub", sine=weight)),
         outputs={"theta": "hub"},
-        trusted=(*(f"hub.position_servo.{name}" for name in FIRMWARE), "hub.inertia.inertia"),
+        trusted=(*(f"hub.position_servo.{n}" for n in FIRMWARE if n in driven.values), "hub.inertia.inertia"),
         units=Units(input="rad"),
     )
 
@@ -92,3 +98,48 @@ def xl330_pendulum(
         .release("hub.inertia.inertia")
         .trust("hub.gravity.sine")
     )
+
+
+def sts3215(
+    inertia: float = 0.03,
+    *,
+    gain: float = 32.0,
+    supply: float = 7.4,
+    dead_band: float = 0.0,
+    weight: float = 0.0,
+) -> Mechanism:
+    """A joint on a Feetech STS3215 of 7.4 V, as arms like the SO-101 have, from goal angle to angle.
+
+        inertia theta'' = servo(goal, theta, theta') - sine sin(theta) - cosine cos(theta)
+
+    `position_servo` with the duty per angle, the largest duty and the motor that were measured at such a
+    servo. The P gain is a register of the servo, 32 when it is new; arms often have less. Not with a speed or
+    acceleration limit set in the servo, which plans a profile towards the goal.
+
+    Args:
+        inertia: Of the joint with rotor and gear; that of the rotor behind the gear is 0.028 [kg m^2].
+        gain: P gain, register 21 of the servo.
+        supply: Supply voltage [V].
+        dead_band: Error that the servo takes for none [rad]; a count is 1.53 mrad.
+        weight: Torque of the weight when the angle is a quarter turn, where to start [N m].
+
+    Returns:
+        Mechanism with the output `theta` [rad] and the port `hub`; its input is the goal [rad].
+
+    Source: Duclusaud, Passault, Padois, Ly 2024, arXiv 2410.08650, and the numbers of this servo published
+        with it: 0.166 duty per radian and unit of the gain, at most 0.97, by an oscilloscope; torque
+        constant, resistance and rotor as fitted there by model M1.
+
+    >>> round(sts3215(gain=16).effect("position_servo", "hub").stamp().stiffness, 2)
+    8.87
+    """
+    servo = PositionServo(
+        gain=gain,
+        gain_scale=0.166,
+        limit=0.97,
+        supply=supply,
+        torque_constant=1.21,
+        resistance=2.68,
+        dead_band=dead_band or None,
+    )
+    return position_servo(inertia, servo=servo, weight=weight)
