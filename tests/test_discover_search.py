@@ -90,7 +90,7 @@ def test_a_constant_of_what_a_search_may_add_is_refused() -> None:
 def test_without_known_noise_the_criterion_says_so() -> None:
     known = Assessment({}, {"theta": NEAR_FLOOR - 0.1, "alpha": NAN}, 0.0)
     assert not known.is_explained
-    assert known.criterion == "the sensor noise of alpha is not known, to judge what is left by"
+    assert known.criterion == "the sensor noise of alpha is not known, to compare what is left with"
     assert "theta and alpha" in Assessment({}, {"theta": NAN, "alpha": NAN}, 0.0).criterion
     # A channel that is above its noise decides, wherever it stands.
     for remaining in ({"theta": NAN, "alpha": 2.0}, {"alpha": 2.0, "theta": NAN}):

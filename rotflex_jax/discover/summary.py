@@ -168,13 +168,18 @@ def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
 
 
 def _far_baseline(state: SearchState) -> tuple[str, ...]:
-    """Parameters of the model as it is that its fit has moved far, in a sentence."""
-    s, h = state.problem.supermodel, state.passed[0].hypothesis
-    found, names = h.mean_values(s), s.mechanism.parameter_names
-    units = [spec.unit for spec in s.mechanism.parameter_specifications]
+    """Parameters of the model as it is that a fit has moved far, in a sentence."""
+    s, first = state.problem.supermodel, state.passed[0]
+    names, specs = s.mechanism.parameter_names, s.mechanism.parameter_specifications
+    found = {
+        i: v.hypothesis.mean_values(s)[i]
+        for v in (first.free_run, first)
+        if v
+        for i in far_from_given(s, v.hypothesis)
+    }
     moved = [
-        f"{names[i]} from {s.mechanism.values[i]:.3g} to {found[i]:.3g} {units[i]}".strip()
-        for i in far_from_given(s, h)
+        f"{names[i]} from {s.mechanism.values[i]:.3g} to {value:.3g} {specs[i].unit}".strip()
+        for i, value in sorted(found.items())
     ]
     if not moved:
         return ()

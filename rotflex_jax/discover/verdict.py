@@ -84,7 +84,9 @@ class Assessment:
         unknown = [c for c, times in self.remaining.items() if math.isnan(times)]
         if not self.at_noise:
             if all(times < NEAR_FLOOR for c, times in self.remaining.items() if c not in unknown):
-                return f"the sensor noise of {' and '.join(unknown)} is not known, to judge what is left by"
+                return (
+                    f"the sensor noise of {' and '.join(unknown)} is not known, to compare what is left with"
+                )
             worst = max(set(self.remaining) - set(unknown), key=lambda c: self.remaining[c])
             return f"the error of {worst} in short runs is above {NEAR_FLOOR:g} times the sensor noise"
         if not self.torque_free:
