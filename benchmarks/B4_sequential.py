@@ -8,7 +8,7 @@ says which of two or three it is. Each rival is fitted to that recording, and al
 
 Beside it the standard inputs, without a pause and evaluated by the same rule: of each kind (multisine, binary
 sequence, sweep, steps, noise) the setting and level that the fitted models expect most of, and of these five
-the one that turned out fastest. They are judged at fewer moments, and the earliest possible one counts.
+the one that turned out fastest. They are evaluated at fewer moments, and the earliest possible one counts.
 Last, cases that no input within the limits can tell: does the loop say so.
 
 Writes results/B4_sequential.json and results/B4_sequential.md; rows that are there are kept.
@@ -40,7 +40,7 @@ TS, ORDINARY, MOST, SEGMENT, ERROR = 0.002, 6.0, 20.0, 0.5, 0.01
 LIMITS = rf.Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
 # Within these nothing moves far beyond the noise.
 NARROW = rf.Limits(voltage=0.3, travel=np.deg2rad(5), deflection=np.deg2rad(0.3))
-# Moments at which a standard input is judged [s]; the earliest since the one before counts.
+# Moments at which a standard input is evaluated [s]; the earliest since the one before counts.
 MOMENTS = (0.5, 1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20)
 LEVELS, PLAYED = (1.0, 0.5, 0.25), 1
 

@@ -65,7 +65,9 @@ AREAS: dict[str, tuple[Tested, ...]] = {
         ),
         Tested("discover/verdict.py", ("test_discover_conclusion.py", "test_discover_verdict.py")),
     ),
-    "localisation": (Tested("discover/localise.py", ("test_discover_localise.py",)),),
+    "localisation": (
+        Tested("discover/localise.py", ("test_discover_localise_limits.py", "test_discover_localise.py")),
+    ),
     "friction": (Tested("mechanism/friction.py", ("test_mechanism_friction.py",), traced=True),),
 }
 LEAST_LIMIT, LIMIT = 60.0, 6.0

@@ -37,7 +37,7 @@ GREY, RED, AMBER, BLUE = "#9aa5b1", "#c8452f", "#d98e04", "#0f6f86"
 # ## The data
 #
 # Voltage in; angle of the hub (theta) and deflection of the arm (alpha) out. Models learn from the
-# first 70 % and are judged on the rest, which no fit sees.
+# first 70 % and are evaluated on the rest, which no fit sees.
 
 # %%
 recording = rf.data.demo_recording()
@@ -108,7 +108,7 @@ show_run(textbook, RED)
 #
 # `rf.locate` looks for times, frequencies, speeds, deflections and moments after a reversal that
 # hold more than their share of the error, and keeps what chance does not explain. Look for hints in
-# the training data; the held-out part stays untouched for judging. Free runs start anew every two
+# the training data; the held-out part stays untouched for comparing. Free runs start again every two
 # seconds here, so that old errors do not pile up.
 
 
@@ -321,7 +321,7 @@ print(result.report("rotflex-report").as_posix())
 #   says where to search.
 # - `ambiguous` names effects that your recording cannot tell apart; `not_excited` those it could
 #   not have shown. Another experiment helps, another algorithm does not.
-# - The held-out part has helped to choose the effects, so it is no neutral judge any more. Where the
+# - The held-out part has helped to choose the effects, so its errors are not unbiased any more. Where the
 #   error falls tenfold this does not matter; in a close call, record again.
 # - All torques hang on one trusted constant, the arm's inertia here: if it is 10 % off, so are
 #   stiffness and friction.

@@ -11,7 +11,7 @@
 #
 # Physics, linear state spaces, Volterra series, adaptive filters, sparse regression: each has its
 # advocates, and each is usually shown on data of its own. Here all learn from the same samples and are
-# judged on the same others, in *free run*: they get the voltage and the first 0.2 s of the angles, and
+# evaluated on the same others, in *free run*: they get the voltage and the first 0.2 s of the angles, and
 # nothing else.
 
 # %%
@@ -66,7 +66,7 @@ plt.show()
 # %% [markdown]
 # - The joint **with the right physics** ends at the noise of the sensor and stays there. It has seven
 #   numbers, and each has a unit.
-# - A **sparse law of motion** (weak SINDy) comes next, and far ahead of the rest: its library happens to
+# - A **sparse equation of motion** (weak SINDy) comes next, and far ahead of the rest: its library happens to
 #   hold the sign of a speed and the cube of an angle, which is what is hidden here.
 # - The **textbook joint** follows theta better than every Volterra series, although it lacks two effects: it
 #   at least knows that a voltage turns into a torque.

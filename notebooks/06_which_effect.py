@@ -62,7 +62,7 @@ for name, true in hidden["stribeck"].items():
 # ## And on a real joint?
 #
 # Two runs of 10 s of a rotary flexible joint in a students' laboratory, each under a controller of its
-# own, 500 samples a second. The search starts from the maker's model, learns from run A, and is judged on
+# own, 500 samples a second. The search starts from the maker's model, learns from run A, and is evaluated on
 # run B. One effect at most is asked for here, to keep this page short; the whole search is in
 # [docs/measured_joint.md](../docs/measured_joint.md). The recordings belong to those who made them: `rotflex
 # data fetch rotflex` takes them from their public address.

@@ -10,9 +10,9 @@
 # # What if the effect I suspect is not in the catalogue?
 #
 # Then the search finds a relative of it, or nothing, and says `unexplained`. You look at where the model
-# still fails, get an idea, and write it down: a law is a class with one method, and from then on the
+# still fails, get an idea, and write it down: an effect is a class with one method, and from then on the
 # search tries it like any other. Here the hidden effect is friction that changes with the *angle* of the
-# hub, as a bent shaft or a worn gear makes it. No law of the catalogue does that.
+# hub, as a bent shaft or a worn gear makes it. No effect of the catalogue does that.
 
 # %%
 import dataclasses
@@ -41,7 +41,7 @@ train, test = recording.split(0.7)
 # %% [markdown]
 # ## What does the catalogue make of it?
 #
-# Friction at the hub, clearly. Fit the usual law and look at what is left.
+# Friction at the hub, clearly. Fit the usual effect and look at what is left.
 
 # %%
 usual = rf.fit(rf.joints.paper() + fx.Coulomb(at="hub"), train)
@@ -122,7 +122,7 @@ for name, error in errors.items():
 mine
 
 # %% [markdown]
-# A law that is registered takes part in `rf.discover`, beside all the others and with no hint: [this
+# An effect that is registered takes part in `rf.discover`, beside all the others and with no hint: [this
 # notebook](02_own_machine.ipynb) lets the search find an effect of one's own in a machine of one's own.
 # For a law that others may need, [CONTRIBUTING.md](../CONTRIBUTING.md) says where the file goes; the
 # conformance tests take it up by themselves.

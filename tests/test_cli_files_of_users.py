@@ -108,7 +108,15 @@ holed = THETA.copy()
 holed[700] = np.nan
 MATRIX = np.column_stack([T, U, THETA, ALPHA])
 
+
+def samples(folder: Path) -> Path:
+    """Samples as a JSON file of a logger has them."""
+    rows = [dict(zip(NAMES, row, strict=True)) for row in MATRIX.tolist()]
+    return _saved(folder / "run.json", lambda f: f.write_text(json.dumps(rows)))
+
+
 READ = {
+    "samples in a JSON file": (samples, ""),
     "as the manual says": (as_csv(table()), ""),
     "semicolons": (as_csv(table(), sep=";"), ""),
     "tabs": (as_csv(table(), sep="\t"), ""),
@@ -171,7 +179,7 @@ CURED = {
     ),
     "milliseconds": (as_csv(table(t=1e3 * T)), "milliseconds", "--time-unit ms"),
     "jitter": (as_csv(table(t=T + jitter)), "", "--resample auto"),
-    "the arm's angle in the room": (in_the_room, "in the room", "--arm-absolute"),
+    "the absolute angle of the arm": (in_the_room, "in the room", "--arm-absolute"),
     "some rows lost": (as_csv(table().drop(index=[700, 701, 1500])), "samples lost", "--resample auto"),
 }  # fmt: skip
 """File, what is said of it, the option that is named and works."""
@@ -237,8 +245,14 @@ def test_it_is_refused(case: str, run, tmp_path: Path) -> None:  # noqa: F811
 
 def test_the_documentation_lists_them_all() -> None:
     page = (Path(__file__).parents[1] / "docs" / "files_tried.md").read_text()
-    for case in (*READ, *CURED, *REFUSED):
+    shown = {case: options for case, (_, options) in READ.items()}
+    shown |= {case: option for case, (*_, option) in CURED.items()}
+    for case, options in shown.items():
+        assert f"| {case} | {f'`{options}`' if options else ''} |" in page, case
+    for case in REFUSED:
         assert f"| {case} |" in page, case
+    rows = [line for line in page.splitlines() if line.startswith("| ") and not line.startswith("| file")]
+    assert len(rows) == len(READ) + len(CURED) + len(REFUSED)
     assert len(READ) + len(CURED) + len(REFUSED) >= 40
 
 

@@ -196,7 +196,10 @@ def test_columns_in_a_json_file(tmp_path):
         (json.dumps([1, 2]), "has no table in it"),
         ("[" * 100_000, "cannot be read as JSON"),
         ('{"t": [0, 1', "cannot be read as JSON"),
-        (json.dumps({"t": [0.0, None], "voltage": [1, 1], "theta": [0, 0], "alpha": [0, 0]}), "."),
+        (
+            json.dumps({"t": [0.0, None], "voltage": [1, 1], "theta": [0, 0], "alpha": [0, 0]}),
+            r"column 't' is nan at sample 2",
+        ),
     ],
 )
 def test_json_without_a_recording_is_refused(tmp_path, content, said):

@@ -20,7 +20,6 @@ def arm(
 
     in explicit steps of 0.1 ms, with friction that holds; the encoder has steps of 0.5 mrad.
     """
-    Ts = 0.002
     rng, h = np.random.default_rng(seed), Ts / fine
     reference = step * np.repeat([0, 1, -1, 1], N // 4)
     u, y, q, w = np.empty(N), np.empty((N, 1)), 0.0, 0.0

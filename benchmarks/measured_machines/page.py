@@ -95,7 +95,7 @@ def page(results: dict[str, Any]) -> str:
     good = [r for r in rows if "error" not in r]
     lines = [
         "| machine | direction | unit | stage | whole | windows | whole, calibrated | windows, calibrated | "
-        "validation, windows | judged by |",
+        "validation, windows | evaluated by |",
         "|---|---|---|---|---:|---:|---:|---:|---:|---|",
     ]
     for row in good:

@@ -159,7 +159,7 @@ def _unnamed_torque(rng: np.random.Generator) -> Beside:
         )
     if which == "shaking":
         values = {"amplitude": log_uniform(rng, 0.002, 0.01), "frequency": log_uniform(rng, 0.5, 4.0)}
-        return Beside("shaking", values)
+        return Beside("shaking", values, (("periodic_disturbance", "input"),))
     return Beside("random_torque", {"size": log_uniform(rng, 0.002, 0.008), "time": log_uniform(rng, 0.3, 2)})
 
 

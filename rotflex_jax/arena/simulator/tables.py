@@ -30,8 +30,8 @@ PORTS = {"hub": HUB, "arm": ARM, "joint": JOINT}
 VISCOUS, DRAG, STIFFNESS, QUADRATIC, CUBIC, GRAVITY, PHASE = 0, 1, 2, 3, 4, 5, 6
 FRICTION_PLUS, FRICTION_MINUS, STRIBECK, STRIBECK_SPEED = 7, 8, 9, 10
 COGGING, COGGING_PHASE, PERIODS, PLAY = 11, 12, 13, 14
-# Of these the package has no counterpart: friction that depends on the angle, a stiffness that
-# grows in proportion to time, a torque that is a sine of time.
+# Of these the package has no exact counterpart: friction that depends on the angle, a stiffness that
+# grows in proportion to time, a torque that is a sine of time (a periodic disturbance acts on the voltage).
 PATCHY, PATCHY_SHARE, DRIFT, SHAKE, SHAKE_RATE = 15, 16, 17, 18, 19
 # Nor for a push ``P exp(-((z - c) / w)^2)`` that is felt around one position only.
 PUSH, PUSH_AT, PUSH_WIDTH = 20, 21, 22
