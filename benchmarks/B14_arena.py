@@ -65,7 +65,8 @@ def page(results: dict[str, Any]) -> str:
             "",
             *lines,
             "",
-            "## Every answer (bold: right; an effect that no recording can tell from the hidden one counts as it)",
+            "## Every answer (bold: right; an effect that no recording can tell from the hidden one "
+            "counts as it)",
             "",
             *rows,
             *(["", "## Failures", "", *notes] if notes else []),

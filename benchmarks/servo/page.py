@@ -108,9 +108,9 @@ def page(found: dict[str, Any]) -> str:
             lines.append(f"| {said} | " + " | ".join(f"{r[name]:.2f}" for r in rows) + " |")
         lines += [
             "",
-            "Root mean square errors [deg] of free runs over `step_response`, which no fit used. `Coulomb, slow` leaves "
-            "out the last third of the chirp; that was decided when these errors were known, and the others were not "
-            "fitted so: it is no held-out result.",
+            "Root mean square errors [deg] of free runs over `step_response`, which no fit used. "
+            "`Coulomb, slow` leaves out the last third of the chirp; that was decided when these errors were "
+            "known, and the others were not fitted so: it is no held-out result.",
             "",
         ]
         lines += ["| model | free runs of a recording | fit [s] |", "|---|---:|---:|"]

@@ -18,8 +18,8 @@ Files = Annotated[
     list[Path],
     typer.Argument(
         metavar="FILE...",
-        help="Recordings: .csv, .tsv, .xlsx, .json, .mat, .npz, .parquet, .tdms, .mf4, .mcap; a folder with a "
-        "file for each channel; or rotflex, the public data set.",
+        help="Recordings: .csv, .tsv, .xlsx, .json, .mat, .npz, .parquet, .tdms, .mf4, .mcap; a folder with "
+        "a file for each channel; or rotflex, the public data set.",
     ),
 ]
 JointName = Annotated[
