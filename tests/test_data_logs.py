@@ -192,7 +192,7 @@ def test_columns_in_a_json_file(tmp_path):
     ("content", "said"),
     [
         (json.dumps([SAMPLES[0], {"t": 1.0}]), r"has t in sample 2, but t, voltage, angles, on, unit in"),
-        (json.dumps({"a": SAMPLES, "b": SAMPLES}), "has no table in it; write a list of samples"),
+        (json.dumps({"a": SAMPLES, "b": SAMPLES}), "has samples under a, b, but one recording is read"),
         (json.dumps([1, 2]), "has no table in it"),
         ("[" * 100_000, "cannot be read as JSON"),
         ('{"t": [0, 1', "cannot be read as JSON"),

@@ -250,8 +250,10 @@ def found(verdict: Verdict = Verdict.AMBIGUOUS) -> Discovery:
 @pytest.fixture(scope="module")
 def answered():
     old, conclusion.PROPOSAL_SECONDS = conclusion.PROPOSAL_SECONDS, 3.0
-    yield with_proposal(found())
-    conclusion.PROPOSAL_SECONDS = old
+    try:
+        return with_proposal(found())
+    finally:
+        conclusion.PROPOSAL_SECONDS = old
 
 
 def test_the_best_standard_input_is_proposed_within_what_the_machine_has_borne(answered):

@@ -58,6 +58,26 @@ def test_its_phase_is_that_of_each_recording(disturbed) -> None:
     assert any("comes from outside and belongs to each recording" in note for note in disturbed.notes)
 
 
+def test_any_of_several_recordings_may_have_it() -> None:
+    """And what is reported of it is what the model has: the phases of recordings have no mean."""
+    runs = [recording(0.0, 5).slice(0, 1200), recording(SIZE, 6).slice(0, 1200)]
+    found = rf.discover(
+        rf.joints.paper() + Coulomb("hub", level=0.02),
+        runs,
+        recording(SIZE, 7).slice(0, 1200),
+        candidates=[(PeriodicDisturbance, "input"), (VoltageDrift, "input")],
+        rounds=1,
+    )
+    (only,) = found.rounds
+    effect = found.model.mechanism.effect("periodic_disturbance", "input")
+    assert only.effect == "periodic_disturbance" and effect.frequency == pytest.approx(FREQUENCY, abs=0.03)
+    for name in ("sine", "cosine"):
+        assert only.parameters[name].value == pytest.approx(getattr(effect, name))
+        assert only.parameters[name].value == pytest.approx(
+            0.0, abs=0.05
+        )  # of the first recording, without one
+
+
 def test_without_a_line_it_is_no_candidate() -> None:
     found = rf.discover(rf.joints.paper(), *recording(0.0, 4).split(0.7), candidates=CANDIDATES, rounds=1)
     assert [r.effect for r in found.rounds] == ["coulomb"]

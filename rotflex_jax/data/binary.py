@@ -249,6 +249,8 @@ def _objects(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str
             found.append((prefix + key, value.kind))
         elif isinstance(value, Mapping):
             found += _objects(value, f"{prefix}{key}.")
+        elif (parts := _parts(value)) is not None:
+            found += _objects(parts, f"{prefix}{key}")
     return found
 
 

@@ -100,7 +100,7 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
     if reader is None:
         raise InputError(
             f"{path.name} has the ending {path.suffix or '(none)'}, but a recording is read from "
-            f"{', '.join(READERS)}; rename or export it."
+            f"{', '.join([*READERS, '.json'])}; rename or export it."
         )
     check_size(path.name, path.stat().st_size, max_bytes, "has")
     try:

@@ -126,7 +126,11 @@ class StoredObjects:
         t = np.atleast_1d(np.asarray([] if t is None else t, float)).ravel()
         if not len(t):
             count = _either(about, "Length")
-            count = len(np.atleast_1d(data)) if count is None else int(count)
+            shape = np.shape(data) or (1,)
+            # Without times of its own it may be Simulink's, with time last.
+            count = shape[-1 if len(shape) > 2 else 0] if count is None else int(count)
+            if not 0 <= count <= np.size(data):
+                raise ValueError("a timeseries has more times than values")
             t = float(_either(about, "Start") or 0.0) + float(_either(about, "Increment")) * np.arange(count)
         data = np.atleast_1d(np.asarray(data))
         if data.shape[0] != len(t):  # Simulink has the time last

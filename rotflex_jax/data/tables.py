@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -220,16 +221,16 @@ def table_from_json(path: Path, max_bytes: int = MAX_BYTES) -> Table:
         if isinstance(error, InputError):
             raise
         raise unreadable(path, "JSON", error) from error
-    samples = lambda v: isinstance(v, list) and bool(v) and all(isinstance(r, dict) for r in v)  # noqa: E731
-    lists = (
-        [data]
-        if samples(data)
-        else [v for v in data.values() if samples(v)]
-        if isinstance(data, dict)
-        else []
-    )
-    if len(lists) == 1:
-        rows, names = lists[0], list(lists[0][0])
+    named = data if isinstance(data, dict) else {"": data}
+    lists = {name: v for name, v in named.items() if _are_samples(v)}
+    if len(lists) > 1:
+        raise InputError(
+            f"{path.name} has samples under {', '.join(lists)}, but one recording is read; write each to a "
+            "file of its own."
+        )
+    if lists:
+        ((_, rows),) = lists.items()
+        names = list(rows[0])
         for k, row in enumerate(rows, 1):
             if set(row) != set(names):
                 raise InputError(
@@ -237,17 +238,15 @@ def table_from_json(path: Path, max_bytes: int = MAX_BYTES) -> Table:
                     "give each sample the same names."
                 )
         found = {name: [row[name] for row in rows] for name in names}
-    elif not lists and isinstance(data, dict):
-        found = {name: v for name, v in data.items() if isinstance(v, list)}
     else:
-        found = {}
+        found = {name: v for name, v in named.items() if name and isinstance(v, list)}
     columns = {}
     for name, values in found.items():
         whole = values and all(isinstance(v, list) and len(v) == len(values[0]) for v in values)
         parts = {f"{name}[{k}]": part for k, part in enumerate(zip(*values, strict=True))} if whole else None
         for column, cells in (parts or {name: values}).items():
             if not any(isinstance(cell, list | dict) for cell in cells):
-                columns[column] = _numbers_or_text(["nan" if c is None else c for c in cells])
+                columns[column] = _numbers_or_text([math.nan if c is None else c for c in cells])
     if not columns:
         raise InputError(
             f"{path.name} has no table in it; write a list of samples, such as "
@@ -256,11 +255,22 @@ def table_from_json(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     return Table(path.name, columns, "sample")
 
 
+def _are_samples(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(row, dict) for row in value)
+
+
 def _numbers_or_text(cells: Sequence[Any]) -> Shaped[np.ndarray, " N"]:
+    """Numbers where all cells are; else text, so that an error can name its place."""
+    if not all(isinstance(cell, int | float) for cell in cells):
+        return np.array([str(cell) for cell in cells])
+    return np.array([_number(cell) for cell in cells])
+
+
+def _number(cell: float) -> float:
     try:
-        return np.array([float(cell) for cell in cells])
-    except (ValueError, OverflowError):  # text stays text, so that the error can name its place
-        return np.array([str(cell)[:80] for cell in cells])
+        return float(cell)
+    except OverflowError:
+        return math.inf
 
 
 def _decoded(path: Path, max_bytes: int) -> str:

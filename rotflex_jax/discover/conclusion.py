@@ -109,7 +109,10 @@ def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
         found: What a search found.
         changes: Arguments of `next_experiment` to use instead of those of the recordings.
     """
-    pairs = [((r.effect, r.port), r.equivalent[0]) for r in found.rounds if r.equivalent]
+    # The phase of a disturbance in the next recording is not known.
+    phased = {name for name, effect in CATALOG.items() if effect.line}
+    equal = [((r.effect, r.port), r.equivalent[0]) for r in found.rounds if r.equivalent]
+    pairs = [(a, b) for a, b in equal if not phased & {a[0], b[0]}]
     if not pairs:
         return None
     recordings = (*found.train, *found.validation)

@@ -28,6 +28,7 @@ from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
+from rotflex_jax.models.model import Model
 from rotflex_jax.models.model_json import Saved, save
 from rotflex_jax.text.markup import as_json, bullets, card, folded, paragraph, picture, table, write_files
 from rotflex_jax.text.numbers import equation, plain_number, readable, unit_text, value_and_interval
@@ -58,10 +59,11 @@ class Discovery(SearchResult):
             at: Port of the torque.
             progress: Called with a line of text at each stage.
         """
-        seconds = self.baseline.window_seconds
-        return learn_torque(
-            self.model, self.train, self.validation, at, window_seconds=seconds, progress=progress
-        )
+        seconds, m = self.baseline.window_seconds, self.model.mechanism
+        for effect in [e for e in m.effects if e.line]:  # its phase is that of one recording
+            m = m.without(effect.name, effect.at)
+        model = Model(m, self.model.solver)
+        return learn_torque(model, self.train, self.validation, at, window_seconds=seconds, progress=progress)
 
     def explanation(
         self, learned: bool | None = None, progress: Callable[[str], None] | None = None

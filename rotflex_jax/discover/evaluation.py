@@ -193,12 +193,15 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
             parts.append(RecordingSlopes(slopes, w[r, samples][inside], coordinates.columns(r, k)))
     covariance = sandwich(parts, curvature(parts, coordinates.size))
     values, derivative = h.physical(s)
-    clean = s.clean(values.mean(axis=0), h.locations)
+    mean = h.mean_values(s)
+    clean = s.clean(mean, h.locations)
     indices = [s.mechanism.parameter_names.index(name) for name in clean.parameter_names]
 
     def combination(i: int) -> Combination | None:
         if i in h.free:
             return Combination([h.free.index(i)], derivative[:1, i])
+        if i in h.phased:  # as the model has it: phases have no mean
+            return Combination([int(coordinates.local_columns(0)[h.local.index(i)])], derivative[:1, i])
         if i in h.local:
             return Combination(
                 [int(coordinates.local_columns(r)[h.local.index(i)]) for r in range(R)], derivative[:, i] / R
@@ -206,12 +209,14 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
         return None
 
     def note(i: int) -> str:
-        differs = i in h.local and R > 1
-        return "mean of " + ", ".join(f"{v:.3g}" for v in values[:, i]) if differs else ""
+        if i not in h.local or R == 1:
+            return ""
+        which = "first of" if i in h.phased else "mean of"
+        return f"{which} " + ", ".join(f"{v:.3g}" for v in values[:, i])
 
     found = inference.estimates(
         clean.parameter_names,
-        values.mean(axis=0)[indices],
+        mean[indices],
         clean.parameter_specifications,
         [combination(i) for i in indices],
         covariance,

@@ -130,7 +130,7 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
         scored = [*scored, *(s for s, _ in more)]
         winner, rivals = choose([*candidates, *(c for _, c in more)], current, data, state.problem.noise)
         assert winner and winner.location
-    nats = next((s.nats for s in scored if s.location == winner.location), 0.0)
+    nats = max((s.nats for s in scored if s.location == winner.location), default=0.0)
     not_distinguished = tuple(r.location for r in rivals if r.location)
     added = AddedEffect(winner.location, nats, not_distinguished, horizon_gains(winner, current))
     state.add(winner, [added])
@@ -160,6 +160,8 @@ def _refit_replaced(
 
 def add_pair(state: SearchState, rounds: int) -> bool:
     """Add two effects that are needed together, where something is left; False where there are none.
+
+    They are sought beside the current model alone, not beside the nominal one.
 
     Args:
         state: What was found so far.

@@ -277,7 +277,7 @@ def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: floa
     values = np.where(c.amplitudes, share * start.values, start.values)
     for k, spec in enumerate(specs):
         # A bound at zero is the end of a logarithm: start a little inside.
-        if np.isfinite(spec.lower):
+        if np.isfinite(spec.lower) and k != c.line:
             values[k] = max(values[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
     z = h.z.copy()
     z[list(c.parameters)] = Transform.of(specs).unconstrain(values)
@@ -311,6 +311,7 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
         free=tuple(i for i in h.free if i not in removed),
         local=tuple(h.local[k] for k in kept),
         local_z=h.local_z[:, kept],
+        phased=tuple(i for i in h.phased if i not in removed),
     )
 
 

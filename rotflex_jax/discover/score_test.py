@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, ProgramSamples
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ReducedModel, SuperModel
+from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ErrorLine, ReducedModel, SuperModel
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.coordinates import FitCoordinates, Projection
 from rotflex_jax.fit.problem import each_recording
@@ -211,11 +211,11 @@ def _directions(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> Direction
         if not any(c.amplitudes):
             d.gates[row, c.effect] = 1.0
             continue
-        # Recordings have each their own phase of a disturbance: the first one is asked.
-        asked = slice(None) if c.line is None else 0
+        # Each recording has its own phase of a disturbance: only the one whose errors have the line counts.
+        affected = slice(None) if c.line is None else c.recordings[p.shape]
         for k, i in enumerate(c.parameters):
             if c.amplitudes[k]:
-                d.values[row, asked, i] = c.probes[p.shape][p.member][k]
+                d.values[row, affected, i] = c.probes[p.shape][p.member][k]
     return d
 
 
@@ -228,46 +228,52 @@ def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
 MOST_LINES = 2
 
 
-def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[float, ...]:
-    """Frequencies [Hz] at which predictions have a line that the input has not, the clearest first.
+def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[ErrorLine, ...]:
+    """Lines in the spectrum of the innovations that the input has not, the clearest first.
 
     Args:
         problem: Predictions of recordings.
         h: Fitted to them.
     """
-    found: list[tuple[float, float]] = []
-    data, windows = problem.dataset.recordings, problem.innovations([h])[0]
-    for recording, e, seen in zip(data, windows, problem.seen, strict=True):
+    found: list[tuple[float, ErrorLine]] = []
+    data, innovations = problem.dataset.recordings, problem.innovations([h])[0]
+    for r, (recording, e, seen) in enumerate(zip(data, innovations, problem.seen, strict=True)):
         first, last = recording.n_init, int(np.sum(seen))
         for x in e[first:last].T if np.all(np.isfinite(e[:last])) else ():
             lines = periodic_torques(x, recording.u[first:last], recording.Ts)
             found += [
-                (line.amplitude / max(line.interval[1] - line.amplitude, 1e-300), line.frequency)
-                for line in lines
+                (x.amplitude / max(x.interval[1] - x.amplitude, 1e-300), ErrorLine(x.frequency, r))
+                for x in lines
             ]
     longest = max(r.duration for r in data)
-    chosen: list[float] = []
-    for _, frequency in sorted(found, reverse=True):
-        if all(abs(frequency - other) > 2 / longest for other in chosen):
-            chosen.append(frequency)
+    chosen: list[ErrorLine] = []
+    for _, line in sorted(found, reverse=True):
+        if all(abs(line.frequency - other.frequency) > 2 / longest for other in chosen):
+            chosen.append(line)
     return tuple(chosen[:MOST_LINES])
 
 
-def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[float] = ()) -> "ScoreTest":
+def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorLine] = ()) -> "ScoreTest":
     """The test of all candidates that are not yet in the hypothesis.
 
     Args:
         problem: Recordings at one horizon.
         h: What the candidates are beside.
-        lines: Frequencies at which a disturbance is tried [Hz]; none is tried without.
+        lines: Where a disturbance is tried; none is tried without.
     """
     s, seen = problem.supermodel, problem.seen
-    absent = (c for c in s.candidates.values() if c.location not in h.locations)
-    candidates = [c for c in (c.at_lines(lines) for c in absent) if c is not None]
+    absent = [c for c in s.candidates.values() if c.location not in h.locations]
+    tried = {c.location: found for c in absent if (found := c.at_lines(lines))}
+    candidates = list(tried.values())
     if not candidates:
         return ScoreTest([], {}, None)
-    families = s.families([c for c in candidates if not c.threshold])
-    batches = [(family, probes) for family in families for probes in _packed(family)]
+    # Families of all that is absent, so that a line that comes or goes compiles nothing.
+    families = s.families([c for c in absent if not c.threshold])
+    batches = [
+        (family, probes)
+        for family in families
+        for probes in _packed([tried[c.location] for c in family if c.location in tried])
+    ]
     e, J = problem.slopes([h])
     w = h.whitener(e[0], seen)
     coordinates = FitCoordinates.of(h, problem.windows)

@@ -67,7 +67,8 @@ def discover(
         train: Recordings to fit.
         validation: Recordings that decide between models, none of which is fitted to them; at most their own
             first state and offsets are adapted when likelihoods are compared, and only the first `n_init`
-            samples for the errors reported. They also help to estimate the noise of the sensors, and the
+            samples for the errors reported, and size and phase of a periodic disturbance, which are fitted to
+            the whole of each. They also help to estimate the noise of the sensors, and the
             model that was chosen is fitted to them once, to see whether its parameters are the same there.
             Without any, every training recording validates what was fitted to the others.
         test: Recordings that have no say in anything; the errors on them are reported beside.

@@ -21,7 +21,7 @@ from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.score_test import Score, ScoreTest, residual_lines, score_test
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
-from rotflex_jax.discover.stepwise import far_from_given, fit_baseline, fit_free_run_baseline, without_fit
+from rotflex_jax.discover.stepwise import as_given, far_from_given, fit_baseline, fit_free_run_baseline
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import (
     Horizons,
@@ -172,7 +172,7 @@ class SearchState:
     def rank(self, beside: ValidatedHypothesis) -> tuple[list[Score], list[Score]]:
         """Scores of all candidates beside a model, of predictions and of free runs; the first are kept."""
         listed, runs = (test.listed for test in self.score_tests(beside))
-        if not self.ranking:
+        if not self.ranking or beside is self.nominal:
             by_runs = {x.location: x.nats for x in runs}
             self.ranking = [(x, by_runs[x.location]) for x in listed]
         return listed, runs
@@ -195,18 +195,18 @@ def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -
     current = horizons.validated(h, fit_free_run_baseline(horizons.free_run.problem, h))
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
-    _set_nominal(state)
-    state.smooth_nats = nats_if_smooth(state.problem, h)
-    for line in smooth_note(state.smooth_nats):
-        say(line)
+    _check_baseline(state)
     return state
 
 
-def _set_nominal(state: SearchState) -> None:
-    """The model as given beside the fitted one, where the fit has gone far away from it at either horizon."""
+def _check_baseline(state: SearchState) -> None:
+    """Whether the baseline would rather have a smooth input, and whether its fit has gone far away."""
+    state.smooth_nats = nats_if_smooth(state.problem, state.current.hypothesis)
+    for line in smooth_note(state.smooth_nats):
+        state.say(line)
     fits = [v.hypothesis for v in (state.current, state.current.free_run) if v]
     if any(far_from_given(state.problem.supermodel, h) for h in fits):
-        state.nominal = without_fit(state.horizons)
+        state.nominal = as_given(state.horizons)
 
 
 def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:
@@ -224,10 +224,9 @@ def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path
         found.append(horizons.validated(h, runs, found[-1] if found else None))
     first, *later = found
     state = SearchState(model, horizons, say, first, digest, len(later), passed=[first], tried=[first])
+    _check_baseline(state)
     if later:
-        state.rank(first)
-    else:
-        _set_nominal(state)
+        state.rank(state.origin)
     state.reached("as it is")
     for reached, stage in zip(later, stages[1:], strict=True):
         state.add(reached, stage.added)

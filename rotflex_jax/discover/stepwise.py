@@ -51,7 +51,7 @@ def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
     least, most = problem.process_noise_range
     intensities = (most, np.sqrt(least * most), least)
     # A distant start is safe only with a short horizon: all paths begin with one.
-    near = problem.with_process_noise(_as_given(problem), dict.fromkeys(problem.ports, 100 * most))
+    near = problem.with_process_noise(_start(problem), dict.fromkeys(problem.ports, 100 * most))
     near = refit(problem, [near], alternations=0)[0]
     paths = [problem.with_process_noise(near, dict.fromkeys(problem.ports, q)) for q in intensities]
     return max(refit(problem, paths, wide=True), key=lambda h: h.log_likelihood)
@@ -67,7 +67,7 @@ def fit_free_run_baseline(problem: LikelihoodProblem, prediction: Hypothesis) ->
         problem: Of free runs.
         prediction: The user's model fitted to predictions.
     """
-    starts = [as_free_run(problem, h) for h in (prediction, _as_given(problem))]
+    starts = [as_free_run(problem, h) for h in (prediction, _start(problem))]
     able = [h for h in starts if np.isfinite(h.log_likelihood)] or starts[:1]
     return max(refit(problem, able), key=lambda h: h.log_likelihood)
 
@@ -85,16 +85,16 @@ def far_from_given(s: SuperModel, h: Hypothesis) -> list[int]:
     return i[np.abs(np.log(ratio)) > np.log(FAR_FROM_GIVEN)].tolist()
 
 
-def without_fit(horizons: Horizons) -> ValidatedHypothesis:
+def as_given(horizons: Horizons) -> ValidatedHypothesis:
     """The user's model with the values that it has and the process noise that suits these, validated."""
     problem = horizons.prediction.problem
     _, most = problem.process_noise_range
-    start = problem.with_process_noise(_as_given(problem), dict.fromkeys(problem.ports, most))
+    start = problem.with_process_noise(_start(problem), dict.fromkeys(problem.ports, most))
     h = choose_process_noise(problem, problem.evaluated(start, problem.innovations([start])[0]), wide=True)
     return horizons.validated(h, as_free_run(horizons.free_run.problem, h))
 
 
-def _as_given(problem: LikelihoodProblem) -> Hypothesis:
+def _start(problem: LikelihoodProblem) -> Hypothesis:
     """The user's model with the values that it has, and calibrations of zero."""
     s, first = problem.supermodel, problem.windows.first_states
     R, C = len(first), len(s.mechanism.channels)
@@ -289,7 +289,8 @@ def remaining_rivals(
     """
     s = problem.supermodel
     remaining = {p: [r for r in rivals[p] if r not in found] for p in found}
-    pairs = [(p, r) for p in found for r in remaining[p]]
+    # One that is refitted at its line has passed already beside the models of its round.
+    pairs = [(p, r) for p in found for r in remaining[p] if not CATALOG[r.effect].line]
     if not pairs or len(found) == 1:
         return RemainingRivals(remaining, [])
     swapped = []
@@ -299,7 +300,8 @@ def remaining_rivals(
     best = validate(validation, final)
     validated = [validate(validation, h) for h in refit(problem, swapped)]
     alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(best, t)}
-    return RemainingRivals({p: [r for r in remaining[p] if (p, r) in alike] for p in found}, validated)
+    left = {p: [r for r in remaining[p] if (p, r) in alike or CATALOG[r.effect].line] for p in found}
+    return RemainingRivals(left, validated)
 
 
 def nested_models(
@@ -529,6 +531,6 @@ def disturbance_notes(s: SuperModel, final: ValidatedHypothesis) -> tuple[str, .
         out.append(
             f"{titled(location)} comes from outside and belongs to each recording, not to the machine: "
             f"{trained} in the training data, {adapted} in the validation data. Size and phase were fitted "
-            "to each, so that errors on validation data are those with it; no other run has that phase."
+            "to each: errors on validation data are those with it, errors on test recordings those without."
         )
     return tuple(out)

@@ -184,8 +184,9 @@ def _far_baseline(state: SearchState) -> tuple[str, ...]:
     if not moved:
         return ()
     return (
-        f"The fit of the model as it is has moved {' and '.join(moved)}, as happens where friction holds a "
-        "machine at rest; candidates were also tried beside the values given.",
+        f"The fit of the model as it is has moved {' and '.join(moved)}: values that were given far off do "
+        "that, and friction that holds a machine at rest"
+        + ("; candidates were also tried beside the values given." if state.ranking else "."),
     )
 
 

@@ -83,6 +83,18 @@ class EffectLocation(NamedTuple):
         return f"{self.effect} at {self.port}"
 
 
+class ErrorLine(NamedTuple):
+    """A line in the spectrum of a model's errors that the input has not.
+
+    Attributes:
+        frequency: Where it is [Hz].
+        recording: Index of the recording with these errors.
+    """
+
+    frequency: float
+    recording: int
+
+
 @dataclasses.dataclass(frozen=True)
 class Candidate:
     """One effect that may be missing.
@@ -98,6 +110,7 @@ class Candidate:
             effect does.
         line: Which of its parameters is a frequency, tried only where a model's errors have a line; None for
             other effects.
+        recordings: For each shape of such a candidate the recording whose errors have the line.
     """
 
     location: EffectLocation
@@ -108,16 +121,19 @@ class Candidate:
     one_sided: bool
     threshold: bool = False
     line: int | None = None
+    recordings: tuple[int, ...] = ()
 
-    def at_lines(self, frequencies: Sequence[float]) -> "Candidate | None":
-        """The candidate as it is tried beside these lines [Hz]: one shape for each; None without any."""
+    def at_lines(self, lines: "Sequence[ErrorLine]") -> "Candidate | None":
+        """The candidate as it is tried beside these lines: one shape for each; None without any."""
         k = self.line
         if k is None:
             return self
         shapes = tuple(
-            tuple((*member[:k], f, *member[k + 1 :]) for member in self.probes[0]) for f in frequencies
+            tuple((*member[:k], line.frequency, *member[k + 1 :]) for member in self.probes[0])
+            for line in lines
         )
-        return dataclasses.replace(self, probes=shapes) if shapes else None
+        found = dataclasses.replace(self, probes=shapes, recordings=tuple(line.recording for line in lines))
+        return found if shapes else None
 
 
 @dataclasses.dataclass(frozen=True)

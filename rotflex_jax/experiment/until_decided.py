@@ -132,7 +132,8 @@ def models_of(given: Any, say: Progress) -> tuple[Any, Mapping[str, float] | Non
         final = {(e.name, e.at): e for e in given.model.mechanism.effects}
         for name in sorted(s.effects):
             at = tuple(name.split("@"))
-            if at not in have:
+            # The phase of a disturbance in the next seconds is not known.
+            if at not in have and not CATALOG[at[0]].line:
                 m = m + final.get(at, CATALOG[at[0]](at=at[1]))
         say(f"fitting {label}")
         models[label], found[label] = fit(m, list(train)), s.probability

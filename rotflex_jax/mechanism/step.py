@@ -193,14 +193,14 @@ def friction_level(
     return evaluate_effect(e, limit, *signals)
 
 
-def motor_limit(
+def motor_beyond_linear(
     mechanism: Mechanism,
     at: str,
     x: Float[Array, "m *S"],
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Torque [N m] that their limits take from the motors at a port, beyond `motor_torque`."""
+    """Torque [N m] of motors at a port beyond `motor_torque`: limits, dead bands, a weak supply."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = jnp.zeros(x.shape[1:], x.dtype)
@@ -227,7 +227,7 @@ def motor_correction(
     """Torque [N m] of the motors at a port beyond their linear part: less for a limit or for heat."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
-    total = motor_limit(mechanism, at, x, v, gates)
+    total = motor_beyond_linear(mechanism, at, x, v, gates)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         if e.driven_by == "motor" and e.at == at:
             k, drive = layout.torque_ports.index(at), memory_drive(mechanism, e, x, v, gates)
@@ -245,7 +245,7 @@ def memory_drive(
     """Last argument of `flow` and `force` of a memory: the voltage, or the torque of the motors [N m]."""
     if e.driven_by == "voltage":
         return v
-    return motor_torque(mechanism, e.at, x, v, gates) + motor_limit(mechanism, e.at, x, v, gates)
+    return motor_torque(mechanism, e.at, x, v, gates) + motor_beyond_linear(mechanism, e.at, x, v, gates)
 
 
 def has_smooth_torques(mechanism: Mechanism) -> bool:
