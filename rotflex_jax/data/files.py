@@ -62,7 +62,10 @@ READERS: dict[str, Callable[[Path, int], Table]] = {
     ".tdms": table_from_tdms,
     ".mf4": table_from_mdf,
     ".mcap": table_from_mcap,
+    ".json": table_from_json,
 }
+# In a folder of recordings JSON files hold settings and results: one is read where it is named itself.
+FILES_OF_CHANNELS = tuple(ending for ending in READERS if ending != ".json")
 
 
 def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None) -> Table:
@@ -86,7 +89,7 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
         return _together(source, f"{len(source)} files", max_bytes, time)
     if isinstance(source, str | os.PathLike) and os.path.isdir(source):
         folder = Path(source)
-        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS and p.is_file())
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in FILES_OF_CHANNELS and p.is_file())
         try:
             return _together(files, f"{folder!s:.300}", max_bytes, time)
         except InputError as error:
@@ -95,12 +98,11 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
             told = f"The folder {folder!s:.100} as one recording with a file for each channel: {error}"
             raise InputError(told) from error
     path = readable_file(source)
-    # Beside recordings JSON files hold settings and results: one is read where it is named itself.
-    reader = table_from_json if path.suffix.lower() == ".json" else READERS.get(path.suffix.lower())
+    reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(
             f"{path.name} has the ending {path.suffix or '(none)'}, but a recording is read from "
-            f"{', '.join([*READERS, '.json'])}; rename or export it."
+            f"{', '.join(READERS)}; rename or export it."
         )
     check_size(path.name, path.stat().st_size, max_bytes, "has")
     try:
@@ -117,7 +119,7 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
     if not sources:
         raise InputError(
             f"{label} is a folder, but a recording is one file, or a folder with a file for each channel, "
-            f"which end in {', '.join(READERS)}; name the file."
+            f"which end in {', '.join(FILES_OF_CHANNELS)}; name the file."
         )
     paths = [readable_file(source) for source in sources]
     tables = [read_table(path, max_bytes) for path in paths]

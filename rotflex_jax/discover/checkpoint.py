@@ -220,18 +220,16 @@ def restored(problem: LikelihoodProblem, written: Mapping[str, Any]) -> Hypothes
     """The hypothesis that was written, with the whitener and the likelihood that its innovations give."""
     locations = tuple(EffectLocation(*map(str, p)) for p in written["locations"])
     numbers = {name: np.array(written[name], float) for name in _NUMBERS}
-    local = tuple(map(int, written["local"]))
     h = Hypothesis(
         locations=locations,
         free=tuple(map(int, written["free"])),
-        local=local,
-        phased=problem.supermodel.phased(local),
+        local=tuple(map(int, written["local"])),
         process_noise={str(p): float(q) for p, q in written["process_noise"].items()},
         whitener=Whitener.of_noise(problem.noise),
         **numbers,
     )
     _check(problem, h)
-    return problem.evaluated(h, problem.innovations([h])[0])
+    return problem.with_likelihood(h)
 
 
 def _check(problem: LikelihoodProblem, h: Hypothesis) -> None:

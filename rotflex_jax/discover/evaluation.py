@@ -61,7 +61,7 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
     own = start
     # Errors that an offset makes are no measure of how well it is determined.
     for _ in range(CALIBRATIONS):
-        own = early.evaluated(own, early.innovations([own])[0])
+        own = early.with_likelihood(own)
         if not np.isfinite(own.log_likelihood):
             return start
         own = adapted_to_recordings(early, own, prior)
@@ -120,7 +120,7 @@ def errors_as_trained(
     validation: ValidationSet, h: Hypothesis, locations: Sequence[EffectLocation]
 ) -> RunErrors:
     """Errors over recordings with the trained model as it is, less a disturbance; arguments as before."""
-    known = [i not in h.phased for i in h.local]
+    known = [i not in validation.problem.supermodel.phased for i in h.local]
     trained = dataclasses.replace(
         h,
         local_z=h.local_z.mean(axis=0, keepdims=True) * known,
@@ -149,10 +149,13 @@ def evaluate(
         locations: What the stage's model has; calibrations that belong to the training recordings alone
             are in the hypothesis, but not here.
     """
-    h, s, trained = validated.hypothesis, problem.supermodel, validated.with_trained_calibrations
+    h, s = validated.hypothesis, problem.supermodel
+    trained = validated.with_trained_calibrations(s)
     every = range(len(validation.problem.dataset.recordings))
     runs = free_runs(validation, [validation.model_of(trained, locations, i) for i in every])
-    of_each = [s.clean(trained.values(s)[i], locations) for i in every] if trained.phased else []
+    of_each = (
+        [s.clean(trained.values(s)[i], locations) for i in every] if s.phased.intersection(h.local) else []
+    )
     return Stage(
         model=Model(s.clean(h.mean_values(s), locations), solver),
         estimates=estimates(problem, h),
@@ -200,7 +203,7 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
     def combination(i: int) -> Combination | None:
         if i in h.free:
             return Combination([h.free.index(i)], derivative[:1, i])
-        if i in h.phased:  # as the model has it: phases have no mean
+        if i in h.local and i in s.phased:  # as the model has it: phases have no mean
             return Combination([int(coordinates.local_columns(0)[h.local.index(i)])], derivative[:1, i])
         if i in h.local:
             return Combination(
@@ -211,7 +214,7 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
     def note(i: int) -> str:
         if i not in h.local or R == 1:
             return ""
-        which = "first of" if i in h.phased else "mean of"
+        which = "first of" if i in s.phased else "mean of"
         return f"{which} " + ", ".join(f"{v:.3g}" for v in values[:, i])
 
     found = inference.estimates(
@@ -408,7 +411,7 @@ def paired_estimates(
 
 def _fitted_to(problem: LikelihoodProblem, start: Hypothesis) -> tuple[Estimate, ...]:
     """Estimates from the recordings of a problem; none where the start diverges there."""
-    begun = problem.evaluated(start, problem.innovations([start])[0])
+    begun = problem.with_likelihood(start)
     if not np.isfinite(begun.log_likelihood):
         return ()
     return estimates(problem, refit(problem, [begun], alternations=1)[0])

@@ -44,10 +44,10 @@ def score_candidates(state: SearchState) -> list[Promising]:
     """The candidates with the best scores beside each model that they may be added to."""
     left = len(state.problem.supermodel.candidates) - len(state.scores)
     state.say(beginning("score", f"round {len(state.scores) + 1}: scoring {left} candidates"))
-    found = [_promising(state, state.current)]
+    found = [_promising(state, state.origin)]
     if state.origin is not state.current:
-        state.say("the model as it is was fitted far from the values given: candidates beside these too")
-        found.append(_promising(state, state.origin))
+        state.say("the model as it is was fitted far from the values given: candidates beside both")
+        found.append(_promising(state, state.current))
     return [p for p in found if p.starts]
 
 
@@ -169,7 +169,7 @@ def add_pair(state: SearchState, rounds: int) -> bool:
     """
     if len(state.scores) + 2 > rounds:
         return False
-    if state.tests is None or not is_unexplained(state.horizons, state.current):
+    if not is_unexplained(state.horizons, state.current):
         return False
     state.say(beginning("pairs", "scoring pairs of candidates"))
     tests = state.score_tests(state.current)

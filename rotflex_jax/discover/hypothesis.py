@@ -135,7 +135,6 @@ class Hypothesis:
         densities: Log-likelihood of each sample [nat]; minus infinity before it is evaluated.
         blocks: What each half second says for the hypothesis, to be compared with another one on the same
             recordings: its log-likelihood [nat], or for free runs minus the logarithm of its error.
-        phased: Those of `local` that no other recording tells: amplitudes that have a phase.
     """
 
     locations: tuple[EffectLocation, ...]
@@ -151,7 +150,6 @@ class Hypothesis:
         default_factory=lambda: np.array(-np.inf)
     )
     blocks: Float[np.ndarray, " B"] = dataclasses.field(default_factory=lambda: np.zeros(0))
-    phased: tuple[int, ...] = ()
 
     def initial_state_for(
         self, s: SuperModel, locations: tuple[EffectLocation, ...]
@@ -171,7 +169,7 @@ class Hypothesis:
 
     def mean_values(self, s: SuperModel) -> Float[np.ndarray, " P"]:
         """Physical values, of local parameters the mean over recordings; of phases those of the first one."""
-        values, phased = self.values(s), list(self.phased)
+        values, phased = self.values(s), [i for i in self.local if i in s.phased]
         mean = values.mean(axis=0)
         mean[phased] = values[0, phased]
         return mean
@@ -294,7 +292,6 @@ def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: floa
             local_z=np.hstack([h.local_z, np.tile(z[list(own)], (len(x0), 1))]),
             z=z,
             x0=x0,
-            phased=s.phased((*h.local, *own)),
         )
     return dataclasses.replace(h, locations=locations, free=(*h.free, *c.parameters), z=z, x0=x0)
 
@@ -311,7 +308,6 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
         free=tuple(i for i in h.free if i not in removed),
         local=tuple(h.local[k] for k in kept),
         local_z=h.local_z[:, kept],
-        phased=tuple(i for i in h.phased if i not in removed),
     )
 
 

@@ -58,7 +58,7 @@ def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
         predictor=dataclasses.replace(problem.predictor, data=read),
         dataset=dataclasses.replace(problem.dataset, data=read),
     )
-    start = smooth.evaluated(h, smooth.innovations([h])[0])
+    start = smooth.with_likelihood(h)
     if not np.isfinite(start.log_likelihood):
         return 0.0
     gain, z = paired_gain(refit(smooth, [start], alternations=1)[0].blocks, h.blocks)

@@ -193,6 +193,10 @@ class LikelihoodProblem:
         """Log-likelihoods of hypotheses as they are [nat], each with the whitener that it gives."""
         return np.array([self.log_likelihood(e) for e in self.innovations(hypotheses)])
 
+    def with_likelihood(self, h: Hypothesis) -> Hypothesis:
+        """The hypothesis as it is, run once, with the whitener and the likelihood that it has."""
+        return self.evaluated(h, self.innovations([h])[0])
+
     def evaluated(self, h: Hypothesis, e: Float[np.ndarray, "R N C"]) -> Hypothesis:
         """The hypothesis with the whitener and the likelihood that its innovations give."""
         if self._diverges(e):
@@ -414,4 +418,4 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
         move=coordinates.moved,
         max_steps=MAX_CORRECTION_STEPS,
     )
-    return h if found.x is h else problem.evaluated(found.x, problem.innovations([found.x])[0])
+    return h if found.x is h else problem.with_likelihood(found.x)

@@ -172,7 +172,7 @@ class SearchState:
     def rank(self, beside: ValidatedHypothesis) -> tuple[list[Score], list[Score]]:
         """Scores of all candidates beside a model, of predictions and of free runs; the first are kept."""
         listed, runs = (test.listed for test in self.score_tests(beside))
-        if not self.ranking or beside is self.nominal:
+        if not self.ranking:
             by_runs = {x.location: x.nats for x in runs}
             self.ranking = [(x, by_runs[x.location]) for x in listed]
         return listed, runs

@@ -88,9 +88,7 @@ def far_from_given(s: SuperModel, h: Hypothesis) -> list[int]:
 def as_given(horizons: Horizons) -> ValidatedHypothesis:
     """The user's model with the values that it has and the process noise that suits these, validated."""
     problem = horizons.prediction.problem
-    _, most = problem.process_noise_range
-    start = problem.with_process_noise(_start(problem), dict.fromkeys(problem.ports, most))
-    h = choose_process_noise(problem, problem.evaluated(start, problem.innovations([start])[0]), wide=True)
+    h = choose_process_noise(problem, _start(problem), wide=True)
     return horizons.validated(h, as_free_run(horizons.free_run.problem, h))
 
 
@@ -418,8 +416,8 @@ def merge_effects(
         return None
     kept = [rich if p == simple else p for p in order if p not in calibrations]
     validated = validate(validation, one)
-    errors = validation.short_run_errors(validated.with_trained_calibrations, kept)
-    several = validation.short_run_errors(validate(validation, final).with_trained_calibrations, order)
+    errors = validation.short_run_errors(validated.with_trained_calibrations(s), kept)
+    several = validation.short_run_errors(validate(validation, final).with_trained_calibrations(s), order)
     if float(np.mean(np.log(errors / several))) > WINDOWS_BETTER:
         return None
     return MergedEffects(one, rich, simple, (simple, *calibrations), saved == 0, validated)
@@ -466,8 +464,9 @@ def _split_calibrations(
 
     A calibration is one of the machine if its trained value makes validation runs clearly better.
     """
-    kept, own, trained = list(order), [], final.with_trained_calibrations
-    for location in [p for p in order if p in validation.problem.supermodel.calibrations]:
+    s = validation.problem.supermodel
+    kept, own, trained = list(order), [], final.with_trained_calibrations(s)
+    for location in [p for p in order if p in s.calibrations]:
         with_it = validation.short_run_errors(trained, kept)
         less = validation.short_run_errors(trained, [p for p in kept if p != location])
         if float(np.mean(np.log(with_it / less))) > -WINDOWS_BETTER:
@@ -494,9 +493,9 @@ def _better_without(
     for location in calibrations:
         bare = without(s, bare, location)
     bare = refit(problem, [bare])[0]
-    with_them = validation.short_run_errors(final.with_trained_calibrations, order)
+    with_them = validation.short_run_errors(final.with_trained_calibrations(s), order)
     locations = [p for p in order if p in bare.locations]
-    alone = validation.short_run_errors(validate(validation, bare).with_trained_calibrations, locations)
+    alone = validation.short_run_errors(validate(validation, bare).with_trained_calibrations(s), locations)
     return bare if runs_clearly_better(alone, with_them) else None
 
 
@@ -522,7 +521,7 @@ def disturbance_notes(s: SuperModel, final: ValidatedHypothesis) -> tuple[str, .
     """Which disturbances belong to each recording, in sentences."""
     out = []
     for location in [p for p in final.hypothesis.locations if CATALOG[p.effect].line]:
-        amplitudes = [i for i in s.parameter_indices(location) if i in final.hypothesis.phased]
+        amplitudes = [i for i in s.parameter_indices(location) if i in s.phased]
         unit = s.mechanism.parameter_specifications[amplitudes[0]].unit
         trained, adapted = (
             ", ".join(f"{np.hypot(*row):.3g} {unit}" for row in h.values(s)[:, amplitudes])

@@ -209,9 +209,7 @@ def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stag
     near = state.current.hypothesis
     # First states that were fitted: a run from measured ones drifts, which would count as random torque.
     fitted = dataclasses.replace(h, x0=near.initial_state_for(problem.supermodel, h.locations))
-    start = problem.with_process_noise(fitted, near.process_noise)
-    h = problem.evaluated(start, problem.innovations([start])[0])
-    h = choose_process_noise(problem, h, wide=True)
+    h = choose_process_noise(problem, fitted, wide=True)
     gain = process_noise_gain(problem, h)
     return dataclasses.replace(stage, process_noise=h.process_noise, process_noise_nats=gain)
 

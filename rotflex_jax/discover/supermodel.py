@@ -246,10 +246,11 @@ class SuperModel:
         """Parameters that each recording has for itself."""
         return [i for location in self.calibrations for i in self.parameter_indices(location)]
 
-    def phased(self, local: Iterable[int]) -> tuple[int, ...]:
-        """Those of some recordings' own parameters that are amplitudes of a disturbance with a phase."""
+    @functools.cached_property
+    def phased(self) -> frozenset[int]:
+        """Amplitudes of disturbances, which have a phase in each recording that no other one tells."""
         disturbances = [c for c in self.candidates.values() if c.line is not None]
-        return tuple(i for i in local if any(i in c.parameters for c in disturbances))
+        return frozenset(i for c in disturbances for k, i in enumerate(c.parameters) if k != c.line)
 
     @functools.cached_property
     def baseline_free(self) -> list[int]:

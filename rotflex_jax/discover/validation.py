@@ -16,7 +16,7 @@ from jaxtyping import Float
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
 from rotflex_jax.discover.hypothesis import Hypothesis, embed_initial_state
 from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_blocks, refit
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, Windows
 from rotflex_jax.metrics import window_starts, windowed_rmse
@@ -132,11 +132,13 @@ class ValidatedHypothesis:
     free_run: "ValidatedHypothesis | None" = None
     folds: tuple[Hypothesis, ...] = ()
 
-    @property
-    def with_trained_calibrations(self) -> Hypothesis:
+    def with_trained_calibrations(self, s: SuperModel) -> Hypothesis:
         """The hypothesis on the validation recordings with calibrations as trained, not as adapted.
 
         The phase of a disturbance is never that of another recording: it stays as adapted.
+
+        Args:
+            s: What it is a hypothesis of.
         """
         if self.folds:
             trained = [h.local_z[k] for k, h in enumerate(self.folds)]
@@ -144,7 +146,7 @@ class ValidatedHypothesis:
             local_z[:, len(self.hypothesis.free) :] = trained
         else:
             local_z = np.tile(self.hypothesis.local_z.mean(axis=0), (len(self.adapted.x0), 1))
-        own = [k for k, i in enumerate(self.adapted.local) if i in self.adapted.phased]
+        own = [k for k, i in enumerate(self.adapted.local) if i in s.phased]
         local_z[:, own] = self.adapted.local_z[:, own]
         return dataclasses.replace(self.adapted, local_z=local_z)
 
@@ -255,7 +257,7 @@ def _cross_validated(
     """A hypothesis fitted without each recording in turn, on the one that was left out."""
     fits, found = [], []
     for fold in validation.folds:
-        start = fold.train.evaluated(h, fold.train.innovations([h])[0])
+        start = fold.train.with_likelihood(h)
         fitted = refit(fold.train, [start], alternations=1)[0]
         # What belongs to the run that is left out is not known to this fit.
         k, own = len(fits), fitted.local_z.copy()
@@ -332,7 +334,7 @@ def validate(
         lost = np.full_like(in_blocks(problem.seen, problem.dataset.data), DIVERGED)
         return ValidatedHypothesis(h, lost, current, np.full(e.shape[-1], np.inf))
     current = adapted_to_recordings(problem, current)
-    blocks = problem.evaluated(current, problem.innovations([current])[0]).blocks
+    blocks = problem.with_likelihood(current).blocks
     errors = validation.short_run_errors(current, h.locations, inner)
     return ValidatedHypothesis(h, blocks, current, errors)
 
@@ -466,4 +468,4 @@ def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
     x0 = embed_initial_state(problem.supermodel, h.locations, problem.windows.first_states)
     no_noise = dict.fromkeys(problem.ports, 0.0)
     start = problem.with_process_noise(dataclasses.replace(h, x0=x0), no_noise)
-    return problem.evaluated(start, problem.innovations([start])[0])
+    return problem.with_likelihood(start)

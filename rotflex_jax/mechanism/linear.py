@@ -176,8 +176,8 @@ def process_covariance(
 ) -> Float[np.ndarray, "m m"]:
     """Covariance of the state after one sample of a white torque of unit intensity.
 
-    `Q(2 h) = Q(h) + E Q(h) E'` from a Simpson rule over the smallest step: other than the usual block
-    exponential it has no growing mode, so a fast electrical pole costs no accuracy.
+    `Q(2 h) = Q(h) + E Q(h) E'` from a Simpson rule over the smallest step; this has, in contrast to the
+    usual block exponential, no growing mode, so a fast electrical pole costs no accuracy.
     """
     g = np.zeros(len(A))
     g[n : 2 * n] = push
