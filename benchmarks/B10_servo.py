@@ -47,12 +47,15 @@ from servo.evolved import evolved
 from servo.figure import draw
 from servo.friction_models import MODELS
 from servo.grey_box import (
+    ABSOLUTE,
     ALIKE,
     FRICTION,
+    ROBUST,
     YIELDING,
     direction,
     evolved_grey_box,
     fitted,
+    released,
     searched,
     servo,
     supply,
@@ -63,7 +66,7 @@ from servo.recordings import Split, splits
 
 RESULTS = HERE / "results"
 FIGURE = HERE.parent / "docs" / "figures" / "servo.png"
-PARTS = ("models", "fits", "search", "direction", "supply", "so101")
+PARTS = ("models", "fits", "search", "direction", "supply", "released", "so101", "so101 search")
 
 from rotflex_jax.text.files import write_file
 
@@ -90,6 +93,7 @@ def rows(split: Split, parts: list[str], rollouts: int, say: Callable[[str], Non
         jobs[f"{ALIKE}, CMA-ES"] = lambda: evolved_grey_box(split, rollouts)
     if "fits" in parts:
         jobs |= {name: lambda e=effects: fitted(servo(e), split)[1] for name, effects in FRICTION.items()}
+        jobs[ROBUST] = lambda: fitted(servo(FRICTION["motor friction, delay"]), split, ABSOLUTE)[1]
         jobs[YIELDING] = lambda: fitted(yielding(), split)[1]
     if "search" in parts:
         jobs["search"] = lambda: searched(split, own=False, say=say)
@@ -102,6 +106,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="What is left out, for instance 'gain 200'.")
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--rollouts", type=int, default=20_000, help="Free runs of each evolution.")
+    parser.add_argument("--workers", type=int, default=1, help="Processes that share the joints of the arm.")
     parser.add_argument("--fresh", action="store_true", help="Run again what the results have already.")
     parser.add_argument("--out", type=Path, default=RESULTS / "B10.json")
     given = parser.parse_args()
@@ -133,10 +138,14 @@ def main() -> None:
     if "supply" in given.parts and ("supply" not in found or given.fresh):
         found["supply"] = supply(known["gain 200"])
         keep()
+    if "released" in given.parts and ("released" not in found or given.fresh):
+        found["released"] = released()
+        keep()
     if "so101" in given.parts:
         if given.fresh:
             found["so101"] = []
-        arm(say, given.rollouts // 5, found.setdefault("so101", []), keep)
+        search = "so101 search" in given.parts
+        arm(say, given.rollouts // 5, found.setdefault("so101", []), keep, search, given.workers)
     keep()
     if given.out.parent == RESULTS:
         draw(found["summary"], FIGURE)

@@ -528,10 +528,31 @@ def servo_rollouts() -> str:
     return f"{took[0] / took[1]:.0f}"
 
 
+@named
+def servo_robust_ratio() -> str:
+    """Free runs of the evolution of M4 over those of the robust fit, one with derivatives counted as 3.5."""
+    summary = results("B10.json")["summary"]
+    took = [summary[n]["rollouts"] for n in ("M4", "motor friction, delay, robust")]
+    return f"{took[0] / (3.5 * took[1]):.0f}"
+
+
+@named
+def servo_robust_processor() -> str:
+    """Processor time of the robust fit [s], the median over what was left out."""
+    rows = (case["motor friction, delay, robust"] for case in results("B10.json")["splits"].values())
+    return f"{statistics.median(row['processor seconds'] for row in rows):.0f}"
+
+
 def _arm_runs(name: str) -> str:
     """Free runs of a recording that a model of the SO-101 took, the median of its joints."""
     took = (row["takes"][name]["rollouts"] for row in results("B10.json")["so101"])
     return f"{statistics.median(took):,.0f}"
+
+
+def _arm_others(name: str) -> str:
+    """Error of a model of the SO-101 over motions that had no say [deg], averaged over joints and motions."""
+    rows = results("B10.json")["so101"]
+    return f"{statistics.mean(errors[name] for row in rows for errors in row['others'].values()):.2f}"
 
 
 ARM = (
@@ -548,6 +569,14 @@ ARM = (
 )
 for _k, _model in enumerate(ARM):
     NAMED[f"servo_arm_runs_{_k}"] = functools.partial(_arm_runs, _model)
+    NAMED[f"servo_arm_others_{_k}"] = functools.partial(_arm_others, _model)
+
+
+@named
+def servo_arm_ratio() -> str:
+    """Free runs of the evolution of the grey box of the SO-101 over those of its fit."""
+    took = [statistics.median(r["takes"][n]["rollouts"] for r in results("B10.json")["so101"]) for n in ARM]
+    return f"{took[ARM.index('Coulomb, delay, CMA-ES')] / took[ARM.index('Coulomb')]:.0f}"
 
 
 # -- speed --------------------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from rotflex_jax.data.readers import (
     GAUGE_RAD_PER_VOLT,
     SO101_JOINTS,
     load_bam_xl330,
+    load_bam_xl330_released,
     load_so101,
     load_two_dof_link,
 )
@@ -179,9 +180,9 @@ def test_no_third_stage() -> None:
         rf.joints.two_dof_link(3)
 
 
-def servo_run(path: Path, **changes: Any) -> np.ndarray:
+def servo_run(path: Path, samples: int = 200, **changes: Any) -> np.ndarray:
     """A synthetic log at uneven times, linear in time; its times."""
-    t = np.cumsum(np.random.default_rng(1).uniform(0.005, 0.007, 200))
+    t = np.cumsum(np.random.default_rng(1).uniform(0.005, 0.007, samples))
     entries = [
         {"timestamp": time, "goal_position": 2 * time, "position": time - 1, "torque_enable": k < 150}
         for k, time in enumerate(t)
@@ -202,6 +203,12 @@ def test_a_servo_log_is_resampled_and_ends_with_the_torque(tmp_path: Path) -> No
     assert dict(run.constants) == {"hub.position_servo.gain": 300.0}
     for word in ("ramp", "gain 300", "resampled to 5 ms", "torque is off"):
         assert word in run.source
+    assert load_bam_xl330_released(tmp_path / "run.json") is None  # off for less than a second
+    t = servo_run(tmp_path / "long.json", samples=400)
+    rest = load_bam_xl330_released(tmp_path / "long.json")
+    assert rest is not None and rest.start == t[150] and t[-1] - 0.005 < rest.t[-1] <= t[-1] + 1e-9
+    np.testing.assert_allclose(rest.y[:, 0], rest.t - 1, atol=1e-12)
+    assert dict(rest.constants) == {"hub.position_servo.gain": 300.0, "hub.position_servo.enabled": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,9 @@ PASSIVE = {
     "motor",
     "current_drive",
     "position_servo",
+    "pid_servo",
+    "current_meter",
+    "duty_meter",
     "coulomb",
     "coulomb_asymmetric",
     "stribeck",
@@ -122,6 +125,9 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
         said = entries(effect)
         if isinstance(effect, Force):  # what a limit takes away
             said.append(effect.force(position, speed, voltage))
+        elif isinstance(effect, Memory):
+            signals = (z, position, speed, voltage)
+            said += [effect.force(*signals), effect.flow(*signals)]
     elif isinstance(effect, Force):
         said = [effect.force(position, speed, voltage)]
     elif isinstance(effect, DryFriction):
@@ -301,6 +307,8 @@ def test_gives_no_energy(cls):
             assert (elsewhere == said).all() or not effect.steady
         elif isinstance(effect, Force):
             assert said[0] * w <= 0
+        elif isinstance(effect, Memory) and effect.shows:
+            assert said[0] == 0  # an instrument
         else:
             assert isinstance(effect, Dahl)
             torque, rate = said

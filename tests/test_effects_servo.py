@@ -135,7 +135,7 @@ def test_the_torque_of_a_motor_under_a_loop_is_that_of_its_current():
         with double_precision():
             state, u = jnp.array([q, v]), jnp.asarray(goal)
             heating = mechanism.effects[-1]
-            found = float(memory_drive(mechanism, heating, state, u, jnp.asarray(gates)))
+            found = float(memory_drive(mechanism, heating, state, state[:1], u, jnp.asarray(gates)))
         volts = 7.4 * duty(400.0, goal - q + 0.5e-3 * v)
         assert found == pytest.approx(0.35 / 3.4 * (volts - 0.35 * v), rel=1e-9)
 

@@ -26,7 +26,7 @@ from rotflex_jax.effects import (
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.export import to_c
-from rotflex_jax.joints import paper
+from rotflex_jax.joints import paper, servo as hobby_servo
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, simulate
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
@@ -110,7 +110,8 @@ def models() -> dict[str, Model]:
     start = paper(hub_damping=0.01, inductance=2e-4)
     present = {"inertia", "spring", "motor", "viscous"}
     # A machine has one gear; a disturbance has the phase of its recording, and no code follows that.
-    todo = sorted(set(CATALOG) - present - {"elastic_backlash", "periodic_disturbance"})
+    loop = {"pid_servo", "current_meter", "duty_meter"}
+    todo = sorted(set(CATALOG) - present - loop - {"elastic_backlash", "periodic_disturbance"})
     found = {}
     for k in range(4):
         m = start if k % 2 else paper()
@@ -119,6 +120,8 @@ def models() -> dict[str, Model]:
             places = [p for p in cls.searched if p in (*m.port_vectors, *m.channels, "input")]
             m = m + sized(cls, places[-1] if places else "input" if issubclass(cls, Actuation) else "hub")
         found[f"catalogue {k}"] = Model(m)
+    full = hobby_servo("xl330", 0.007, integral=100, weight=0.4, sensors="theta+current+duty")
+    found["a servo with its readings"] = Model(full)
     found["elastic teeth"] = Model(start + CATALOG["elastic_backlash"]("hub") + Coulomb("hub"))
     assert {e.name for m in found.values() for e in m.mechanism.effects} == {*CATALOG} - {
         "periodic_disturbance"

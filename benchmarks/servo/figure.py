@@ -14,6 +14,7 @@ GREY = {
     "load friction, viscous, delay": "load friction",
     "weight friction": "weight friction",
     "weight friction, delay": "with delay",
+    "motor friction, delay, robust": "motor friction, robust",
     "weight friction, delay, a supply that gives way": "with a supply that gives way",
 }
 # The last one has the numbers of "with delay".

@@ -92,6 +92,17 @@ def page(found: dict[str, Any]) -> str:
             f"its derivative unconfounded, verdict `{d['verdict']}`. One mass does not tell a directional "
             "friction from another torque constant.",
         ]
+    if "released" in found:
+        lines += ["", "## The torque off", ""]
+        lines += [
+            "Errors of free runs of 4 s in which the arm swings without torque, by gain before [deg]:",
+            "",
+        ]
+        for name, row in found["released"].items():
+            fits = ", ".join(
+                f"{n} = {v:.3g} ± {HALF_WIDTH_95 * s:.2g}" for n, (v, s) in row["parameters"].items()
+            )
+            lines.append(f"- {name}: {', '.join(f'{e:.2f}' for e in row['rms'])}; {fits}")
     if "supply" in found:
         motion, logged = (f"{v:.3g} ± {1.96 * s:.2g} ohm" for v, s in found["supply"].values())
         lines += ["", "## A supply that gives way", ""]
@@ -113,6 +124,21 @@ def page(found: dict[str, Any]) -> str:
             "known, and the others were not fitted so: it is no held-out result.",
             "",
         ]
+        if all("others" in r for r in rows):
+            lines += ["Over the other motions, which had no say in anything:", ""]
+            lines += [
+                "| model | " + " | ".join(f"{r['joint']}: {m}" for r in rows for m in r["others"]) + " |"
+            ]
+            lines += ["|---|" + "---:|" * sum(len(r["others"]) for r in rows)]
+            for name in names:
+                each = (e[name] for r in rows for e in r["others"].values())
+                lines.append(f"| {name} | " + " | ".join(f"{v:.2f}" for v in each) + " |")
+            lines.append("")
+        for row in (r for r in rows if "search" in r):
+            said, away = row["search"], row["search"]["others"]
+            effects = ", ".join(said["effects"]) or "nothing"
+            errors = ", ".join(f"{m} {e:.2f}" for m, e in away.items())
+            lines += [f"Search at {row['joint']}: {effects} (`{said['verdict']}`); {errors}.", ""]
         lines += ["| model | free runs of a recording | fit [s] |", "|---|---:|---:|"]
         for name in names:
             took = [r["takes"][name] for r in rows]

@@ -25,6 +25,8 @@ OWN_CAPTIONS = {
     "where it is.",
     "learned_torque": "The splines along the speed; a weight for each makes the map.",
     "motor": "Less torque the faster it turns: the back-EMF takes voltage away.",
+    "current_meter": "After a jump of the current.",
+    "duty_meter": "After a jump of the duty.",
     "coulomb_asymmetric": "With half the level backwards.",
     "load_friction": "Turning forwards, a positive load is the motor's own; backwards it is the machine's.",
 }

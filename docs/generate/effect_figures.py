@@ -221,13 +221,25 @@ def _motor(ax: Axes, effect: Effect) -> None:
 
 def _servo(ax: Axes, effect: Effect) -> None:
     """Torque at rest over the distance to the goal."""
-    assert isinstance(effect, fx.PositionServo)
+    assert isinstance(effect, fx.PositionLoop)
     error = np.linspace(-1.5, 1.5, 601)
     for gain, look in ((effect.gain, LINE), (effect.gain / 4, OTHER)):
         servo = effect.replace(gain=gain)
-        torque = servo.stamp().stiffness * error + np.asarray(servo.force(-error, 0.0, 0.0))
+        integral = (0.0,) if isinstance(servo, Memory) else ()
+        torque = servo.stamp().stiffness * error + np.asarray(servo.force(*integral, -error, 0.0, 0.0))
         ax.plot(error, torque, **look, label=f"gain {gain:g}")
     _labels(ax, "goal less position, at rest [rad]", "torque on the port [N m]")
+
+
+def _meter(ax: Axes, effect: Effect) -> None:
+    """The reading after a jump of what it shows."""
+    assert isinstance(effect, Memory)
+    time = effect.values["time"]
+    t = np.linspace(0, 5 * time, 200)
+    ax.plot(1e3 * t, np.where(t > 0, 1.0, 0.0), **OTHER, label=f"{effect.shows} of the motor")
+    ax.plot(1e3 * t, 1 - np.exp(-t / time), **LINE, label="reading")
+    unit = {"current": "A", "duty": "-"}[effect.shows]
+    _labels(ax, "time [ms]", f"{effect.shows} [{unit}]")
 
 
 def _mode(ax: Axes, effect: Effect) -> None:
@@ -295,6 +307,9 @@ DRAWINGS: dict[type, Draw] = {
     fx.Motor: _motor,
     fx.CurrentDrive: _stamped("command [V]", "drive"),
     fx.PositionServo: _servo,
+    fx.PidServo: _servo,
+    fx.CurrentMeter: _meter,
+    fx.DutyMeter: _meter,
     fx.SecondMode: _mode,
     fx.Inertia: _stamped("acceleration [rad/s²]", "inertia"),
     fx.Spring: _stamped("position [rad]", "stiffness"),

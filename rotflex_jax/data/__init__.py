@@ -10,4 +10,8 @@ from rotflex_jax.data.datasets import (
     load_dataset as load_dataset,
 )
 from rotflex_jax.data.files import load as load, save_csv as save_csv
-from rotflex_jax.data.readers import load_rotflex as load_rotflex
+from rotflex_jax.data.readers import (
+    load_bam_xl330 as load_bam_xl330,
+    load_bam_xl330_released as load_bam_xl330_released,
+    load_rotflex as load_rotflex,
+)

@@ -15,10 +15,10 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from rotflex_jax.data.binary import read_mat
 from rotflex_jax.data.files import readable_file
@@ -283,7 +283,8 @@ def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
     """Reads a run of a position servo that lifts a pendulum: goal angle to angle.
 
     Goal and angle were logged together, at uneven times, and are resampled to 5 ms by linear
-    interpolation. Where the torque is switched off the arm falls freely; the recording ends there.
+    interpolation. Where the torque is switched off the arm falls freely; the recording ends there, and
+    `load_bam_xl330_released` reads the rest.
 
     Args:
         path: of the JSON file.
@@ -299,32 +300,91 @@ def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
         Duclusaud, Passault, Padois, Ly 2024, Extended friction models for the physics simulation of servo
         actuators, arXiv 2410.08650.
     """
+    log = _bam_log(path)
+    end = len(log.on) if log.on.all() else int(np.argmin(log.on))
+    note = "" if end == len(log.on) else ", up to where the torque is off"
+    return log.recording(slice(0, end), note, {})
+
+
+def load_bam_xl330_released(path: str | os.PathLike[str]) -> Recording | None:
+    """Reads the rest of such a run, from where the torque is off: the arm falls and swings freely.
+
+    Args:
+        path: of the JSON file.
+
+    Returns:
+        The recording with the constant `hub.position_servo.enabled` zero, for a servo that has this parameter
+        (`rotflex_jax.joints.servo`); None where the torque is never off, or for less than a second.
+
+    Raises:
+        InputError: as `load_bam_xl330`.
+
+    Source:
+        As `load_bam_xl330`.
+    """
+    log = _bam_log(path)
+    off = np.flatnonzero(~log.on)
+    if not len(off):
+        return None
+    after = np.flatnonzero(log.on[off[0] :])
+    part = slice(int(off[0]), int(off[0] + after[0]) if len(after) else len(log.on))
+    if log.t[part][-1] - log.t[part][0] < 1.0:
+        return None
+    return log.recording(part, ", where the torque is off", {f"{SERVO}.enabled": 0.0})
+
+
+class _BamLog(NamedTuple):
+    """A run of the XL-330 as it was logged.
+
+    Attributes:
+        file: its name.
+        what: motion and gain, in words.
+        t: times [s].
+        goal: goal [rad].
+        theta: angle [rad].
+        on: whether the torque is on.
+        settings: of the servo, by full names of parameters.
+    """
+
+    file: str
+    what: str
+    t: Float[np.ndarray, " N"]
+    goal: Float[np.ndarray, " N"]
+    theta: Float[np.ndarray, " N"]
+    on: Bool[np.ndarray, " N"]
+    settings: dict[str, float]
+
+    def recording(self, part: slice, note: str, further: dict[str, float]) -> Recording:
+        """A part of it, resampled."""
+        t, Ts = self.t[part], BAM_PERIOD
+        return Recording(
+            u=_resampled(t, self.goal[part], Ts, self.file),
+            y=_resampled(t, self.theta[part], Ts, self.file),
+            Ts=Ts,
+            input_name="goal",
+            input_unit="rad",
+            source=f"{self.what}, resampled to 5 ms{note}",
+            start=float(t[0]),
+            accept="constant_input" if further else (),  # without torque the goal moves nothing
+            resolution={"theta": COUNT},
+            constants=self.settings | further,
+        )
+
+
+def _bam_log(path: str | os.PathLike[str]) -> _BamLog:
     file = readable_file(path)
     try:
         run = json.loads(file.read_text(encoding="utf-8"))
         entries = run["entries"]
-        on = [bool(entry["torque_enable"]) for entry in entries]
+        on = np.array([bool(entry["torque_enable"]) for entry in entries], dtype=bool)
         columns = ("timestamp", "goal_position", "position")
-        stop = on.index(False) if False in on else len(on)
-        rows = [[entry[name] for name in columns] for entry in entries[:stop]]
-        t, goal, theta = np.array(rows, dtype=float).T
+        t, goal, theta = np.array([[entry[name] for name in columns] for entry in entries], dtype=float).T
         what = f"{file.name}, {run['trajectory']}, gain {run['kp']}"
         known = {"gain": run["kp"]} | ({"supply": run["vin"]} if "vin" in run else {})
         settings = {f"{SERVO}.{name}": float(value) for name, value in known.items()}
     except (ValueError, KeyError, TypeError) as error:
         raise unreadable(file, "a log of the XL-330", error) from error
-    Ts = BAM_PERIOD
-    return Recording(
-        u=_resampled(t, goal, Ts, file.name),
-        y=_resampled(t, theta, Ts, file.name),
-        Ts=Ts,
-        input_name="goal",
-        input_unit="rad",
-        source=f"{what}, resampled to 5 ms{'' if stop == len(on) else ', up to where the torque is off'}",
-        start=float(t[0]),
-        resolution={"theta": COUNT},
-        constants=settings,
-    )
+    return _BamLog(file.name, what, t, goal, theta, on, settings)
 
 
 SO101_JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")

@@ -37,7 +37,16 @@ from rotflex_jax.effects.gear import Backlash, ElasticBacklash
 from rotflex_jax.effects.hysteresis import BoucWen, Dahl, LuGre
 from rotflex_jax.effects.inertia import Inertia, SecondMode
 from rotflex_jax.effects.learned import LearnedTorque
-from rotflex_jax.effects.motor import CurrentDrive, Heating, Motor, PositionServo
+from rotflex_jax.effects.motor import (
+    CurrentDrive,
+    CurrentMeter,
+    DutyMeter,
+    Heating,
+    Motor,
+    PidServo,
+    PositionLoop,
+    PositionServo,
+)
 from rotflex_jax.effects.sensors import (
     ChannelDelay,
     CrossTalk,
@@ -72,7 +81,11 @@ __all__ = [
     "Viscous",
     "Motor",
     "CurrentDrive",
+    "PositionLoop",
     "PositionServo",
+    "PidServo",
+    "CurrentMeter",
+    "DutyMeter",
     "SecondMode",
     # dry friction
     "Coulomb",

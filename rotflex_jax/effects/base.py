@@ -28,7 +28,7 @@ Period = float | Float[Array, ""]
 """Sampling period [s]."""
 Probe = Mapping[str, float]
 """Parameter name -> value at which a score test tries an effect."""
-Drive = Literal["voltage", "motor"]
+Drive = Literal["voltage", "motor", "current", "duty"]
 Domain = Literal["port", "input", "channel"]
 Beside = Literal["nothing", "other", "states"]
 StatePart = Literal["linear", "rotor", "memory"]
@@ -294,10 +294,19 @@ class Linear(Effect):
     exact_step: ClassVar[bool] = True
     # True for what turns voltage into torque at its port.
     motor: ClassVar[bool] = False
+    # True for a motor that has a `torque_per_current`, so that its torque says its current.
+    has_current: ClassVar[bool] = False
+    # True for a servo that has a `duty`.
+    has_duty: ClassVar[bool] = False
 
     @abc.abstractmethod
     def stamp(self) -> Stamp:
         """Entries of the equations of motion."""
+
+    @property
+    def torque_per_current(self) -> Scalar:
+        """Torque at the port per current of the armature [N m/A], of a motor that has a current."""
+        raise NotImplementedError
 
 
 class Force(Effect):
@@ -326,8 +335,14 @@ class DryFriction(Effect):
     steady: ClassVar[bool] = False
     # True where it depends on the torque that passes from the motor to the machine: `limit` receives it [N m]
     # as a fourth argument, positive where the motor pushes forwards. It is the mean of both sides of the
-    # port: of what the motors give and of what the rest of the machine takes, dry friction apart.
+    # port: of what the motors give and, with its share, of what the rest of the machine takes, dry friction
+    # apart.
     loaded: ClassVar[bool] = False
+
+    @property
+    def rest_share(self) -> float:
+        """Share of the rest of the machine in the transmitted torque, 0 for that of the motors alone."""
+        return 0.5
 
     @abc.abstractmethod
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar, *load: Scalar) -> Scalar:
@@ -350,9 +365,11 @@ class Memory(Effect):
     kind_meaning: ClassVar[str] = "A torque with a state of its own: it depends on what came before."
     state_part: ClassVar[StatePart | None] = "memory"
     torque_at_port: ClassVar[bool] = True
-    # The last argument of `flow` and `force`: the motor's voltage [V], or the torque [N m] of the motors at
-    # its port.
+    # The last argument of `flow` and `force`: the motor's voltage [V]; of the motors at its port the torque
+    # [N m] or the current [A]; or the duty of the servo there.
     driven_by: ClassVar[Drive] = "voltage"
+    # The quantity of its port that its state is the reading of; empty where no output shows it.
+    shows: ClassVar[str] = ""
 
     @property
     def order(self) -> int:

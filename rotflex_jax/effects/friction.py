@@ -169,10 +169,11 @@ class LoadFriction(DryFriction):
         |tau| = level + driving |load| while the motor drives,  level + driven |load| while it is driven
 
     At rest any torque up to that level holds the port. `load` is the torque through the gear, taken as the
-    mean of both sides of the port: of what the motor gives and of what the rest of the machine takes. The
-    motor drives where the load has the sign of the motion. A gear with `driven` of 2 or more cannot be turned
-    by its load. Not beside an efficiency of the motor that is free, which does the same while the motor
-    drives.
+    mean of both sides of the port: of what the motor gives and of what the rest of the machine takes. With
+    `of="motor"` it is what the motor gives, so that a machine which turns the gear back while the motor gives
+    nothing meets the level alone. The motor drives where the load has the sign of the motion. A gear with
+    `driven` of 2 or more cannot be turned by its load. Not beside an efficiency of the motor that is free,
+    which does the same while the motor drives.
 
     Args:
         at: Port of the motor.
@@ -181,6 +182,7 @@ class LoadFriction(DryFriction):
         driven: Share of the load while the load drives the motor.
         tied: Whether `driven` is `driving`, whatever is given for it: model M3. For recordings of one weight
             under a servo, which cannot tell the two from another torque constant.
+        of: Whose torque the load is: "both" sides' on average, or the "motor"'s.
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
     simulation of servo actuators, 2024, models M3 and M5 (load-dependent and directional friction).
@@ -208,8 +210,14 @@ class LoadFriction(DryFriction):
     )
 
     tied: bool = False
+    of: str = "both"
 
     def __post_init__(self) -> None:
+        if self.of not in ("both", "motor"):
+            raise InputError(
+                f"LoadFriction was given of={self.of!r}, but the load is of 'both' sides or of the 'motor'; "
+                "give one of these."
+            )
         if not isinstance(self.tied, bool):
             raise InputError(
                 f"LoadFriction was given tied={self.tied!r}, but it needs True or False; say whether both "
@@ -224,6 +232,11 @@ class LoadFriction(DryFriction):
         """The share of a driven motor follows that of a driving one, where they are tied."""
         return {"driven": "driving"} if self.tied else {}
 
+    @property
+    def rest_share(self) -> float:
+        """How much the load is that of the rest of the machine."""
+        return 0.0 if self.of == "motor" else 0.5
+
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar, load: Scalar) -> Scalar:
         """Level [N m] that opposes motion in `direction` under the load [N m]."""
         push = jnp.asarray(load) * direction
@@ -237,7 +250,8 @@ class LoadFriction(DryFriction):
 
     def sentence(self) -> str:
         """In words."""
+        whose = "of the motor" if self.of == "motor" else "through the gear"
         return (
-            f"friction at the {self.at} grows with the torque through the gear: from {self.level:.3g} N m by "
+            f"friction at the {self.at} grows with the torque {whose}: from {self.level:.3g} N m by "
             f"{self.driving:.1%} of it while the motor drives and by {self.driven:.1%} while it is driven"
         )

@@ -1,4 +1,4 @@
-"""The motor: driven by voltage or by current, its heating, and the position loop of a servo's firmware."""
+"""The motor: driven by voltage or by current, its heating, the position loop of a servo, its readings."""
 
 import dataclasses
 import math
@@ -6,7 +6,18 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from rotflex_jax.effects.base import Drive, Force, Linear, Memory, Probe, Scalar, Scale, Stamp, register
+from rotflex_jax.effects.base import (
+    Drive,
+    Force,
+    Linear,
+    Memory,
+    Probe,
+    Scalar,
+    Scale,
+    Stamp,
+    StatePart,
+    register,
+)
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import parameter
 
@@ -48,6 +59,7 @@ class Motor(Linear):
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("torque_constant",)
     motor: ClassVar[bool] = True
+    has_current: ClassVar[bool] = True
 
     at: str = "hub"
     torque_constant: float = parameter(0.00767, unit="N m/A", lower=0.0, meaning="torque per current")
@@ -79,13 +91,18 @@ class Motor(Linear):
         return {"back_emf": "torque_constant"} if self.tied else {}
 
     @property
+    def torque_per_current(self) -> Scalar:
+        """At the port [N m/A]."""
+        return self.efficiency * self.torque_constant * self.gear_ratio
+
+    @property
     def order(self) -> int:
         """One state, the current, where there is an inductance."""
         return 0 if self.inductance is None else 1
 
     def stamp(self) -> Stamp:
         """Entries of the equations of motion."""
-        gain = self.efficiency * self.torque_constant * self.gear_ratio
+        gain = self.torque_per_current
         emf = self.back_emf * self.gear_ratio
         if self.inductance is None:
             return Stamp(drive=gain / self.resistance, damping=gain * emf / self.resistance)
@@ -98,7 +115,7 @@ class Motor(Linear):
 
     def sentence(self) -> str:
         """In words."""
-        gain = self.efficiency * self.torque_constant * self.gear_ratio / self.resistance
+        gain = self.torque_per_current / self.resistance
         speed = math.inf if self.back_emf == 0 else 1 / (self.back_emf * self.gear_ratio)
         return (
             f"the motor gives the {self.at} {gain:.3g} N m per volt at rest and runs free at "
@@ -207,9 +224,130 @@ the divisor 256 of the gain and the 885 counts of full duty [1/rad]. The logged 
 0.3 %; its manual gives the divisor 128."""
 
 
+@dataclasses.dataclass(frozen=True)
+class PositionLoop(Linear):
+    """What servos under a position loop have in common: the motor, the firmware's numbers, the limit.
+
+    A base class, no effect: `PositionServo` has a P gain and perhaps a D gain, `PidServo` an I gain too.
+    """
+
+    amplitudes: ClassVar[tuple[str, ...]] = ("torque_constant",)
+    motor: ClassVar[bool] = True
+    has_current: ClassVar[bool] = True
+    has_duty: ClassVar[bool] = True
+    exact_step: ClassVar[bool] = False
+
+    at: str = "hub"
+    gain: float = parameter(400.0, unit="", lower=0.0, meaning="P gain of the firmware")
+    gain_scale: float = parameter(
+        DYNAMIXEL_GAIN_SCALE, unit="1/rad", lower=0.0, meaning="duty per angle for a gain of one"
+    )
+    limit: float = parameter(1.0, unit="", lower=0.0, physical=(0.0, 1.0), meaning="largest duty")
+    supply: float = parameter(7.4, unit="V", lower=0.0, meaning="supply voltage")
+    period: float = parameter(1e-3, unit="s", lower=0.0, meaning="control period of the firmware")
+    torque_constant: float = parameter(
+        0.35, unit="N m/A", lower=0.0, meaning="torque per current, voltage per speed"
+    )
+    resistance: float = parameter(3.4, unit="ohm", lower=1e-6, meaning="armature resistance")
+    derivative: float | None = parameter(
+        None, unit="s/rad", typical=0.05, lower=0.0, meaning="duty per speed of the D gain"
+    )
+    dead_band: float | None = parameter(
+        None, unit="rad", typical=0.003, lower=0.0, meaning="error that the firmware takes for none"
+    )
+    source_resistance: float | None = parameter(
+        None, unit="ohm", typical=0.3, lower=0.0, meaning="resistance of supply and cable"
+    )
+    enabled: float | None = parameter(
+        None,
+        unit="",
+        typical=1.0,
+        lower=0.0,
+        physical=(0.0, 1.0),
+        meaning="1 where the torque is on, 0 where it is off",
+    )
+
+    @property
+    def further_parts(self) -> tuple[str, ...]:
+        """What was given of the parts that most servos lack, with its size."""
+        declared = self.declared()
+        names = ("derivative", "dead_band", "source_resistance", "integral")
+        parts = {n: self.values.get(n) for n in names}
+        said = [f"{n} of {v:.4g} {declared[n].unit}" for n, v in parts.items() if v]
+        return (*said, *(["torque that is off"] if self.enabled == 0 else []))
+
+    @property
+    def torque_per_current(self) -> Scalar:
+        """At the port [N m/A]."""
+        return self.torque_constant
+
+    @property
+    def _torque_per_volt(self) -> Scalar:
+        """Of the armature at rest [N m/V]."""
+        found = self.torque_constant / self.resistance
+        return found if self.enabled is None else self.enabled * found
+
+    @property
+    def _torque_per_duty(self) -> Scalar:
+        """At rest [N m]."""
+        return self._torque_per_volt * self.supply
+
+    def stamp(self) -> Stamp:
+        """Entries of the equations of motion below the limit, without an I gain."""
+        stiffness = self._torque_per_duty * self.gain * self.gain_scale
+        braking = self._torque_per_volt * self.torque_constant - stiffness * self.period / 2
+        if self.derivative is not None:
+            braking = braking + self._torque_per_duty * self.derivative
+        return Stamp(stiffness=stiffness, drive=stiffness, damping=braking)
+
+    def _wanted(self, position: Scalar, speed: Scalar, goal: Scalar) -> tuple[Scalar, Scalar]:
+        """Duty by P and D gain before the limit: as the linear loop has it, and with the dead band."""
+        error = goal - position + self.period / 2 * speed
+        linear = wanted = self.gain * self.gain_scale * error
+        if self.dead_band is not None:
+            wanted = self.gain * self.gain_scale * (error - _within(error, self.dead_band))
+        if self.derivative is not None:
+            linear, wanted = linear - self.derivative * speed, wanted - self.derivative * speed
+        return linear, wanted
+
+    def duty(self, position: Scalar, speed: Scalar, goal: Scalar, integral: Scalar | None = None) -> Scalar:
+        """Duty that the firmware gives; `integral` is that of its I gain. None where the torque is off."""
+        wanted = self._wanted(position, speed, goal)[1]
+        given = _within(wanted if integral is None else wanted + integral, self.limit)
+        return given if self.enabled is None else self.enabled * given
+
+    def _beyond(
+        self, position: Scalar, speed: Scalar, goal: Scalar, integral: Scalar | None = None
+    ) -> Scalar:
+        """Torque [N m] by which the motor differs from the linear loop."""
+        linear, wanted = self._wanted(position, speed, goal)
+        before = wanted if integral is None else wanted + integral
+        # What the limit takes away, added: nothing is rounded below it.
+        off = _within(before, self.limit) - before
+        if self.dead_band is not None:
+            off = off + (wanted - linear)
+        if integral is not None:
+            off = off + integral
+        if self.source_resistance is None:
+            return self._torque_per_duty * off
+        duty = linear + off
+        share = self.source_resistance / self.resistance * duty
+        supply = (self.supply + share * self.torque_constant * speed) / (1 + share * duty)
+        return self._torque_per_volt * ((supply - self.supply) * duty + self.supply * off)
+
+    def sentence(self) -> str:
+        """In words."""
+        stall = self._torque_per_duty * self.limit
+        speed = math.inf if self.torque_constant == 0 else self.supply * self.limit / self.torque_constant
+        return (
+            f"the servo holds the {self.at} at its goal with {self.stamp().stiffness:.3g} N m/rad, gives up "
+            f"to {stall:.3g} N m at rest and runs free at {speed:.3g} rad/s"
+        )
+
+
 @register
 @dataclasses.dataclass(frozen=True)
-class PositionServo(Linear, Force):
+class PositionServo(PositionLoop, Force):
     """A motor behind a gear under the position loop of its firmware; the input is the goal angle.
 
         duty = min(max(gain gain_scale (goal - (position - period / 2 speed)), -limit), limit)
@@ -250,6 +388,7 @@ class PositionServo(Linear, Force):
         derivative: Duty that the D gain takes away per speed [s/rad], or None.
         dead_band: Error of the angle that the firmware takes for none [rad], or None.
         source_resistance: Of supply and cable, by which the voltage falls under current [ohm], or None.
+        enabled: 1 where the torque is on, 0 where it is off; None for a servo whose torque is always on.
 
     Source: Duclusaud, Passault, Padois, Ly 2024, Extended friction models for the physics simulation of
         servo actuators, arXiv 2410.08650, section II; Robotis, XL330-M288-T e-manual, control tables 84 and
@@ -262,78 +401,172 @@ class PositionServo(Linear, Force):
         "tau = torque_constant / resistance * (supply * duty - torque_constant * speed), "
         "duty = min(max(gain * gain_scale * (v - position + period / 2 * speed), -limit), limit); where "
         "given, dead_band off the error, derivative * speed off the duty, source_resistance * duty * current "
-        "off the supply"
+        "off the supply, enabled times tau"
     )
-    amplitudes: ClassVar[tuple[str, ...]] = ("torque_constant",)
-    motor: ClassVar[bool] = True
-    exact_step: ClassVar[bool] = False
-
-    at: str = "hub"
-    gain: float = parameter(400.0, unit="", lower=0.0, meaning="P gain of the firmware")
-    gain_scale: float = parameter(
-        DYNAMIXEL_GAIN_SCALE, unit="1/rad", lower=0.0, meaning="duty per angle for a gain of one"
-    )
-    limit: float = parameter(1.0, unit="", lower=0.0, physical=(0.0, 1.0), meaning="largest duty")
-    supply: float = parameter(7.4, unit="V", lower=0.0, meaning="supply voltage")
-    period: float = parameter(1e-3, unit="s", lower=0.0, meaning="control period of the firmware")
-    torque_constant: float = parameter(
-        0.35, unit="N m/A", lower=0.0, meaning="torque per current, voltage per speed"
-    )
-    resistance: float = parameter(3.4, unit="ohm", lower=1e-6, meaning="armature resistance")
-    derivative: float | None = parameter(
-        None, unit="s/rad", typical=0.05, lower=0.0, meaning="duty per speed of the D gain"
-    )
-    dead_band: float | None = parameter(
-        None, unit="rad", typical=0.003, lower=0.0, meaning="error that the firmware takes for none"
-    )
-    source_resistance: float | None = parameter(
-        None, unit="ohm", typical=0.3, lower=0.0, meaning="resistance of supply and cable"
-    )
-
-    @property
-    def further_parts(self) -> tuple[str, ...]:
-        """What was given of the parts that most servos lack, with its size."""
-        parts = {n: getattr(self, n) for n in ("derivative", "dead_band", "source_resistance")}
-        declared = self.declared()
-        return tuple(f"{n} of {v:.4g} {declared[n].unit}" for n, v in parts.items() if v)
-
-    @property
-    def _torque_per_duty(self) -> Scalar:
-        """At rest [N m]."""
-        return self.torque_constant * self.supply / self.resistance
-
-    def stamp(self) -> Stamp:
-        """Entries of the equations of motion below the limit."""
-        stiffness = self._torque_per_duty * self.gain * self.gain_scale
-        braking = self.torque_constant**2 / self.resistance - stiffness * self.period / 2
-        if self.derivative is not None:
-            braking = braking + self._torque_per_duty * self.derivative
-        return Stamp(stiffness=stiffness, drive=stiffness, damping=braking)
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
         """Torque [N m] by which the motor differs from the linear loop; `voltage` is the goal [rad]."""
-        error = voltage - position + self.period / 2 * speed
-        linear = wanted = self.gain * self.gain_scale * error
+        return self._beyond(position, speed, voltage)
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class PidServo(PositionLoop, Memory):
+    """A motor behind a gear under a PID loop of its firmware; the input is the goal angle.
+
+        wanted = gain gain_scale band(e) - derivative speed + z
+        e = goal - (position - period / 2 speed)
+        duty = min(max(wanted, -limit), limit)
+        dz/dt = integral band(e) - anti_windup (wanted - duty)
+
+    The motor is that of `PositionServo`. The state z is the duty of the I gain. While the duty is at its
+    limit, what is wanted beyond it is led back to the integral (back-calculation), as in the firmware of a
+    Dynamixel X, whose manual draws an anti-windup gain and does not say its size: release `anti_windup` where
+    a log reaches the limit. A large one keeps the integral from growing there.
+
+    The I part is a torque of the step, linear in time over it; the rest of the loop is exact below the limit.
+    Not for a servo without an I gain, for which `PositionServo` has one state less.
+
+    Args:
+        at: Port the servo drives.
+        gain: P gain of the firmware, in its own unit.
+        gain_scale: Duty per angle for a gain of one [1/rad].
+        limit: Largest duty, 1 for the whole supply.
+        supply: Supply voltage [V].
+        period: Control period of the firmware [s].
+        torque_constant: Torque per current, equal to voltage per speed [N m/A].
+        resistance: Of the armature [ohm].
+        derivative: Duty that the D gain takes away per speed [s/rad], or None.
+        dead_band: Error of the angle that the firmware takes for none [rad], or None.
+        source_resistance: Of supply and cable, by which the voltage falls under current [ohm], or None.
+        enabled: 1 where the torque is on, 0 where it is off; None for a servo whose torque is always on.
+        integral: Duty per error and second of the I gain [1/(rad s)].
+        anti_windup: Rate at which a duty beyond the limit is led back [1/s].
+
+    Source: Robotis, XM430-W210 e-manual, section on the position PID gains (control tables 80, 82, 84, and
+        the anti-windup gain K_a); K. J. Astrom and T. Hagglund, PID Controllers, 2nd ed., 1995, section 3.5.
+    """
+
+    name: ClassVar[str] = "pid_servo"
+    title: ClassVar[str] = "motor under a PID position loop"
+    equation: ClassVar[str] = (
+        "tau = torque_constant / resistance * (supply * duty - torque_constant * speed), "
+        "duty = min(max(wanted, -limit), limit), "
+        "wanted = gain * gain_scale * (v - position + period / 2 * speed) + z, "
+        "dz/dt = integral * (v - position) - anti_windup * (wanted - duty), "
+        "where given, dead_band off the error, derivative * speed off wanted, source_resistance * duty * "
+        "current off the supply, enabled times tau"
+    )
+    state_part: ClassVar[StatePart | None] = "memory"
+
+    integral: float = parameter(1.0, unit="1/(rad s)", lower=0.0, meaning="duty per error and second")
+    anti_windup: float = parameter(
+        100.0, unit="1/s", lower=0.0, meaning="rate at which a duty beyond the limit is led back"
+    )
+
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the duty of the I gain [1/s]; `drive` is the goal [rad]."""
+        error = drive - position + self.period / 2 * speed
         if self.dead_band is not None:
-            wanted = self.gain * self.gain_scale * (error - _within(error, self.dead_band))
-        if self.derivative is not None:
-            linear, wanted = linear - self.derivative * speed, wanted - self.derivative * speed
-        # What the limit takes away, added: nothing is rounded below it.
-        off = _within(wanted, self.limit) - wanted
-        if self.dead_band is not None:
-            off = off + (wanted - linear)
-        if self.source_resistance is None:
-            return self._torque_per_duty * off
-        duty = linear + off
-        share = self.source_resistance / self.resistance * duty
-        supply = (self.supply + share * self.torque_constant * speed) / (1 + share * duty)
-        return self.torque_constant / self.resistance * ((supply - self.supply) * duty + self.supply * off)
+            error = error - _within(error, self.dead_band)
+        wanted = self._wanted(position, speed, drive)[1] + z
+        rate = self.integral * error - self.anti_windup * (wanted - _within(wanted, self.limit))
+        return rate if self.enabled is None else self.enabled * rate
+
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Torque [N m] by which the motor differs from a loop without limit and I gain."""
+        return self._beyond(position, speed, drive, z)
+
+
+@dataclasses.dataclass(frozen=True)
+class Meter(Memory):
+    """What an instrument shows of the motor: a first-order filter, and no torque.
+
+        dz/dt = (x - z) / time
+
+    A base class, no effect. The state is the reading, which an output shows: `outputs={"current": ("hub",
+    "current")}`. Within a sample the motor's value is that in the middle of it, so a reading is at least the
+    mean over the sample before.
+    """
+
+    ports: ClassVar[tuple[str, ...]] = ("hub",)
+
+    at: str = "hub"
+    time: float = parameter(0.005, unit="s", lower=1e-5, meaning="time constant of the filter")
+
+    def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """Time derivative of the reading [its unit per s]."""
+        return (drive - z) / self.time
+
+    def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
+        """No torque [N m]."""
+        return 0.0 * drive
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class CurrentMeter(Meter):
+    """Shows the current of the motor at its port, filtered.
+
+        dz/dt = (i - z) / time
+
+    For a log with the current, as servos and drives write it. Goal and angle alone determine the torques of a
+    servo only up to a common factor; a current in amperes sets that factor, since the torque per current is
+    the back-EMF per speed: an inertia that is trusted otherwise may be released. In counts of an unknown size
+    it needs a `SensorGain` beside it and sets no factor. Not for a current amplifier, whose current is the
+    input.
+
+    Args:
+        at: Port of the motor.
+        time: Time constant of the filter [s].
+
+    Source: Robotis, XM430-W210 e-manual, control table 126; first-order low-pass filter.
+    """
+
+    name: ClassVar[str] = "current_meter"
+    title: ClassVar[str] = "reading of the motor's current"
+    equation: ClassVar[str] = "dz/dt = (i - z) / time, i current of the motor, tau = 0"
+    driven_by: ClassVar[Drive] = "current"
+    shows: ClassVar[str] = "current"
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A motor that says its torque per current."""
+        return ("motor whose current is known",)
 
     def sentence(self) -> str:
         """In words."""
-        stall = self._torque_per_duty * self.limit
-        speed = math.inf if self.torque_constant == 0 else self.supply * self.limit / self.torque_constant
-        return (
-            f"the servo holds the {self.at} at its goal with {self.stamp().stiffness:.3g} N m/rad, gives up "
-            f"to {stall:.3g} N m at rest and runs free at {speed:.3g} rad/s"
-        )
+        return f"the reading of the current follows the motor at the {self.at} within {self.time:.3g} s"
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class DutyMeter(Meter):
+    """Shows the duty that the firmware of a servo gives its motor, filtered.
+
+        dz/dt = (duty - z) / time
+
+    For a log with the duty, the PWM or the load in shares of the supply. It is what the firmware computes
+    from goal and angle, so it checks the firmware's numbers and says little about the motor.
+
+    Args:
+        at: Port of the servo.
+        time: Time constant of the filter [s].
+
+    Source: Robotis, XL330-M288-T e-manual, control table 124; first-order low-pass filter.
+    """
+
+    name: ClassVar[str] = "duty_meter"
+    title: ClassVar[str] = "reading of a servo's duty"
+    equation: ClassVar[str] = "dz/dt = (duty - z) / time, duty of the servo, tau = 0"
+    driven_by: ClassVar[Drive] = "duty"
+    shows: ClassVar[str] = "duty"
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A servo, whose firmware has a duty."""
+        return ("servo",)
+
+    def sentence(self) -> str:
+        """In words."""
+        return f"the reading of the duty follows the servo at the {self.at} within {self.time:.3g} s"

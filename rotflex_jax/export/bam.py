@@ -15,7 +15,7 @@ from rotflex_jax.effects import (
     Gravity,
     Inertia,
     LoadFriction,
-    PositionServo,
+    PositionLoop,
     Stribeck,
     Viscous,
 )
@@ -48,7 +48,7 @@ def to_bam(
     stand in their class of the actuator, not in the file: they are listed with their values.
 
     Args:
-        model: Mechanism of one coordinate with a `PositionServo`, or a Model.
+        model: Mechanism of one coordinate with a `PositionLoop`, or a Model.
         Ts: Sampling period of the certificate's input [s].
         actuator: Name of the class of the actuator in BAM.
         length: Of the pendulum [m], where the servo lifts a weight.
@@ -64,7 +64,7 @@ def to_bam(
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
     simulation of servo actuators, 2024, arXiv 2410.08650; parameter files of the repository Rhoban/bam.
     """
-    subject = Subject.of(model, Ts, u)
+    subject = Subject.of(model, Ts, u).of_motion()
     length = number(length, "length", above=0, unit="m", example="0.1")
     if not (isinstance(actuator, str) and actuator.strip()):
         raise InputError(
@@ -78,8 +78,8 @@ def to_bam(
     return Exported(json.dumps(content, indent=2) + "\n", certificate)
 
 
-def _servo(mechanism: Mechanism) -> PositionServo:
-    servos = [e for e in mechanism.effects if isinstance(e, PositionServo)]
+def _servo(mechanism: Mechanism) -> PositionLoop:
+    servos = [e for e in mechanism.effects if isinstance(e, PositionLoop)]
     if len(servos) == 1 and mechanism.ports and len(mechanism.coordinates) == 1 and mechanism.channels:
         return servos[0]
     raise InputError(
@@ -94,7 +94,7 @@ def _weight(mechanism: Mechanism) -> tuple[float, float]:
 
 
 def _parameters(
-    mechanism: Mechanism, servo: PositionServo, actuator: str, length: float
+    mechanism: Mechanism, servo: PositionLoop, actuator: str, length: float
 ) -> tuple[dict[str, Any], list[str], list[str]]:
     sine, cosine = _weight(mechanism)
     weight = math.hypot(sine, cosine)
@@ -139,9 +139,11 @@ def _parameters(
             content["load_friction_base"] = (effect.driving + effect.driven) / 4
             if effect.driving != effect.driven:
                 approximated.append(f"{label(effect)}: the mean of both shares")
+            if effect.of == "motor":
+                approximated.append(f"{label(effect)}: of the sum of both sides, not of the motor alone")
         elif isinstance(effect, Delay) and "command_delay" not in content:
             content["command_delay"] = effect.time
-        elif not isinstance(effect, PositionServo | Inertia | Gravity):
+        elif not isinstance(effect, PositionLoop | Inertia | Gravity):
             left_out.append(f"{label(effect)}: {effect.equation}")
     if falls and loads:
         content["load_friction_stribeck"] = 0.0
@@ -151,7 +153,7 @@ def _parameters(
 
 def run_by_bam_equations(
     parameters: dict[str, Any],
-    servo: PositionServo,
+    servo: PositionLoop,
     weight: tuple[float, float],
     length: float,
     u: Real[np.ndarray, " N"] | Sequence[float],

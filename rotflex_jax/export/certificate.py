@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from rotflex_jax.checks import positive, shown, signal
-from rotflex_jax.effects.base import Effect
+from rotflex_jax.effects.base import Effect, Memory
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, simulate
 from rotflex_jax.models.model import Model
@@ -102,12 +102,14 @@ class Subject:
         Ts: Sampling period [s].
         u: Input of the certificate, held over each sample.
         on: That input in words.
+        left_out: Readings that the form has not.
     """
 
     model: Model
     Ts: float
     u: Float[np.ndarray, " N"]
     on: str
+    left_out: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -142,6 +144,19 @@ class Subject:
         """The mechanism."""
         return self.model.mechanism
 
+    def of_motion(self) -> "Subject":
+        """The same without readings of a motor, for forms whose sensors show motions alone."""
+        m = self.mechanism
+        others = {c: pair for (c, pair), q in zip(m.outputs, m.quantities, strict=True) if q.of_motion}
+        if len(others) == len(m.outputs):
+            return self
+        effects = tuple(e for e in m.effects if not (isinstance(e, Memory) and e.shows))
+        left_out = tuple(f"{c}: the {what} at {port}" for c, (port, what) in m.outputs if c not in others)
+        names = {f"{e.at}.{e.name}.{n}" for e in effects for n in e.values}
+        reduced = dataclasses.replace(m, effects=effects, outputs=others, trusted=m.trusted & names)
+        model = dataclasses.replace(self.model, mechanism=reduced)
+        return dataclasses.replace(self, model=model, left_out=left_out)
+
     def certificate(
         self,
         form: str,
@@ -170,7 +185,7 @@ class Subject:
             self.on,
             m.channels,
             units,
-            left_out=tuple(left_out),
+            left_out=(*self.left_out, *left_out),
             approximated=tuple(approximated),
         )
         if y is None:

@@ -9,7 +9,7 @@ import dataclasses
 import math
 from typing import Any
 
-from rotflex_jax.effects import Coulomb, Gravity, Lag, Motor, PositionServo, Saturation, VoltageOffset
+from rotflex_jax.effects import Coulomb, Gravity, Lag, Motor, PositionLoop, Saturation, VoltageOffset
 from rotflex_jax.effects.base import Actuation, DryFriction, Effect, Linear, Sensing
 from rotflex_jax.errors import InputError
 from rotflex_jax.export.certificate import label
@@ -134,7 +134,7 @@ class Chain:
             return
         vector = tuple(map(float, mechanism.vector(effect)))
         place = self.places.setdefault(vector, Place(effect.at))
-        if isinstance(effect, PositionServo):
+        if isinstance(effect, PositionLoop):
             self._add_servo(effect, vector, place)
         elif isinstance(effect, Motor) and effect.inductance is not None:
             gain, emf = (
@@ -171,16 +171,17 @@ class Chain:
         place.stiffness += float(stamp.stiffness)
         place.damping += float(stamp.damping)
 
-    def _add_servo(self, effect: PositionServo, vector: Vector, place: Place) -> None:
+    def _add_servo(self, effect: PositionLoop, vector: Vector, place: Place) -> None:
         """The limit of the duty holds without the back-EMF, which therefore is damping of the joint."""
-        per_duty = effect.torque_constant * effect.supply / effect.resistance
+        on = 1.0 if effect.enabled is None else effect.enabled
+        per_duty = on * effect.torque_constant * effect.supply / effect.resistance
         stiffness = per_duty * effect.gain * effect.gain_scale
         drive = Drive(f"{effect.at}.{effect.name}", vector, stiffness, limit=per_duty * effect.limit)
         drive.at_position, drive.at_speed = -stiffness, stiffness * effect.period / 2
         drive.at_speed -= per_duty * (effect.derivative or 0.0)
         self.left_out += [f"{label(effect)}: {p}" for p in effect.further_parts if "derivative" not in p]
         self.drives.append(drive)
-        place.damping += effect.torque_constant**2 / effect.resistance
+        place.damping += on * effect.torque_constant**2 / effect.resistance
 
     def _add_friction(self, mechanism: Mechanism, effect: DryFriction, place: Place) -> None:
         load = (0.0,) if effect.loaded else ()

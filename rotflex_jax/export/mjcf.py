@@ -67,7 +67,7 @@ def to_mjcf(
     Source: MuJoCo documentation, XML reference; E. Todorov, Convex and analytically-invertible dynamics with
     contacts and constraints, 2014, for friction as a constraint.
     """
-    subject, name = Subject.of(model, Ts, u), machine_name(name)
+    subject, name = Subject.of(model, Ts, u).of_motion(), machine_name(name)
     chain = Chain.of(subject.mechanism, "MJCF")
     tree = _mujoco(subject.mechanism, chain, name, subject.Ts)
     text = _written(tree)

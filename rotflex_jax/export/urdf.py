@@ -54,7 +54,7 @@ def to_urdf(
 
     Source: ROS, URDF XML specification, link and joint.
     """
-    subject, name = Subject.of(model, Ts, u), machine_name(name)
+    subject, name = Subject.of(model, Ts, u).of_motion(), machine_name(name)
     chain = Chain.of(subject.mechanism, "URDF")
     tree = _robot(subject.mechanism, chain, name)
     text = _written(tree)

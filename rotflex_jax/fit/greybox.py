@@ -160,6 +160,7 @@ def fit(
     local: Sequence[str] = (),
     first: FirstState = "fitted",
     window_seconds: float | None = None,
+    robust: float | None = None,
     max_steps: int = 60,
     minimiser: "Minimiser | None" = None,
     devices: Sequence[Any] | None = None,
@@ -198,6 +199,10 @@ def fit(
         window_seconds: Start again every so often [s], each time with a first state of its own: the
             parameters with which free runs of that length are best. Delays and lags go on across windows, and
             memories begin as a run over the whole recording leaves them, as in the errors over windows.
+        robust: Errors beyond this many standard deviations count by their size and not by its square, 1.5 for
+            instance, where the model is far off for some of the time and should be right for the rest. The
+            standard deviation is told by the median of the errors; `noise` and intervals are those of errors
+            that are bent so. None for squares throughout.
         max_steps: Most iterations of each minimisation, of which there are several.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
@@ -236,6 +241,13 @@ def fit(
             )
     if not m.free_names:
         raise InputError("All parameters are trusted, but a fit needs a free one; release one.")
+    if robust is not None:
+        robust = checks.positive(robust, "robust", "", "1.5, or None for squares throughout")
+        if minimiser is not None:
+            raise InputError(
+                "A robust fit was asked for with a minimiser of optimistix, but only the toolkit's own bends "
+                "errors; leave one of the two out."
+            )
     if window_seconds is not None:
         checks.positive(window_seconds, "window_seconds", "s", "2.0, or None for whole recordings")
     check_signs(model, given)
@@ -244,6 +256,10 @@ def fit(
     options = FitOptions(asked, local, first, window_seconds, max_steps)
     with double_precision():
         end = problem.solve([names.index(n) for n in local], process_noise, window_seconds)
+        if robust is not None:
+            problem, end = problem.robust(end, robust)
+            assert problem.bend is not None
+            options = dataclasses.replace(options, bend=tuple(problem.bend.tolist()))
         if throw and end.status != "converged":
             raise RuntimeError(f"The fit did not converge: {end.status}.")
         return report(problem, end, *problem.errors(end.point, end.stage, end.K), options)
@@ -272,6 +288,8 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
             "Recordings, or settings of them such as n_init, differ from those of the fit, but a profile "
             "fits the same data again with one quantity held; give those that were fitted, or fit these."
         )
+    if asked.bend is not None:
+        problem = dataclasses.replace(problem, bend=np.array(asked.bend))
     windows = problem.horizons(asked.window_seconds)[-1]
     point = problem.start([m.parameter_names.index(n) for n in asked.local], windows)
     transform, local_z = problem.transform, point.local_z.copy()
@@ -305,4 +323,5 @@ def _problem(
         max_steps,
         minimiser,
         progress or (lambda _: None),
+        None,
     )

@@ -67,11 +67,28 @@ NEARBY_STARTS, NEARBY = 3, 0.3
 # Of two attempts whose costs differ by less, one that converged is better [nat].
 EQUAL_COST = 0.1
 
+# How often a robust fit tells anew which errors are large.
+ROBUST_REPETITIONS = 2
+
+# Standard deviation of a normal number, by the median of its size.
+NORMAL_PER_MEDIAN = 1.4826
+
 _STATUS = {
     Status.CONVERGED: "converged",
     Status.DIVERGED: "diverged: the model error at the start is not finite",
     Status.UNSOLVED: "stopped: a step has no finite solution; the model diverges near these parameters",
 }
+
+
+def bent(
+    e: Float[np.ndarray, "R N C"], J: Float[np.ndarray, "R N C D"], bend: Float[np.ndarray, " C"]
+) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
+    """Errors whose squares are twice the pseudo-Huber loss `c^2 (sqrt(1 + (e/c)^2) - 1)`, and their slopes.
+
+    Source: P. Charbonnier, L. Blanc-Feraud, G. Aubert and M. Barlaud, IEEE Trans. Image Process. 6, 1997.
+    """
+    root = np.sqrt(1 + (e / bend) ** 2)
+    return e * np.sqrt(2 / (root + 1)), J * (np.sqrt((root + 1) / 2) / root)[..., None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,6 +170,8 @@ class GreyBoxProblem:
         max_steps: Most iterations of a minimisation.
         minimiser: Solver of optimistix, or None for the toolkit's own.
         say: Called with lines of progress.
+        bend: Errors of each channel beyond which they count by their size; None where all count by their
+            square.
     """
 
     model: Model
@@ -162,6 +181,7 @@ class GreyBoxProblem:
     max_steps: int
     minimiser: "Minimiser | None"
     say: Callable[[str], None]
+    bend: Float[np.ndarray, " C"] | None
 
     def start(self, local: Sequence[int], windows: Windows) -> FitPoint:
         """The point of the model as it is."""
@@ -268,7 +288,7 @@ class GreyBoxProblem:
     def errors(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
-        """Errors of the runs and their slopes; zero where a sample does not count."""
+        """Errors of the runs and their slopes, bent where large ones count less; zero where none counts."""
         values, slopes = self.physical(point)
         many = point.x0.shape[1] > 1
         y_hat, J = jax.device_get(
@@ -282,7 +302,32 @@ class GreyBoxProblem:
             )
         )
         seen = self.dataset.data.seen[:, :, None] > 0
-        return np.where(seen, y_hat - self.dataset.data.y, 0.0), np.where(seen[..., None], J, 0.0)
+        e, J = np.where(seen, y_hat - self.dataset.data.y, 0.0), np.where(seen[..., None], J, 0.0)
+        return (e, J) if self.bend is None else bent(e, J, self.bend)
+
+    def robust(self, end: FitAttempt, beyond: float) -> tuple["GreyBoxProblem", FitAttempt]:
+        """The same problem with large errors bent, and its end.
+
+        What is large is told by the median of the errors, which large ones do not move, and told once more
+        where that fit ends. The fit begins where that by squares has ended, and where that has begun: large
+        errors may have led it elsewhere.
+
+        Args:
+            end: Of a fit by squares.
+            beyond: Errors that are bent, in standard deviations of a normal number with that median.
+        """
+        problem, seen = self, self.dataset.data.seen > 0
+        starts = [end.point, self.start(end.point.local, end.stage.windows)]
+        for _ in range(ROBUST_REPETITIONS):
+            e, _ = self.errors(end.point, end.stage, end.K)
+            spread = NORMAL_PER_MEDIAN * np.median(np.abs(e[seen]), axis=0)
+            problem = dataclasses.replace(self, bend=beyond * np.maximum(spread, self.dataset.noise))
+            found = [problem.attempt(start, [end.stage]) for start in starts]
+            best = min(found, key=lambda attempt: attempt.rank)
+            steps = end.steps + sum(attempt.steps for attempt in found)
+            end = dataclasses.replace(best, steps=steps, history=[*end.history, *best.history])
+            starts = [end.point]
+        return problem, end
 
     def model_at(self, point: FitPoint, recording: int) -> Model:
         """The model of a recording."""

@@ -193,6 +193,7 @@ class Sensors:
             for port, v in ports.items()
             if port != ROTOR
             for q in Quantity
+            if q.of_motion
         }
         return cls(here, {name: row for name, row in wanted.items() if row not in here})
 

@@ -42,6 +42,8 @@ class FitOptions:
         first: Whether first states were fitted, or held at what the first samples show.
         window_seconds: Runs started again so often [s]; None for whole recordings.
         max_steps: Most iterations of each minimisation.
+        bend: Errors of each channel beyond which they counted by their size [unit of the channel]; None where
+            all counted by their square.
     """
 
     process_noise: dict[str, float] | None = None
@@ -49,6 +51,7 @@ class FitOptions:
     first: str = "fitted"
     window_seconds: float | None = None
     max_steps: int = 60
+    bend: tuple[float, ...] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from rotflex_jax.joints.rotary_flexible import (
     spring_settings,
     spring_stiffness,
 )
-from rotflex_jax.joints.servos import position_servo, sts3215, xl330_pendulum
+from rotflex_jax.joints.servos import position_servo, servo, sts3215, xl330_pendulum
 
 __all__ = [
     "paper",
@@ -29,6 +29,7 @@ __all__ = [
     "rotary_arm",
     "two_dof_link",
     "position_servo",
+    "servo",
     "sts3215",
     "xl330_pendulum",
     "load_mjcf",

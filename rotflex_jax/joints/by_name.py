@@ -19,6 +19,7 @@ JOINTS = (
     "flexible_link",
     "single_inertia",
     "position_servo",
+    "servo",
     "sts3215",
     "xl330_pendulum",
 )

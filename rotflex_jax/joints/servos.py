@@ -1,8 +1,20 @@
 """Hobby servos under the position loop of their firmware: the input is a goal angle."""
 
 import dataclasses
+from typing import Literal, get_args
 
-from rotflex_jax.effects import Gravity, Inertia, PositionServo
+from rotflex_jax.checks import number, one_of
+from rotflex_jax.effects import (
+    CurrentMeter,
+    DutyMeter,
+    Gravity,
+    Inertia,
+    PidServo,
+    PositionLoop,
+    PositionServo,
+)
+from rotflex_jax.effects.base import Memory
+from rotflex_jax.effects.motor import DYNAMIXEL_GAIN_SCALE
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.quantity import Units
 
@@ -18,12 +30,19 @@ FIRMWARE = (
     "derivative",
     "dead_band",
     "source_resistance",
+    "enabled",
+    "integral",
+    "anti_windup",
 )
-"""Parameters of `PositionServo` that its user has set."""
+"""Parameters of `PositionServo` and `PidServo` that their user or the firmware has set."""
+
+ServoKind = Literal["xl330", "sts3215"]
+METERS: dict[str, type[Memory]] = {"current": CurrentMeter, "duty": DutyMeter}
+"""Reading of a servo -> the effect that shows it."""
 
 
 def position_servo(
-    inertia: float = 0.005, *, servo: PositionServo | None = None, weight: float = 0.0
+    inertia: float = 0.005, *, servo: PositionLoop | None = None, weight: float = 0.0
 ) -> Mechanism:
     """A joint on a hobby servo, from goal angle to angle.
 
@@ -52,7 +71,7 @@ def position_servo(
         ports={"hub": (1.0,)},
         effects=(Inertia(at="hub", inertia=inertia), driven, Gravity(at="hub", sine=weight)),
         outputs={"theta": "hub"},
-        trusted=(*(f"hub.position_servo.{n}" for n in FIRMWARE if n in driven.values), "hub.inertia.inertia"),
+        trusted=(*(f"hub.{driven.name}.{n}" for n in FIRMWARE if n in driven.values), "hub.inertia.inertia"),
         units=Units(input="rad"),
     )
 
@@ -143,3 +162,83 @@ def sts3215(
         dead_band=dead_band or None,
     )
     return position_servo(inertia, servo=servo, weight=weight)
+
+
+def servo(
+    kind: ServoKind = "xl330",
+    inertia: float | None = None,
+    *,
+    gain: float | None = None,
+    integral: float | None = None,
+    derivative: float | None = None,
+    dead_band: float | None = None,
+    supply: float = 7.4,
+    source_resistance: float | None = None,
+    weight: float = 0.0,
+    sensors: str = "theta",
+) -> Mechanism:
+    """A joint on a servo of a known kind, with what its log has, from goal angle to angle.
+
+        inertia theta'' = servo(goal, theta, theta') - sine sin(theta) - cosine cos(theta)
+
+    `position_servo` with the numbers of the kind; with an I gain the loop is a `PidServo`. The parameter
+    `enabled` is there too: a stretch of a log in which the torque is off is a recording of its own, with
+    `constants={"hub.position_servo.enabled": 0.0}` (`hub.pid_servo.enabled`). Not with a speed or
+    acceleration limit set in the servo, which plans a profile towards its goal.
+
+    The gains are those that the servo's registers have. For the XL-330 the manual's ratios of the three gains
+    and the size that logs show for the P gain are taken, half of the manual's; for the STS3215 the P gain was
+    measured, and I and D gain are the duty per error and second, or per speed, that the caller says.
+
+    Args:
+        kind: "xl330", a Dynamixel XL-330; "sts3215", a Feetech STS3215 of 7.4 V.
+        inertia: Of the joint with rotor and gear [kg m^2]; None for a bare arm of that size.
+        gain: P gain, as new if None: 400 and 32.
+        integral: I gain, or None: in counts of the register for the XL-330, else [1/(rad s)].
+        derivative: D gain, or None: in counts of the register for the XL-330, else [s/rad].
+        dead_band: Error that the servo takes for none [rad], or None.
+        supply: Supply voltage [V].
+        source_resistance: Of supply and cable [ohm], or None.
+        weight: Torque of the weight when the angle is a quarter turn, where to start [N m].
+        sensors: What the log has: "theta", "theta+current" [A], "theta+duty" or "theta+current+duty".
+
+    Returns:
+        Mechanism with these outputs and the port `hub`; its input is the goal [rad].
+
+    Raises:
+        InputError: Another kind, or sensors that are none of these.
+
+    Source: Robotis, XL330-M288-T e-manual, control tables 80 to 84; else as `xl330_pendulum` and `sts3215`.
+
+    >>> servo("sts3215", gain=16, sensors="theta+current").channels
+    ('theta', 'current')
+    >>> servo("xl330", integral=100).effect("pid_servo", "hub").values["integral"] > 0
+    True
+    """
+    one_of(kind, "kind", get_args(ServoKind))
+    combined = ("theta", "theta+current", "theta+duty", "theta+current+duty")
+    channels = one_of(sensors, "sensors", combined).split("+")
+    if kind == "xl330":
+        preset = position_servo(0.005 if inertia is None else inertia, weight=weight)
+        # By error in counts and periods: duty = P e / 256 + I sum(e) / 131072 - D change / 32, over 885.
+        per_sum, per_change = DYNAMIXEL_GAIN_SCALE / (512 * 1e-3), 8 * DYNAMIXEL_GAIN_SCALE * 1e-3
+        if integral is not None:
+            integral = per_sum * number(integral, "integral", least=0, example="100")
+        if derivative is not None:
+            derivative = per_change * number(derivative, "derivative", least=0, example="100")
+    else:
+        preset = sts3215(0.03 if inertia is None else inertia, weight=weight)
+    known = preset.effect("position_servo", "hub").values | {"supply": supply, "enabled": 1.0}
+    given = {"gain": gain, "derivative": derivative, "dead_band": dead_band, "integral": integral}
+    given["source_resistance"] = source_resistance
+    known |= {name: value for name, value in given.items() if value is not None}
+    law = PidServo if integral is not None else PositionServo
+    driven = law(at="hub", **known)
+    machine = position_servo(preset.effect("inertia", "hub").values["inertia"], servo=driven, weight=weight)
+    shown = [METERS[c]("hub") for c in channels if c in METERS]
+    return dataclasses.replace(
+        machine,
+        effects=(*machine.effects, *shown),
+        outputs={c: ("hub", c) if c in METERS else "hub" for c in channels},
+        trusted=machine.trusted | {f"hub.{e.name}.time" for e in shown},
+    )

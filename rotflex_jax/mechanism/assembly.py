@@ -77,6 +77,7 @@ class Layout:
         rotor_side: One for those on the motor's side of a gear with play, zero for the others.
         contacts: How many of them have dry friction.
         output_rows: Each output as a combination of positions and speeds.
+        output_states: Index of the state that an output shows as it is, None for the others.
     """
 
     n: int
@@ -88,6 +89,7 @@ class Layout:
     rotor_side: tuple[float, ...]
     contacts: int
     output_rows: tuple[tuple[float, ...], ...]
+    output_states: tuple[int | None, ...]
 
     @classmethod
     @functools.cache
@@ -112,7 +114,15 @@ class Layout:
             rotor_side=tuple(1.0 if structure.on_rotor(p) else 0.0 for p in names),
             contacts=len(dry),
             output_rows=tuple(quantity.row(structure.port_vectors[port]) for quantity, port in measured),
+            output_states=tuple(_shown_state(structure, port, what) for _, (port, what) in structure.outputs),
         )
+
+
+def _shown_state(structure: Mechanism, port: str, what: str) -> int | None:
+    """Index of the state that is the reading of a quantity at a port."""
+    rows = own_states(structure)
+    shown = (rows[i][0] for i, e in effects_of(structure, Memory) if e.at == port and e.shows == what)
+    return next(shown, None)
 
 
 def effects_of(mechanism: Mechanism, kind: type[EffectKind]) -> list[tuple[int, EffectKind]]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Real
 
 from rotflex_jax import checks
 from rotflex_jax.checks import number, shown, shown as describe
-from rotflex_jax.effects.base import Effect, Linear
+from rotflex_jax.effects.base import Effect, Linear, Memory
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.quantity import TURNING, Quantity, Units
@@ -104,11 +104,17 @@ def check(mechanism: "Mechanism") -> None:
                 f"Port {name!r} was given {len(vector)} entries, but the mechanism has the "
                 f"{len(mechanism.coordinates)} coordinates {mechanism.coordinates}; give one entry for each."
             )
+    instruments = {(e.at, e.shows) for e in mechanism.effects if isinstance(e, Memory)}
     for channel, (port, what) in mechanism.outputs:
         if port not in ports or what not in Quantity.names():
             raise InputError(
                 f"Output {channel!r} was given as {(port, what)}, but it needs one of the ports "
                 f"{tuple(ports)} with {' or '.join(map(repr, Quantity.names()))}; correct the output."
+            )
+        if not Quantity(what).of_motion and (port, what) not in instruments:
+            raise InputError(
+                f"Output {channel!r} was given as the {what} at {port!r}, but it needs an effect there that "
+                f"shows it; put a {what.capitalize()}Meter({port!r}) among the effects."
             )
     seen: set[tuple[str, str]] = set()
     for effect in mechanism.effects:
@@ -297,6 +303,10 @@ class Mechanism:
         has: dict[str, Callable[[str], bool]] = {
             "motor": self.has_motor,
             "inertia": self.has_inertia,
+            "motor whose current is known": lambda port: any(
+                e.has_current for e in self.linear_effects(port)
+            ),
+            "servo": lambda port: any(e.has_duty for e in self.linear_effects(port)),
             "second output": lambda channel: len(self.outputs) > 1,
             "position": lambda channel: self.quantity(channel).is_position,
             "position or speed": lambda channel: self.quantity(channel).derivative <= 1,

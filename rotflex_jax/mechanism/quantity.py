@@ -4,8 +4,10 @@ Effects speak of a turning port: angles in rad, torques in N m. A machine may sa
 otherwise, in metres under forces in newtons, or in volts under volts; then every unit follows by
 dimensions, and sentences speak of forces.
 
-A reading that is no linear combination of positions and speeds has a row of zeros here and its equation in
-`mechanism/simulate.py`. An acceleration is more: it depends on the torques, which no reading receives.
+A reading that is no linear combination of positions and speeds has a row of zeros here. The current of
+a motor and the duty of a servo are states of effects that show them (`Memory.shows`); another reading would
+have its equation in `mechanism/simulate.py`. An acceleration is more: it depends on the torques, which no
+reading receives.
 """
 
 import enum
@@ -123,7 +125,8 @@ class Quantity(enum.Enum):
     """A measured quantity of a port; its value is the name that outputs are given with.
 
     Attributes:
-        derivative: Order of the time derivative of the port's position.
+        derivative: Order of the time derivative of the port's position; 2, as of a torque, for a reading of
+            the motor.
 
     >>> Quantity("speed").derivative, Quantity("speed").unit(Units("m", "N"))
     (1, 'm/s')
@@ -133,6 +136,8 @@ class Quantity(enum.Enum):
 
     POSITION = "position", 0
     SPEED = "speed", 1
+    CURRENT = "current", 2
+    DUTY = "duty", 2
 
     def __new__(cls, name: str, derivative: int) -> "Quantity":
         """A member whose value is the name alone."""
@@ -150,11 +155,20 @@ class Quantity(enum.Enum):
         """Whether it is the position itself."""
         return self.derivative == 0
 
+    @property
+    def of_motion(self) -> bool:
+        """Whether it is a linear function of positions and speeds."""
+        return self.derivative <= 1
+
     def unit(self, units: Units) -> str:
         """Unit of the reading for a machine that moves in these units."""
+        if not self.of_motion:
+            return "A" if self is Quantity.CURRENT else ""
         return units.motion + ("", "/s")[self.derivative]
 
     def row(self, port: tuple[float, ...]) -> tuple[float, ...]:
         """Coefficients of the reading over positions and speeds (2 n,) for a port vector (n,)."""
         zeros = (0.0,) * len(port)
+        if not self.of_motion:
+            return zeros + zeros
         return port + zeros if self.is_position else zeros + port

@@ -26,7 +26,12 @@ from rotflex_jax.runtime.xla import working_precision
 
 def true_outputs(structure: Mechanism, x: Float[Array, "n *S"]) -> Float[Array, "C *S"]:
     """Readings of ideal sensors."""
-    return sparse_matvec(Layout.of(structure).output_rows, x)
+    layout = Layout.of(structure)
+    moving = sparse_matvec(layout.output_rows, x)
+    if not any(layout.output_states):
+        return moving
+    states = [moving[c] if i is None else x[i] for c, i in enumerate(layout.output_states)]
+    return jnp.stack(states)
 
 
 def sensor_readings(

@@ -7,7 +7,8 @@ no smoothing width.
 """
 
 import dataclasses
-from typing import NamedTuple, get_args
+from collections.abc import Callable
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,7 @@ def motor_torque(
             continue
         stamp = e.stamp()
         total = total + gates[i] * (stamp.drive * v - stamp.damping * speed - stamp.stiffness * position)
-        if e.order:
+        if stamp.own:
             own = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in row]) for row in stamp.own])
             columns = (stamp.from_speed, stamp.from_voltage)
             inputs = jnp.stack([jnp.stack([jnp.asarray(c, x.dtype) for c in column]) for column in columns])
@@ -95,18 +96,19 @@ class LoadRows(NamedTuple):
 def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | None:
     """Rows of the transmitted torques, or None where no friction depends on them.
 
-        load = (motor - rest) / 2,   rest = inertia p.ddq - motor
+        load = (1 - s) motor - s rest,   rest = inertia p.ddq - motor
 
     The inertia that is entered at the port lies between both sides. It accelerates by all torques but dry
     friction, which is what the load determines. With `motor = a + f` and `inertia p.ddq = b + g`, where a and
-    b are linear and f and g are those of forces and memories, the load is `a - b / 2 + f - g / 2`.
+    b are linear and f and g are those of forces and memories, the load is `a - s b + f - s g`; the share s of
+    the rest is a half, unless the friction says otherwise.
 
     Args:
         mechanism: With (traced) parameter values.
         gates: One factor per effect.
     """
     layout = Layout.of(mechanism.structure)
-    ports = {e.at for _, e in effects_of(mechanism, DryFriction) if e.loaded}
+    ports = {e.at: e.rest_share for _, e in effects_of(mechanism, DryFriction) if e.loaded}
     if not ports:
         return None
     eq = equations(mechanism, gates)
@@ -134,9 +136,10 @@ def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | Non
                 for row, torque in zip(own.get(i, ()), stamp.torque, strict=True):
                     now = now + gates[i] * torque * x[row]
         motor = motor_torque(mechanism, port, x, v, gates)
-        linear = (motor - (inertia * acceleration[: m + 1] - now)) / 2
+        share = ports[port]
+        linear = (1 - share) * motor - share * (inertia * acceleration[: m + 1] - now)
         one = jnp.ones(1, gates.dtype)
-        rows.append(jnp.concatenate([linear, -inertia * acceleration[m + 1 :] / 2, one]))
+        rows.append(jnp.concatenate([linear, -share * inertia * acceleration[m + 1 :], one]))
     found = jnp.stack(rows)
     return LoadRows(found[:, :m], found[:, m], found[:, m + 1 : -1], found[:, -1])
 
@@ -197,10 +200,11 @@ def motor_beyond_linear(
     mechanism: Mechanism,
     at: str,
     x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Torque [N m] of motors at a port beyond `motor_torque`: limits, dead bands, a weak supply."""
+    """Torque [N m] of motors at a port beyond `motor_torque`: limits, dead bands, a weak supply, I gains."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = jnp.zeros(x.shape[1:], x.dtype)
@@ -208,7 +212,30 @@ def motor_beyond_linear(
         if isinstance(e, Linear) and e.motor and e.at == at:
             k = layout.torque_ports.index(at)
             total = total + gates[i] * _force(e, position[k], speed[k], v)
+    for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
+        if isinstance(e, Linear) and e.motor and e.at == at:
+            k = layout.torque_ports.index(at)
+            total = total + gates[i] * _force(e, z[m], position[k], speed[k], v)
     return total
+
+
+def motor_duty(
+    mechanism: Mechanism,
+    at: str,
+    x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
+    v: Float[Array, "*S"],
+) -> Float[Array, "*S"]:
+    """Duty of the servo at a port."""
+    layout = Layout.of(mechanism.structure)
+    position, speed = (motion[layout.torque_ports.index(at)] for motion in port_motion(layout, x))
+    given: Callable[..., Any] = lambda e, *signals: e.duty(*signals)  # noqa: E731
+    memories = {i: z[m] for m, (i, _) in enumerate(effects_of(mechanism, Memory))}
+    for i, e in effects_of(mechanism, Linear):
+        if e.at == at and e.has_duty:
+            integral = (memories[i],) if i in memories else ()
+            return evaluate_effect(e, given, position, speed, v, *integral)
+    return jnp.zeros_like(v)
 
 
 def _force(e: Force | Memory, *signals: Float[Array, "*S"]) -> Float[Array, "*S"]:
@@ -227,10 +254,10 @@ def motor_correction(
     """Torque [N m] of the motors at a port beyond their linear part: less for a limit or for heat."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
-    total = motor_beyond_linear(mechanism, at, x, v, gates)
+    total = motor_beyond_linear(mechanism, at, x, z, v, gates)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         if e.driven_by == "motor" and e.at == at:
-            k, drive = layout.torque_ports.index(at), memory_drive(mechanism, e, x, v, gates)
+            k, drive = layout.torque_ports.index(at), memory_drive(mechanism, e, x, z, v, gates)
             total = total + gates[i] * _force(e, z[m], position[k], speed[k], drive)
     return total
 
@@ -239,13 +266,22 @@ def memory_drive(
     mechanism: Mechanism,
     e: Memory,
     x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Last argument of `flow` and `force` of a memory: the voltage, or the torque of the motors [N m]."""
+    """Last argument of `flow` and `force` of a memory, as its `driven_by` says."""
     if e.driven_by == "voltage":
         return v
-    return motor_torque(mechanism, e.at, x, v, gates) + motor_beyond_linear(mechanism, e.at, x, v, gates)
+    if e.driven_by == "duty":
+        return motor_duty(mechanism, e.at, x, z, v)
+    if e.driven_by == "motor":
+        linear = motor_torque(mechanism, e.at, x, v, gates)
+        return linear + motor_beyond_linear(mechanism, e.at, x, z, v, gates)
+    # What the motor gives after all that it loses, by heat too, is what its current makes.
+    given = motor_torque(mechanism, e.at, x, v, gates) + motor_correction(mechanism, e.at, x, z, v, gates)
+    motor = next(m for m in mechanism.linear_effects(e.at) if m.has_current)
+    return evaluate_effect(motor, lambda motor, given: given / motor.torque_per_current, given)
 
 
 def has_smooth_torques(mechanism: Mechanism) -> bool:
@@ -281,7 +317,7 @@ def torques(
         total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], v)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = memory_drive(mechanism, e, x, v, gates)
+        drive = memory_drive(mechanism, e, x, z, v, gates)
         total[k] = total[k] + gate[i] * _force(e, memory[m], position[k], speed[k], drive)
     return jnp.stack(total)
 
@@ -292,14 +328,19 @@ def memory_rates(
     z: Float[Array, "z *S"],
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
+    others: Float[Array, "z *S"] | None = None,
 ) -> Float[Array, "z *S"]:
-    """Time derivatives of the memories; arguments as for `torques`."""
+    """Time derivatives of the memories; arguments as for `torques`.
+
+    `others` are the memories as the motor has them, which drive further ones; `z` if None.
+    """
+    others = z if others is None else others
     layout = Layout.of(mechanism.structure)
     position, speed = map(jnp.unstack, port_motion(layout, x))
     memory, rates, flow = jnp.unstack(z), [], lambda e, *signals: e.flow(*signals)
     for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = memory_drive(mechanism, e, x, v, gates)
+        drive = memory_drive(mechanism, e, x, others, v, gates)
         rates.append(jnp.asarray(evaluate_effect(e, flow, memory[m], position[k], speed[k], drive)))
     return jnp.stack(rates)
 
@@ -315,8 +356,8 @@ def advance_memories(
     """Memories after `h` [s], motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
     if not z.shape[0]:
         return z
-    flow = lambda s: memory_rates(mechanism, x, s, v, gates)  # noqa: E731
-    # Each flow depends on its own state only, so one direction gives all derivatives.
+    flow = lambda s: memory_rates(mechanism, x, s, v, gates, z)  # noqa: E731
+    # Each flow depends on its own state only, what drives it held, so one direction gives all derivatives.
     rate, slope = jax.jvp(flow, (z,), (jnp.ones_like(z),))
     h = expand_axes(h[None], z)
     a = slope * h
