@@ -133,7 +133,7 @@ def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | Non
             if e.motor:
                 given = stamp.drive * v - stamp.damping * speed - stamp.stiffness * position
                 now = now + gates[i] * given
-                for row, torque in zip(own.get(i, ()), stamp.torque, strict=True):
+                for row, torque in zip(own[i] if stamp.own else (), stamp.torque, strict=True):
                     now = now + gates[i] * torque * x[row]
         motor = motor_torque(mechanism, port, x, v, gates)
         share = ports[port]
