@@ -232,6 +232,21 @@ def test_a_servo_log_with_a_gap_is_refused(tmp_path: Path) -> None:
         load_bam_xl330(tmp_path / "run.json")
 
 
+def test_a_released_arm_swings_about_its_lowest_point(measured: Measured) -> None:
+    """Four logs have a stretch without torque; under torque the servo would not let it swing."""
+    measured("bam_xl330")
+    runs = [load_bam_xl330_released(path) for path in rf.data.fetch("bam_xl330")]
+    released = [r for r in runs if r is not None]
+    assert len(runs) == 12 and len(released) == 4
+    for r in released:
+        angle = r.y[:, 0]
+        assert r.N * r.Ts == pytest.approx(4.0, abs=0.02) and abs(angle[-1]) < 0.06
+        turns = np.flatnonzero(np.diff(np.sign(angle - angle[-1])))
+        half = np.pi * np.sqrt(0.0069 / (0.49 * 9.81 * 0.1))  # of a small swing [s]
+        assert len(turns) >= 4 and np.median(np.diff(turns[:4])) * r.Ts == pytest.approx(half, rel=0.15)
+        assert r.constants["hub.position_servo.enabled"] == 0.0
+
+
 def test_the_servo_follows_better_with_more_gain(measured: Measured) -> None:
     runs = measured("bam_xl330")
     assert len(runs) == 12

@@ -36,6 +36,7 @@ def test_every_effect_comes_back_as_it_was(name, tmp_path):
     numbers = {n: s.lower + 1 / 3 if np.isfinite(s.lower) else -1 / 3 for n, s in cls.declared().items()}
     effect = cls(at=place(cls), **numbers)
     others = [e for e in paper().effects if (e.name, e.at) != (name, effect.at)]
+    others += [CATALOG["position_servo"]("hub")] if "servo" in cls.needs() else []
     mechanism = dataclasses.replace(paper(), effects=(*others, effect), trusted=())
     model = Model(mechanism)
     back = reloaded(model, tmp_path)
