@@ -102,7 +102,7 @@ class Motor(Linear):
 
     def stamp(self) -> Stamp:
         """Entries of the equations of motion."""
-        gain = self.torque_per_current
+        gain = self.efficiency * self.torque_constant * self.gear_ratio
         emf = self.back_emf * self.gear_ratio
         if self.inductance is None:
             return Stamp(drive=gain / self.resistance, damping=gain * emf / self.resistance)
