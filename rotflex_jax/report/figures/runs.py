@@ -95,7 +95,9 @@ def _overlay_caption(discovery: SearchResult) -> str:
 def _overlay_view(discovery: SearchResult) -> LineView:
     """The whole held-out recording to pan and zoom."""
     s = shown(discovery)
-    runs = [(s.baseline, BASELINE, "baseline", BASELINE_DASH)]
+    runs: list[tuple[np.ndarray, str, str, tuple[float, ...]]] = [
+        (s.baseline, BASELINE, "baseline", BASELINE_DASH)
+    ]
     if s.final is not None:
         runs.append((s.final, FINAL, "final model", ()))
     panels = list[Panel]()
