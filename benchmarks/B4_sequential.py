@@ -1,6 +1,6 @@
 """Seconds on the rig until it is decided: experiments that stop by themselves beside standard inputs.
 
-    python benchmarks/B4_sequential.py --seeds 2000 2001 2002
+    python benchmarks/B4_sequential.py --seeds 2000 2001 2002 2003 2004 --hopeless 2002 2003 --workers 16
 
 A machine of the independent simulator hides one effect; an ordinary recording of 6 s at about 1 V rms hardly
 says which of two or three it is. Each rival is fitted to that recording, and all start equally probable. Then
@@ -11,7 +11,8 @@ sequence, sweep, steps, noise) the setting and level that the fitted models expe
 the one that turned out fastest. They are evaluated at fewer moments, and the earliest possible one counts.
 Last, cases that no input within the limits can tell: does the loop say so.
 
-Writes results/B4_sequential.json and results/B4_sequential.md; rows that are there are kept.
+Writes results/B4_sequential.json and .md after each case; rows that are there are kept, so that a run that
+was stopped goes on. Processes share compiled programs where ROTFLEX_PROGRAMS names a folder.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+import B0_discovery as B0
 import rotflex_jax as rf
 from rotflex_jax.arena.marking import renamed
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
@@ -231,6 +233,12 @@ def trial(name: str, seed: int, say, hopeless: bool = False, alone: bool = False
     return row
 
 
+def one(job: dict) -> dict:
+    """A case in a process of its own."""
+    say = lambda text: print(text, flush=True)  # noqa: E731
+    return trial(job["case"], job["seed"], say, job["hopeless"], job["alone"])
+
+
 def fastest(row: dict) -> dict:
     """The standard input that decided rightly first; the whole time where none did."""
     good = [s for s in row["standard"] if s["decided"] and s["best"] == row["truth"]]
@@ -292,26 +300,38 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[2000, 2001, 2002])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[2000, 2001, 2002])
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument(
         "--hopeless", type=int, nargs="*", default=[], help="seeds of cases that nothing can tell"
     )
     parser.add_argument("--alone", action="store_true", help="leave the standard inputs out")
-    parser.add_argument("--minutes", type=float, default=1e9, help="begin no case after so long")
+    parser.add_argument("--fresh", action="store_true", help="play again what the results have already")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     given = parser.parse_args()
-    began, file = time.monotonic(), given.out / "B4_sequential.json"
-    rows = json.loads(file.read_text())["rows"] if file.exists() else []
+    file = given.out / "B4_sequential.json"
+    rows = json.loads(file.read_text())["rows"] if file.exists() and not given.fresh else []
     have = {(r["case"], r["seed"], r["hopeless"]) for r in rows}
-    todo = [(n, s, True) for s in given.hopeless for n in HOPELESS]
-    todo += [(n, s, False) for s in given.seeds for n in given.cases]
-    for name, seed, hopeless in todo:
-        if (name, seed, hopeless) in have or time.monotonic() - began > 60 * given.minutes:
+    todo: list[B0.Job] = [
+        {"case": name, "seed": seed, "hopeless": lost, "alone": given.alone}
+        for lost, seeds, names in ((False, given.seeds, given.cases), (True, given.hopeless, HOPELESS))
+        for seed in seeds
+        for name in names
+        if (name, seed, lost) not in have
+    ]
+    # Those of three models take longest and begin first.
+    todo.sort(key=lambda job: -len((HOPELESS if job["hopeless"] else CASES)[job["case"]][2]))
+    print(f"{len(todo)} cases to play", flush=True)
+    for job, row in B0.rows(todo, given.workers, one):
+        name = f"{job['case']} {job['seed']}"
+        if "error" in row:  # is tried again next time
+            print(f"{name}: {row['error']}", flush=True)
             continue
-        rows.append(trial(name, seed, lambda s: print(s, flush=True), hopeless, given.alone))
-        given.out.mkdir(exist_ok=True, parents=True)
-        write_file(file, json.dumps({"schema": 1, "rows": rows}, indent=1) + "\n")
+        print(f"{name}: {row['verdict']} after {row['seconds']:g} s ({row['elapsed_s']:.0f} s)", flush=True)
+        rows.append(row)
+        rows.sort(key=lambda r: (r["hopeless"], r["seed"], [*CASES].index(r["case"])))
+        B0.save(file, {"schema": 1, "made": B0.provenance(), "rows": rows})
         write_file(file.with_suffix(".md"), summary(rows))
     print(summary(rows))
 

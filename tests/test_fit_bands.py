@@ -135,8 +135,8 @@ def test_bands_of_several_models_are_those_of_the_mixture():
 def test_bands_hold_what_another_run_of_the_arena_measures():
     """Friction as it is, fitted to the first half; nine of ten samples of the other half lie in the bands.
 
-    That half begins in motion, where a friction with memory is not at rest: a run that takes it to be is off by
-    more than the noise until its end, and a band that allows for that holds everything.
+    That half begins in motion, where a friction with memory is not at rest: a run that takes it to be is off
+    by more than the noise until its end, and a band that allows for that holds everything.
     """
     inside = {"theta": [], "alpha": []}
     for seed, effect in ((100, rf.effects.Coulomb("hub")), (100, rf.effects.BoucWen("hub"))):

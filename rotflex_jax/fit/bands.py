@@ -165,15 +165,15 @@ def prediction_bands(
 
         y_k - y_hat_k ~ N(0, v_k),   v_k = sum of the parts,   band: y_hat_k -+ quantile(level) sqrt(v_k)
 
-    The run starts from the first `n_init` samples, like every free run; memories that no sensor shows, such as
-    that of a friction, are estimated from them too where the recording does not start at rest. The variance of
-    a sample adds up parameters (by the covariance of the fit, with the first state that follows them), the
-    first state (by the noise of the samples that it is estimated on), parameters that each recording has for
-    itself (by their spread), process torques (by the linear part of the machine), the noise of the sensors, and
-    what the model lacks. That is a constant for each channel, so large that bands over `known` recordings hold
-    the share `level` of their samples; without any as large as the residuals of the fit beyond the sensor's
-    noise, and nothing where these are of predictions, which do not show what a free run misses. Of several
-    models with weights the band is that of the mixture.
+    The run starts from the first `n_init` samples, like every free run; memories that no sensor shows, such
+    as that of a friction, are estimated from them too where the recording does not start at rest. The
+    variance of a sample adds up parameters (by the covariance of the fit, with the first state that follows
+    them), the first state (by the noise of the samples that it is estimated on), parameters that each
+    recording has for itself (by their spread), process torques (by the linear part of the machine), the
+    noise of the sensors, and what the model lacks. That is a constant for each channel, so large that bands
+    over `known` recordings hold the share `level` of their samples; without any as large as the residuals of
+    the fit beyond the sensor's noise, and nothing where these are of predictions, which do not show what a
+    free run misses. Of several models with weights the band is that of the mixture.
 
     Everything is propagated to first order: not for a run in which a small change of a parameter decides
     between two motions.
