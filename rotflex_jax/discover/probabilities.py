@@ -45,8 +45,8 @@ class EvidenceRule(NamedTuple):
 
     Attributes:
         temperature: Nats of predictions that are worth one: innovations are alike from sample to sample. It
-            takes as many times more as what remains is beyond what the verdict allows: predictions then follow
-            the data within a few samples, whatever the model.
+            is larger by as much as what remains exceeds what the verdict allows: predictions then follow the
+            data within a few samples, whatever the model.
         run_nats: What half a second says whose error in free run is larger by a factor e [nat].
         prior_nats: How much likelier than its presence the absence of an effect is beforehand [nat].
         passed_nats: How much likelier the set that has passed all tests of the search is beforehand than one
