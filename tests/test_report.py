@@ -249,6 +249,7 @@ def undrawn(monkeypatch) -> None:
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
     torques = LatentTorqueComparison(photographed(), None)
     monkeypatch.setattr(Discovery, "latent_torque", lambda self, progress: torques)
+    monkeypatch.setattr(Discovery, "identifiability", lambda self: None)
 
 
 @pytest.fixture(scope="module")
@@ -456,6 +457,22 @@ def test_the_missing_torque_is_shown_and_what_was_learned(discovery, page, monke
     without = read(render(discovery, Explanation(latent, map_of_friction(discovery, False)))).text
     assert "does not make held-out data likelier" in without
     assert "The missing torque" not in read(page).text
+
+
+def test_the_report_says_what_can_be_known(discovery, monkeypatch) -> None:
+    """Of the final model, on the recording that was fitted: what a call of `identifiable` says."""
+    monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
+    open_scale = paper().release("arm.inertia.inertia")
+    last = dataclasses.replace(discovery.rounds[-1].stage, model=Model(open_scale))
+    found = dataclasses.replace(
+        discovery, rounds=(*discovery.rounds[:-1], dataclasses.replace(discovery.rounds[-1], stage=last))
+    )
+    known = found.identifiability()
+    assert known is not None and not known.structural and known.badly_known is not None
+    text = read(render(found, Explanation(known=known))).text
+    assert "What can be known" in text
+    assert "only their ratios are known, one common factor is open" in text
+    assert "What can be known" not in read(render(found)).text
 
 
 def test_a_map_is_learned_only_where_something_is_unexplained(

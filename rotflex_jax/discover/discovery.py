@@ -8,6 +8,7 @@ from typing import Any
 from rotflex_jax import checks
 from rotflex_jax.discover.conclusion import proposed
 from rotflex_jax.discover.explanation import (
+    SHOWN_SECONDS,
     Explanation,
     LatentTorqueComparison,
     compare_latent_torques,
@@ -28,6 +29,7 @@ from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
+from rotflex_jax.fit.identifiable import Identifiability, identifiable
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.model_json import Saved, save
 from rotflex_jax.text.markup import as_json, bullets, card, folded, paragraph, picture, table, write_files
@@ -65,6 +67,19 @@ class Discovery(SearchResult):
         model = Model(m, self.model.solver)
         return learn_torque(model, self.train, self.validation, at, window_seconds=seconds, progress=progress)
 
+    def identifiability(self) -> Identifiability | None:
+        """What sensors and the longest fitted recording determine of the final model, at its parameters.
+
+        The noise of the sensors counts alone, which is the best case. None where nothing is free, or where
+        runs of other parameters diverge.
+        """
+        longest = max(self.train, key=lambda r: r.N)
+        shown = longest.slice(0, min(longest.N, round(SHOWN_SECONDS / longest.Ts)))
+        try:
+            return identifiable(self.model, shown) if self.model.mechanism.free_names else None
+        except InputError:
+            return None
+
     def explanation(
         self, learned: bool | None = None, progress: Callable[[str], None] | None = None
     ) -> Explanation:
@@ -85,7 +100,9 @@ class Discovery(SearchResult):
             except InputError:  # no sensor tells how that port moves
                 torque = None
         say("report: tests of the residuals and frequency responses")
-        return Explanation(latent, torque, remaining_failures(self), model_tests(self))
+        tests = model_tests(self)
+        say("report: what the recording determines")
+        return Explanation(latent, torque, remaining_failures(self), tests, self.identifiability())
 
     def save(self, path: str | Path) -> Path:
         """Write the final model as JSON, with its estimates; `Model.load` reads the model."""
