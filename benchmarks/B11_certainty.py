@@ -6,9 +6,9 @@
 Intervals: short records with one hidden friction or play at three sizes, fitted with the true structure; how
 often the 95 % interval of a profile holds the true number, beside Wald's. Bands: a run that nobody fitted, of
 the same machine; how many of its samples lie in the 90 % band of the true structure, and of the textbook's
-model that lacks the effect. Cost: processor seconds of profiles, identifiability, bands and probabilities on a
-record of 20 s. Nothing is recomputed that is in the results already; processes share compiled programs where
-ROTFLEX_PROGRAMS names a folder.
+model that lacks the effect. Cost: processor seconds of profiles, identifiability, bands and probabilities on
+a record of 20 s. Nothing is recomputed that is in the results already; processes share compiled programs
+where ROTFLEX_PROGRAMS names a folder.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import scipy
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.discover import Discovery
+from rotflex_jax.discover.probabilities import Probabilities, SetProbability
 from rotflex_jax.effects import Inertia, Motor
 from rotflex_jax.fit import Fit
 from rotflex_jax.fit.result import FitOptions
@@ -130,6 +133,25 @@ def test_bands_of_several_models_are_those_of_the_mixture():
         np.testing.assert_allclose(inside, probability, atol=1e-6)
     same = rf.prediction_bands([(one, 1.0), (one, 5.0)], rec)
     np.testing.assert_allclose(same.upper, alone[0].upper, rtol=1e-9)
+
+
+def test_bands_of_a_search_are_those_of_its_probable_sets():
+    """Each set fitted to the training recording, with its probability; an improbable one is left out."""
+    train, rec = recording(1), recording(9)
+    shares = {frozenset(): 0.7, frozenset({"viscous@hub"}): 0.2, frozenset({"coulomb@hub"}): 0.01}
+    found = Probabilities(tuple(SetProbability(s, p) for s, p in shares.items()), {}, 0.09)
+    model = rf.Model(axis())
+    search = SimpleNamespace(
+        probabilities=found, train=(train,), baseline=SimpleNamespace(model=model), model=model
+    )
+    bands = Discovery.prediction_bands(search, rec, 0.8)
+    damped = rf.fit(axis() + rf.effects.Viscous("hub"), train)
+    expected = rf.prediction_bands([(fitted(), 0.7), (damped, 0.2)], rec, 0.8)
+    np.testing.assert_allclose(bands.upper, expected.upper, rtol=1e-6)
+    np.testing.assert_allclose(bands.middle, expected.middle, rtol=1e-6)
+    search.probabilities = None
+    alone = Discovery.prediction_bands(search, rec, 0.8)
+    np.testing.assert_allclose(alone.upper, rf.prediction_bands(fitted(), rec, 0.8).upper, rtol=1e-6)
 
 
 def test_bands_hold_what_another_run_of_the_arena_measures():

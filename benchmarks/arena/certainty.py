@@ -1,4 +1,4 @@
-"""How often intervals hold the true number and bands the measured samples, on one record of the arena; the cost.
+"""How often intervals hold the true number and bands the measured samples, on one record of the arena.
 
 Imports JAX, so workers import it.
 """

@@ -1,7 +1,7 @@
 """The result of `discover`: what was found, and what can be done with it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,13 @@ from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
+from rotflex_jax.experiment.until_decided import models_of
+from rotflex_jax.fit.bands import Bands, prediction_bands
+from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.identifiable import Identifiability, identifiable
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.model_json import Saved, save
+from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import as_json, bullets, card, folded, paragraph, picture, table, write_files
 from rotflex_jax.text.numbers import equation, plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import staircase
@@ -108,6 +112,35 @@ class Discovery(SearchResult):
         """Write the final model as JSON, with its estimates; `Model.load` reads the model."""
         seen = self.train[0]
         return save(Saved(self.model, self.final.estimates, Ts=seen.Ts, n_init=seen.n_init), path)
+
+    def prediction_bands(
+        self,
+        recording: Recording,
+        level: float = 0.9,
+        *,
+        known: Recording | Sequence[Recording] = (),
+        progress: Callable[[str], None] | None = None,
+    ) -> Bands:
+        """Bands of a free run over the probable sets of effects, each fitted to the training recordings.
+
+        Sets weigh as much as they are probable; that the right one is none of them is not in the bands,
+        unless recordings are `known`. Of a search without probabilities the final model counts alone.
+
+        Args:
+            recording: Its input and first samples are used, its other samples only by `coverage`.
+            level: Probability, between 0 and 1.
+            known: Recordings by which the error of models is measured, see `rotflex_jax.prediction_bands`.
+            progress: Called with a line of text at each fit.
+
+        Raises:
+            InputError: As `rotflex_jax.prediction_bands`.
+        """
+        say = checks.progress(progress)
+        fits, share = (
+            models_of(self, say) if self.probabilities else ({"": fit(self.model, self.train)}, None)
+        )
+        weighted = [(fitted, share[name] if share else 1.0) for name, fitted in fits.items()]
+        return prediction_bands(weighted, recording, level, known=known)
 
     def next_experiment(self, **changes: Any) -> Experiment | None:
         """Design the input that distinguishes the first effect found from its equal; None where it has none.
