@@ -14,7 +14,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.text.colours import FINAL, MEASURED, stage_colours
 from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.plotting import blank, styled, thinned
-from rotflex_jax.text.zoom import Line, LineView, Panel
+from rotflex_jax.text.zoom import Line, LinePanel, LineView
 
 # A model that runs away must not hide what was measured: scales go no further than so many spans of it.
 MOST_SPANS, MOST_ERROR_SPANS = 2.0, 3.0
@@ -86,7 +86,7 @@ def _limits(measured: Float[np.ndarray, " N"]) -> tuple[tuple[float, float], tup
 
 def run_panels(
     label: str, below: str, measured: Float[np.ndarray, " N"], runs: Sequence[Line], band: float = 0.0
-) -> tuple[Panel, Panel]:
+) -> tuple[LinePanel, LinePanel]:
     """Measured and simulated values of one channel to zoom, and the differences under them.
 
     Args:
@@ -99,8 +99,8 @@ def run_panels(
     errors = tuple(dataclasses.replace(r, values=measured - r.values, width=1.0) for r in runs)
     limits, error_limits = _limits(measured)
     return (
-        Panel(label, (Line("measured", MEASURED, measured, 2.8), *runs), 190, limits=limits),
-        Panel(below, errors, 120, band, error_limits),
+        LinePanel(label, (Line("measured", MEASURED, measured, 2.8), *runs), 190, limits=limits),
+        LinePanel(below, errors, 120, band, error_limits),
     )
 
 
@@ -108,7 +108,7 @@ def run_view(
     recording: Recording, channels: Sequence[str], runs: Sequence[tuple[str, Float[np.ndarray, "N C"]]]
 ) -> LineView:
     """The same as `run_figure` to pan and zoom."""
-    panels = list[Panel]()
+    panels = list[LinePanel]()
     for c, channel in enumerate(channels):
         scale, read = readable(1.0, recording.units[recording.channels.index(channel)])
         lines = [

@@ -36,7 +36,7 @@ class Line:
 
 
 @dataclasses.dataclass(frozen=True)
-class Panel:
+class LinePanel:
     """Lines with one scale.
 
     Attributes:
@@ -83,7 +83,7 @@ class LineView:
 
     start: float
     Ts: float
-    panels: tuple[Panel, ...]
+    panels: tuple[LinePanel, ...]
     stretches: tuple[Stretch, ...] = ()
     marks: tuple[float, ...] = ()
 

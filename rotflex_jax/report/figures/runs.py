@@ -30,7 +30,7 @@ from rotflex_jax.text.colours import (
 )
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, thinned
-from rotflex_jax.text.zoom import Line, LineView, Panel, Stretch
+from rotflex_jax.text.zoom import Line, LinePanel, LineView, Stretch
 
 # Longer recordings are shown in part [s]; the errors are those of the whole.
 OVERLAY_SECONDS = 30.0
@@ -100,7 +100,7 @@ def _overlay_view(discovery: SearchResult) -> LineView:
     ]
     if s.final is not None:
         runs.append((s.final, FINAL, "final model", ()))
-    panels = list[Panel]()
+    panels = list[LinePanel]()
     for c, (channel, unit) in enumerate(channel_units(discovery).items()):
         scale, read = readable(1.0, unit)
         panels += run_panels(
