@@ -126,7 +126,7 @@ class LineView:
                 }
                 for panel in self.panels
             ],
-            "spots": [{"label": s.label, "from": s.start, "to": s.end} for s in self.stretches],
+            "stretches": [{"label": s.label, "from": s.start, "to": s.end} for s in self.stretches],
             "marks": list(self.marks),
             "note": note,
         }

@@ -2,7 +2,7 @@
    where no script runs. Loaded after uPlot, which draws axes, lines and legends. */
 (() => {
   "use strict";
-  const INK = "#1f2933", MUTED = "#66727f", GRID = "#dde3e8", BAND = "#d5dbe1", SPOT = "#f3efe2", BLANK = "#eceff2";
+  const INK = "#1f2933", MUTED = "#66727f", GRID = "#dde3e8", BAND = "#d5dbe1", STRETCH = "#f3efe2", BLANK = "#eceff2";
   const FONT = "12px system-ui, sans-serif";
   const STEP = 0.2, FACTOR = 1.6, FINGER_MARGIN = 24;
 
@@ -126,7 +126,7 @@
     });
   };
 
-  const bar = (figure, box, visible, spots) => {
+  const bar = (figure, box, visible, stretches) => {
     const tools = element("div", "tools");
     const button = (text, says, action) => {
       const made = element("button", "", text);
@@ -138,7 +138,7 @@
       return made;
     };
     button("All", "Show all (key 0)", () => visible.all());
-    for (const spot of spots) button(spot.label, spot.label, () => visible.set([[spot.from, spot.to]]));
+    for (const stretch of stretches) button(stretch.label, stretch.label, () => visible.set([[stretch.from, stretch.to]]));
     button("−", "Show more (key −)", () => visible.zoom(1 / FACTOR));
     button("+", "Show less, larger (key +)", () => visible.zoom(FACTOR));
     const still = button("Still picture", "Show the still picture, as in print", () => {
@@ -187,7 +187,7 @@
   const lines = (figure, box, data, id) => {
     const count = data.x.count, x = Array.from({ length: count }, (_, k) => data.x.start + k * data.x.step);
     const visible = new Visible([[x[0], x[count - 1]]], [Math.min(8 * data.x.step, x[count - 1] - x[0])]);
-    bar(figure, box, visible, data.spots);
+    bar(figure, box, visible, data.stretches);
     const plots = data.panels.map((panel, index) => {
       const last = index === data.panels.length - 1;
       const values = panel.lines.map((line) =>
@@ -203,10 +203,10 @@
         ctx.beginPath();
         ctx.rect(left, top, width, height);
         ctx.clip();
-        ctx.fillStyle = SPOT;
-        for (const spot of data.spots) {
-          const from = u.valToPos(spot.from, "x", true);
-          ctx.fillRect(from, top, u.valToPos(spot.to, "x", true) - from, height);
+        ctx.fillStyle = STRETCH;
+        for (const stretch of data.stretches) {
+          const from = u.valToPos(stretch.from, "x", true);
+          ctx.fillRect(from, top, u.valToPos(stretch.to, "x", true) - from, height);
         }
         if (panel.band) {
           const high = u.valToPos(panel.band, "y", true);
