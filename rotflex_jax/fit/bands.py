@@ -373,8 +373,8 @@ def _first_state(
         return (float(e @ e + c @ c) if finite else np.inf), e, S
 
     best, least = np.zeros(moving + unseen.shape[1]), np.inf
-    main = np.eye(len(best))[-1]  # the largest spread is the last
-    for x in (0.0 * main, main, -main):
+    axes = np.eye(len(best))[moving:]
+    for x in (0.0 * best, *axes, *-axes):  # a play may rest on either side
         cost, e, S = evaluated(x)
         for _ in range(FIRST_STATE_STEPS):
             if not np.isfinite(cost):
