@@ -271,7 +271,8 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
     def run(state: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
         """Outputs; slopes by parameters, positions, speeds, and by shares of what no sensor shows."""
         y_hat, J = _slopes(model, m, recording, state[None], free)
-        return y_hat, np.concatenate([J[..., : F + moving], J[..., F + moving :] @ unseen], axis=-1)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a run that diverges, which is refused below
+            return y_hat, np.concatenate([J[..., : F + moving], J[..., F + moving :] @ unseen], axis=-1)
 
     if unseen.size:
         start = _first_state(run, start, unseen, y, noise, recording.n_init, F)
