@@ -131,11 +131,14 @@ def data_address(figure: Figure) -> str:
     buffer = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    svg = _COORDINATES.sub(lambda found: _LONG_NUMBER.sub(_rounded, found[0]), buffer.getvalue())
+    svg = _UNUSED.sub("", buffer.getvalue())
+    svg = _COORDINATES.sub(lambda found: _LONG_NUMBER.sub(_rounded, found[0]), svg)
     # A third less than in base 64, and a page is to stay small enough to be sent.
     return "data:image/svg+xml;charset=utf-8," + quote(" ".join(svg.split()), safe=_KEPT)
 
 
+# What no browser reads: a document type, and metadata with addresses of vocabularies.
+_UNUSED = re.compile(r"<!DOCTYPE[^>]*>|<metadata>.*?</metadata>", re.DOTALL)
 # Coordinates [1/72 inch] are written to a hundredth, which nobody can see.
 _COORDINATES, _LONG_NUMBER = re.compile(r' (?:d|x|y)="[^"]*"'), re.compile(r"-?\d+\.\d{3,}")
 _KEPT = " =:/,;()!$*@?[]{}|^`~+"
