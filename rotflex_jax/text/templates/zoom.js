@@ -1,8 +1,9 @@
-/* Figures to pan and zoom. A figure holds its data as JSON beside its still picture, which stays for print and
-   where no script runs. Loaded after uPlot, which draws axes, lines and legends. */
+/* Figures to pan and zoom. A figure holds its data as JSON beside its still picture, which stays for print
+   and where no script runs. Loaded after uPlot, which draws axes, lines and legends. */
 (() => {
   "use strict";
-  const INK = "#1f2933", MUTED = "#66727f", GRID = "#dde3e8", BAND = "#d5dbe1", STRETCH = "#f3efe2", BLANK = "#eceff2";
+  const INK = "#1f2933", MUTED = "#66727f", GRID = "#dde3e8";
+  const BAND = "#d5dbe1", STRETCH = "#f3efe2", BLANK = "#eceff2";
   const FONT = "12px system-ui, sans-serif";
   const STEP = 0.2, FACTOR = 1.6, FINGER_MARGIN = 24;
 
@@ -69,7 +70,8 @@
     over.addEventListener("wheel", (e) => {
       if (e.ctrlKey || e.metaKey) {
         e.preventDefault();
-        visible.zoom(Math.exp(-0.01 * Math.max(-60, Math.min(60, e.deltaY))), both(place(e.clientX, e.clientY)));
+        const turned = Math.max(-60, Math.min(60, e.deltaY));
+        visible.zoom(Math.exp(-0.01 * turned), both(place(e.clientX, e.clientY)));
       } else if (Math.abs(e.deltaX) > Math.abs(e.deltaY)) {
         e.preventDefault();
         visible.move(both([e.deltaX / over.clientWidth, 0]));
@@ -138,7 +140,9 @@
       return made;
     };
     button("All", "Show all (key 0)", () => visible.all());
-    for (const stretch of stretches) button(stretch.label, stretch.label, () => visible.set([[stretch.from, stretch.to]]));
+    for (const stretch of stretches) {
+      button(stretch.label, stretch.label, () => visible.set([[stretch.from, stretch.to]]));
+    }
     button("−", "Show more (key −)", () => visible.zoom(1 / FACTOR));
     button("+", "Show less, larger (key +)", () => visible.zoom(FACTOR));
     const still = button("Still picture", "Show the still picture, as in print", () => {
@@ -194,7 +198,8 @@
         Array.from(numbers(line.values), (v) => (Number.isFinite(v) ? v : null)));
       const range = (u, low, high) => {
         if (low == null) return [-1, 1];
-        const kept = panel.limits ? [Math.max(low, panel.limits[0]), Math.min(high, panel.limits[1])] : [low, high];
+        const [least, most] = panel.limits || [low, high];
+        const kept = [Math.max(low, least), Math.min(high, most)];
         return uPlot.rangeNum(kept[0], kept[1], 0.06, false);
       };
       const under = (u) => {
