@@ -6,7 +6,9 @@
 Intervals: short records with one hidden friction or play at three sizes, fitted with the true structure; how
 often the 95 % interval of a profile holds the true number, beside Wald's. Bands: a run that nobody fitted, of
 the same machine; how many of its samples lie in the 90 % band of the true structure, and of the textbook's
-model that lacks the effect. Nothing is recomputed that is in the results already.
+model that lacks the effect. Cost: processor seconds of profiles, identifiability, bands and probabilities on
+a record of 20 s. Nothing is recomputed that is in the results already; processes share compiled programs
+where ROTFLEX_PROGRAMS names a folder.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ BANDS = (
     ("voltage_offset", "input"),
 )
 SIZES = (1.0, 0.3, 0.1)
+PARTS = ("intervals", "bands", "cost")
 Job = dict[str, Any]
 
 
@@ -58,6 +61,11 @@ def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job
             for p in BANDS
             for kind in inputs
             for seed in seeds
+        ]
+    if "cost" in a.parts:
+        found += [
+            {"part": "cost", "effects": [list(p)], "kind": inputs[0], "seed": seeds[0], "size": 1.0}
+            for p in FRICTION
         ]
     return [{**j, "seconds": a.seconds} for j in found if not a.only or a.only in key({**j, "seconds": 0})]
 
@@ -104,7 +112,9 @@ def summary(rows: list[Job]) -> dict[str, Any]:
         for group, columns in bands.items()
     }
     means |= {"all": means.pop("all")} if "all" in means else {}
-    return {"intervals": intervals, "bands": means, "failed": len(rows) - len(good)}
+    spent = {name(r): r["processor_s"] for r in good if r["part"] == "cost"}
+    cost = {effect: {**parts, "all": sum(parts.values())} for effect, parts in spent.items()}
+    return {"intervals": intervals, "bands": means, "cost": cost, "failed": len(rows) - len(good)}
 
 
 def _intervals(found: list[Job]) -> dict[str, Any]:
@@ -139,6 +149,14 @@ def page(s: dict[str, Any], made: dict[str, Any]) -> str:
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     lines += ["", "Share of the samples [%] of a held-out run in bands of 90 %, mean over the records.", ""]
+    if s["cost"]:
+        names = list(next(iter(s["cost"].values())))
+        lines += [f"| hidden | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
+        lines += [
+            f"| {effect} | {' | '.join(f'{parts[n]:.1f}' for n in names)} |"
+            for effect, parts in s["cost"].items()
+        ]
+        lines += ["", "Processor time [s] after the fit of a record of 20 s, compiling included.", ""]
     clean = "clean" if made["clean"] else "with changes"
     versions = ", ".join(f"{n} {v}" for n, v in made["versions"].items())
     lines += [f"{s['failed']} rows failed. Commit {made['commit']} ({clean}), {made['date']}, {versions}."]
@@ -151,7 +169,7 @@ def main() -> int:
     parser.add_argument("--tuning", action="store_true", help="tuning seeds (report seeds if not)")
     parser.add_argument("--seeds", default="", help="as 1000,1001; all if omitted")
     parser.add_argument("--inputs", default="noise,multisine", help="kinds of input")
-    parser.add_argument("--parts", nargs="*", choices=("intervals", "bands"), default=["intervals", "bands"])
+    parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--only", default="", help="part of a name, as lugre@hub")
     parser.add_argument("--seconds", type=float, default=6.0, help="length of a run [s]")
     parser.add_argument("--workers", type=int, default=1, help="processes")
@@ -180,7 +198,8 @@ def main() -> int:
             B0.save(path, results)
             saved = now
         left = (now - began) / count * (len(todo) - count)
-        said = row.get("error") or row.get("coverage") or [i["held"] for i in row["intervals"]]
+        said = row.get("error") or row.get("coverage") or row.get("processor_s")
+        said = said or [i["held"] for i in row["intervals"]]
         console.print(f"{count}/{len(todo)} {key(job)} -> {said} ({left:.0f} s left)", markup=False)
     results["summary"] = summary(list(known.values()))
     B0.save(path, results)

@@ -1,6 +1,6 @@
 """Seconds on the rig until it is decided: experiments that stop by themselves beside standard inputs.
 
-    python benchmarks/B4_sequential.py --seeds 2000 2001 2002
+    python benchmarks/B4_sequential.py --seeds 2000 2001 2002 2003 2004 --hopeless 2002 2003 --workers 16
 
 A machine of the independent simulator hides one effect; an ordinary recording of 6 s at about 1 V rms hardly
 says which of two or three it is. Each rival is fitted to that recording, and all start equally probable. Then
@@ -11,7 +11,8 @@ sequence, sweep, steps, noise) the setting and level that the fitted models expe
 the one that turned out fastest. They are evaluated at fewer moments, and the earliest possible one counts.
 Last, cases that no input within the limits can tell: does the loop say so.
 
-Writes results/B4_sequential.json and results/B4_sequential.md; rows that are there are kept.
+Writes results/B4_sequential.json and .md after each case; rows that are there are kept, so that a run that
+was stopped goes on. Processes share compiled programs where ROTFLEX_PROGRAMS names a folder.
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
+import B0_discovery as B0
 import rotflex_jax as rf
 from rotflex_jax.arena.marking import renamed
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
@@ -231,6 +234,12 @@ def trial(name: str, seed: int, say, hopeless: bool = False, alone: bool = False
     return row
 
 
+def one(job: dict) -> dict:
+    """A case in a process of its own."""
+    say = lambda text: print(text, flush=True)  # noqa: E731
+    return trial(job["case"], job["seed"], say, job["hopeless"], job["alone"])
+
+
 def fastest(row: dict) -> dict:
     """The standard input that decided rightly first; the whole time where none did."""
     good = [s for s in row["standard"] if s["decided"] and s["best"] == row["truth"]]
@@ -238,10 +247,45 @@ def fastest(row: dict) -> dict:
     return min(good, key=lambda s: s["seconds"]) if good else least
 
 
-def summary(rows: list[dict]) -> str:
+def ratio(row: dict) -> float:
+    """Seconds of the best standard input over those of the loop, of a case that has to be decided.
+
+    Where the loop decided nothing, or wrongly, it counts as if it had needed the whole time.
+    """
+    good = row["verdict"] == "decided" and row["best"] == row["truth"]
+    return fastest(row)["seconds"] / (row["seconds"] if good else MOST)
+
+
+def totals(rows: list[dict]) -> dict:
+    """Counts and medians over all cases: those that can be decided, and those that cannot."""
+    told, lost = ([r for r in rows if r["hopeless"] == h] for h in (False, True))
+    decided = [r for r in told if r["verdict"] == "decided"]
+    played = [(s, r["truth"]) for r in told for s in r["standard"]]
+    sure = [s["best"] == truth for s, truth in played if s["decided"]]
+
+    def median(values: list[float]) -> float | None:
+        return float(np.median(values)) if values else None
+
+    return {
+        "cases": len(told),
+        "decided": len(decided),
+        "wrong": sum(r["best"] != r["truth"] for r in decided),
+        "standard": len(played),
+        "standard_decided": len(sure),
+        "standard_wrong": sum(not right for right in sure),
+        "ratio": median([ratio(r) for r in told]),
+        "seconds": median([r["seconds"] for r in told]),
+        "standard_seconds": median([fastest(r)["seconds"] for r in told]),
+        "hopeless": len(lost),
+        "hopeless_said": sum(r["verdict"] == "not distinguishable" for r in lost),
+        "hopeless_decided": sum(r["verdict"] == "decided" for r in lost),
+        "hopeless_seconds": median([r["seconds"] for r in lost]),
+    }
+
+
+def page(rows: list[dict]) -> str:
     """Markdown."""
-    told = [r for r in rows if not r["hopeless"]]
-    lost = [r for r in rows if r["hopeless"]]
+    t = totals(rows)
     lines = [
         "# Seconds on the rig until it is decided",
         "",
@@ -251,39 +295,27 @@ def summary(rows: list[dict]) -> str:
         "| case | seed | the loop | seconds | best standard input | seconds | ratio |",
         "|---|---|---|---|---|---|---|",
     ]
-    ratios, wrong, wrong_standard, played = [], 0, 0, 0
-    for r in told:
-        s, right = fastest(r), r["best"] == r["truth"]
-        verdict = r["verdict"] + ("" if right else ", WRONG" if r["verdict"] == "decided" else "")
-        wrong += r["verdict"] == "decided" and not right
-        wrong_standard += sum(x["decided"] and x["best"] != r["truth"] for x in r["standard"])
-        played += len(r["standard"])
-        good = r["verdict"] == "decided" and right
-        ratio = s["seconds"] / r["seconds"] if good else (1.0 if not s["decided"] else s["seconds"] / MOST)
-        ratios.append(ratio)
+    for r in (r for r in rows if not r["hopeless"]):
+        s, wrong = fastest(r), r["verdict"] == "decided" and r["best"] != r["truth"]
         more = "" if s["decided"] else "> "
         lines.append(
-            f"| {r['case']} | {r['seed']} | {verdict} | {r['seconds']:g} | {s['input']} {s['setting']} "
-            f"| {more}{s['seconds']:g} | {more}{ratio:.1f} |"
+            f"| {r['case']} | {r['seed']} | {r['verdict']}{', WRONG' * wrong} | {r['seconds']:g} "
+            f"| {s['input']} {s['setting']} | {more}{s['seconds']:g} | {more}{ratio(r):.1f} |"
         )
-    if told:
-        decided = sum(r["verdict"] == "decided" for r in told)
+    if t["cases"]:
         lines += [
             "",
-            f"{len(told)} cases of 40 planned. The loop decided {decided}, {wrong} of them wrongly; of "
-            f"{played} standard inputs {wrong_standard} decided wrongly (undecided ones are among them). "
-            f"Median of the ratios {np.median(ratios):.1f}; median seconds "
-            f"{np.median([r['seconds'] for r in told]):.1f} beside "
-            f"{np.median([fastest(r)['seconds'] for r in told]):.1f}.",
+            f"{t['cases']} cases. The loop decided {t['decided']}, {t['wrong']} of them wrongly; of "
+            f"{t['standard']} standard inputs {t['standard_decided']} decided, {t['standard_wrong']} of them "
+            f"wrongly. Median of the ratios {t['ratio']:.1f}; median seconds {t['seconds']:.1f} beside "
+            f"{t['standard_seconds']:.1f}.",
         ]
-    if lost:
-        said = sum(r["verdict"] == "not distinguishable" for r in lost)
-        took = np.median([r["seconds"] for r in lost])
+    if t["hopeless"]:
         lines += [
             "",
-            f"Where the limits leave nothing to see ({NARROW.voltage:g} V): {said} of {len(lost)} times it "
-            f"said so, after {took:g} s in the median; "
-            f"{sum(r['verdict'] == 'decided' for r in lost)} times it decided.",
+            f"Where the limits leave nothing to see ({NARROW.voltage:g} V): {t['hopeless_said']} of "
+            f"{t['hopeless']} times it said so, after {t['hopeless_seconds']:g} s in the median; "
+            f"{t['hopeless_decided']} times it decided.",
         ]
     return "\n".join(lines) + "\n"
 
@@ -292,28 +324,45 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[2000, 2001, 2002])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[2000, 2001, 2002])
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument(
         "--hopeless", type=int, nargs="*", default=[], help="seeds of cases that nothing can tell"
     )
     parser.add_argument("--alone", action="store_true", help="leave the standard inputs out")
-    parser.add_argument("--minutes", type=float, default=1e9, help="begin no case after so long")
+    parser.add_argument("--fresh", action="store_true", help="play again what the results have already")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     given = parser.parse_args()
-    began, file = time.monotonic(), given.out / "B4_sequential.json"
-    rows = json.loads(file.read_text())["rows"] if file.exists() else []
+    file = given.out / "B4_sequential.json"
+    results = {"schema": 1, "runs": [], "rows": []}
+    if file.exists() and not given.fresh:
+        results |= json.loads(file.read_text())
+    # First of all, since results that are written make the tree a changed one.
+    results["runs"].append({**B0.provenance(), "arguments": sys.argv[1:]})
+    rows = results["rows"]
     have = {(r["case"], r["seed"], r["hopeless"]) for r in rows}
-    todo = [(n, s, True) for s in given.hopeless for n in HOPELESS]
-    todo += [(n, s, False) for s in given.seeds for n in given.cases]
-    for name, seed, hopeless in todo:
-        if (name, seed, hopeless) in have or time.monotonic() - began > 60 * given.minutes:
+    todo: list[B0.Job] = [
+        {"case": name, "seed": seed, "hopeless": lost, "alone": given.alone}
+        for lost, seeds, names in ((False, given.seeds, given.cases), (True, given.hopeless, HOPELESS))
+        for seed in seeds
+        for name in names
+        if (name, seed, lost) not in have
+    ]
+    # Those of three models take longest and begin first.
+    todo.sort(key=lambda job: -len((HOPELESS if job["hopeless"] else CASES)[job["case"]][2]))
+    print(f"{len(todo)} cases to play", flush=True)
+    for job, row in B0.rows(todo, given.workers, one):
+        name = f"{job['case']} {job['seed']}"
+        if "error" in row:  # is tried again next time
+            print(f"{name}: {row['error']}", flush=True)
             continue
-        rows.append(trial(name, seed, lambda s: print(s, flush=True), hopeless, given.alone))
-        given.out.mkdir(exist_ok=True, parents=True)
-        write_file(file, json.dumps({"schema": 1, "rows": rows}, indent=1) + "\n")
-        write_file(file.with_suffix(".md"), summary(rows))
-    print(summary(rows))
+        print(f"{name}: {row['verdict']} after {row['seconds']:g} s ({row['elapsed_s']:.0f} s)", flush=True)
+        rows.append(row)
+        rows.sort(key=lambda r: (r["hopeless"], r["seed"], [*CASES].index(r["case"])))
+        B0.save(file, {**results, "summary": totals(rows)})
+        write_file(file.with_suffix(".md"), page(rows))
+    print(page(rows))
 
 
 if __name__ == "__main__":

@@ -24,13 +24,12 @@ for folder in (HERE, HERE.parent):
     if str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
 
-from arena.probability import Row, classes, draw_probabilities, summary, told_of, usable, weighed
+from arena.probability import Row, classes, draw_probabilities, misfit, summary, told_of, usable, weighed
 from rotflex_jax.discover.probabilities import RULE, EvidenceRule
 
 # What is tried of each number; all others are held while it is.
 TRIED: dict[str, tuple[float, ...]] = {
     "temperature": (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 50.0),
-    "temperature_unexplained": (30.0, 100.0, 300.0, 1000.0, math.inf),
     "run_nats": (0.0, 0.1, 0.2, 0.3, 0.5, 1.0),
     "prior_nats": (0.5, 1.0, 2.0, 3.0, 4.0),
     "passed_nats": (1.0, 2.0, 3.0, 4.0),
@@ -72,7 +71,7 @@ def calibrated(rows: Sequence[Row], start: EvidenceRule = RULE) -> EvidenceRule:
             break
     # Laplace's rule of succession.
     for name, explained in (("elsewhere", True), ("elsewhere_unexplained", False)):
-        part = [r for r in rows if (r["verdict"] != "unexplained") == explained]
+        part = [r for r in rows if (misfit(r) == 1) == explained]
         missed = sum(not has_right(r) for r in part)
         best = best._replace(**{name: round((missed + 1) / (len(part) + 2), 3)})
     return best

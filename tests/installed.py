@@ -17,6 +17,8 @@ DATA = (
     "data/demo_truth.json",
     "text/templates/page.html.j2",
     "text/templates/style.css",
+    "text/templates/zoom.js",
+    "text/templates/uplot/uPlot.iife.min.js",
     "report/templates/report.html.j2",
     "report/templates/simulation.html.j2",
     "compare/templates/comparison.html.j2",

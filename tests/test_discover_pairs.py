@@ -15,8 +15,10 @@ from rotflex_jax.discover.pairs import (
     best_candidates,
     find_pair,
     is_unexplained,
+    pairs_passed_by,
     promising_pairs,
     refit_pairs,
+    validated_pairs,
 )
 from rotflex_jax.discover.score_test import (
     MAX_THRESHOLD_AMPLITUDE,
@@ -227,7 +229,7 @@ def test_a_refit_of_a_pair_reaches_what_its_score_promises(small):
 
 
 PAIR_WANTED = ((fx.Coulomb, "hub"), (fx.CubicSpring, "joint"), (fx.Coulomb, "joint"))
-STIFFENS = EffectLocation("cubic_spring", "joint")
+STIFFENS, JOINT = EffectLocation("cubic_spring", "joint"), EffectLocation("coulomb", "joint")
 
 
 def horizons(hidden: dict) -> Horizons:
@@ -275,3 +277,16 @@ def test_a_pair_must_be_better_than_each_of_its_members(spring: float):
     again, more = find_pair(at, current, tests, lambda h, p: True, lines.append, tried)
     assert again and all(again.members[p] is less for p, less in found.members.items())
     assert len(more) == len(tried) - 2
+    # Where steps of one effect had ended with another pair, this one would be fitted and told; where they
+    # have ended with it, nothing is.
+    pairs = promising_pairs(*tests)
+    (other,) = validated_pairs(
+        at, current, [tuple(t.pairs([sp.HUB, JOINT])[0] for t in tests)], lambda h, p: True
+    ).values()
+    given = at, current, pairs
+    fits, alike = pairs_passed_by(*given, other, lambda h, p: True, lines.append)
+    assert {sp.HUB, STIFFENS} in [set(p) for p in alike] and len(fits) >= 1
+    passed = pairs_passed_by(*given, other, lambda h, p: True, lines.append, known=[found.found])
+    assert {sp.HUB, STIFFENS} not in [set(p) for p in passed[1]]
+    only = [p for p in pairs if set(p[0].locations) == {sp.HUB, STIFFENS}]
+    assert pairs_passed_by(at, current, only, found.found, lambda h, p: True, lines.append) == ([], [])

@@ -8,7 +8,17 @@ import pytest
 from scipy.special import softmax
 from scipy.stats import norm
 
-from arena.probability import Event, calibration_error, classes, credible, effect_events, reliability, weighed
+from arena.probability import (
+    Event,
+    calibration_error,
+    classes,
+    credible,
+    effect_events,
+    misfit,
+    reliability,
+    scatter_of_right,
+    weighed,
+)
 from rotflex_jax.discover.probabilities import (
     EvidenceRule,
     FittedSet,
@@ -26,7 +36,6 @@ BLOCKS = 12
 COMMON = np.random.default_rng(0).normal(size=BLOCKS) * 40
 RULE = EvidenceRule(
     temperature=2.0,
-    temperature_unexplained=20.0,
     run_nats=1.5,
     prior_nats=0.7,
     passed_nats=0.4,
@@ -52,12 +61,11 @@ def test_even_leads_are_a_softmax():
     expected = softmax(lead / 2.0 + 1.5 * runs - 0.7 * n + passed)
     np.testing.assert_allclose(set_probabilities(sets, rule=RULE), expected, rtol=1e-9)
     assert expected.min() > 0.02  # all have a say
-    # Where something remains, nats of predictions count for less.
+    # Where something remains, nats of predictions count for less; in the end, for nothing.
     expected = softmax(lead / 20.0 + 1.5 * runs - 0.7 * n + passed)
-    np.testing.assert_allclose(set_probabilities(sets, is_explained=False, rule=RULE), expected, rtol=1e-9)
-    none = RULE._replace(temperature_unexplained=np.inf)
+    np.testing.assert_allclose(set_probabilities(sets, misfit=10.0, rule=RULE), expected, rtol=1e-9)
     expected = softmax(1.5 * runs - 0.7 * n + passed)
-    np.testing.assert_allclose(set_probabilities(sets, is_explained=False, rule=none), expected, rtol=1e-9)
+    np.testing.assert_allclose(set_probabilities(sets, misfit=np.inf, rule=RULE), expected, rtol=1e-9)
 
 
 def test_a_missing_horizon_says_as_much_as_the_reference():
@@ -109,7 +117,7 @@ def found():
         fitted("coulomb@hub sensor_bias@alpha", 6.0 + 2 * (0.4 + 0.7 - np.log(4.0))),
         fitted("coulomb@hub", 99.0),
     ]
-    return probabilities(sets, is_explained=True, rule=RULE)
+    return probabilities(sets, misfit=1.0, rule=RULE)
 
 
 def test_sets_effects_and_what_lies_elsewhere(found):
@@ -147,7 +155,8 @@ def test_what_is_told(found):
     assert data["effects"]["stribeck@hub"] == pytest.approx(2 / 7)
     assert "3 sets" in found.sentence and "Coulomb friction at hub 55 %" in found.sentence
     assert "Stribeck" in found.sentence and "none of these 4 %" in found.sentence
-    left = probabilities([fitted("")], is_explained=False, rule=RULE)
+    left = probabilities([fitted("")], misfit=np.inf, rule=RULE)
+    assert probabilities([fitted("")], misfit=2.0, rule=RULE).elsewhere == pytest.approx((0.04 + 0.25) / 2)
     assert left.elsewhere == 0.25 and "catalogue" in left.remarks[1]
     assert left.sentence == "One set of effects was fitted: nothing more 75 %; another one 25 %."
 
@@ -215,7 +224,8 @@ def test_calibration_error_by_hand():
 
 
 def row(sets, wanted=(), **more):
-    return {"probabilities": {"sets": sets, "elsewhere": 0.1}, "wanted": wanted, "verdict": "found", **more}
+    found = {"sets": sets, "elsewhere": 0.1}
+    return {"probabilities": found, "wanted": wanted, "verdict": "found", "misfit": 1.0, **more}
 
 
 def test_sets_that_are_one_answer_count_once():
@@ -242,3 +252,21 @@ def test_a_row_is_weighed_again_as_it_was(found):
     kept = [[sorted(s.effects), line(s.prediction), line(s.free_run)] for s in found.evidence]
     again = weighed(row([], evidence=kept), RULE)
     assert again.sets == found.sets and again.effects == found.effects
+
+
+def test_an_older_row_has_the_misfit_of_its_errors():
+    """Twice the error that a verdict allows of one channel: a variance four times as large."""
+    old = {"noise_floor": {"theta": 1e-3, "alpha": 2e-3}, "windows": {"theta": 3e-3, "alpha": 1e-3}}
+    assert misfit(old) == pytest.approx(4.0)
+    assert misfit({**old, "windows": {"theta": 1.4e-3, "alpha": 1e-3}}) == 1.0
+    assert misfit({**old, "misfit": 7.0}) == 7.0
+
+
+def test_few_machines_scatter_as_much_as_their_probabilities_say():
+    """One bin of `n` sets of 0.75: the calibration error is that of a mean of `n` Bernoulli trials."""
+    mean, high = scatter_of_right([[0.75]] * 20)
+    drawn = np.abs(np.random.default_rng(1).binomial(20, 0.75, 20_000) / 20 - 0.75)
+    assert mean == pytest.approx(drawn.mean(), rel=0.15)
+    assert high == pytest.approx(np.quantile(drawn, 0.95), rel=0.3)
+    # Answers exclude each other: of two of one half each, one is right.
+    assert scatter_of_right([[0.5, 0.5]] * 20)[1] == 0.0

@@ -50,14 +50,24 @@ def test_wheel_holds_the_package_its_data_and_the_manual_page(built: Path) -> No
     assert {f"rotflex_jax/{name}" for name in installed.DATA} <= names
     stem = f"rotflex_jax-{PROJECT['version']}"
     assert f"{stem}.data/data/share/man/man1/rotflex.1" in names
-    assert f"{stem}.dist-info/licenses/LICENSE" in names
+    uplot = "rotflex_jax/text/templates/uplot/LICENSE"  # in every report
+    for licence in ("LICENSE", "NOTICE", uplot):
+        assert wheel.read(f"{stem}.dist-info/licenses/{licence}") == (ROOT / licence).read_bytes()
     assert "rotflex = rotflex_jax.cli:main" in wheel.read(f"{stem}.dist-info/entry_points.txt").decode()
 
 
 def test_source_distribution_holds_tests_documents_and_licence(built: Path) -> None:
     (source,) = (built / "unpacked").iterdir()
     assert ours(source / "tests") == ours(ROOT / "tests")
-    for name in ("LICENSE", "SECURITY.md", "CITATION.cff", "docs/design.md", ".ci/run", "Containerfile"):
+    for name in (
+        "LICENSE",
+        "NOTICE",
+        "SECURITY.md",
+        "CITATION.cff",
+        "docs/design.md",
+        ".ci/run",
+        "Containerfile",
+    ):
         assert (source / name).read_bytes() == (ROOT / name).read_bytes()
 
 

@@ -1,5 +1,6 @@
 """The report: complete, self-contained, readable, and safe against what users call their files."""
 
+import base64
 import dataclasses
 import html.parser
 import json
@@ -7,6 +8,8 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
 
 import matplotlib
 import numpy as np
@@ -246,6 +249,7 @@ def undrawn(monkeypatch) -> None:
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
     torques = LatentTorqueComparison(photographed(), None)
     monkeypatch.setattr(Discovery, "latent_torque", lambda self, progress: torques)
+    monkeypatch.setattr(Discovery, "identifiability", lambda self: None)
 
 
 @pytest.fixture(scope="module")
@@ -296,8 +300,11 @@ def read(page: str) -> Reader:
 def test_the_page_is_well_formed_and_needs_nothing_else(page) -> None:
     reader = read(page)
     assert reader.addresses
-    assert all(a.startswith("data:image/svg+xml;base64,") for a in reader.addresses)
-    assert not {"script", "link", "iframe", "object"} & set(reader.tags)
+    assert all(a.startswith("data:image/svg+xml;charset=utf-8,") for a in reader.addresses)
+    assert not {"link", "iframe", "object"} & set(reader.tags)
+    # A browser refuses whatever a script or a style would fetch.
+    assert re.search(r'<meta http-equiv="Content-Security-Policy" content="default-src \'none\';', page)
+    assert "Copyright (c) 2022 Leon Sorokin" in page
     style = re.search(r"<style>(.*)</style>", page, re.DOTALL).group(1)
     assert "url(" not in style
     assert "@import" not in style
@@ -333,7 +340,8 @@ def test_what_a_user_wrote_is_escaped(page) -> None:
     assert "The spring hardens <b>fast</b>." in text
     assert "<i>own</i> at hub" in text
     assert "The <u>offset</u>" in text and "has <b>fitted</b> are" in text
-    for tag in ("script", "b", "i", "u"):
+    assert "<script>alert" not in page
+    for tag in ("b", "i", "u"):
         assert tag not in read(page).tags
 
 
@@ -451,6 +459,22 @@ def test_the_missing_torque_is_shown_and_what_was_learned(discovery, page, monke
     assert "The missing torque" not in read(page).text
 
 
+def test_the_report_says_what_can_be_known(discovery, monkeypatch) -> None:
+    """Of the final model, on the recording that was fitted: what a call of `identifiable` says."""
+    monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
+    open_scale = paper().release("arm.inertia.inertia")
+    last = dataclasses.replace(discovery.rounds[-1].stage, model=Model(open_scale))
+    found = dataclasses.replace(
+        discovery, rounds=(*discovery.rounds[:-1], dataclasses.replace(discovery.rounds[-1], stage=last))
+    )
+    known = found.identifiability()
+    assert known is not None and not known.structural and known.badly_known is not None
+    text = read(render(found, Explanation(known=known))).text
+    assert "What can be known" in text
+    assert "only their ratios are known, one common factor is open" in text
+    assert "What can be known" not in read(render(found)).text
+
+
 def test_a_map_is_learned_only_where_something_is_unexplained(
     discovery, undrawn, tmp_path, monkeypatch
 ) -> None:
@@ -514,23 +538,105 @@ def test_tables_for_a_terminal(discovery) -> None:
     assert "held" in text
 
 
-def test_long_recordings_keep_the_page_small(discovery) -> None:
-    test = moved(60_000, 0.002)
+def validated(discovery: Discovery, test: Recording) -> Discovery:
+    """The same with another validation recording, whose errors are noise with one peak."""
     rng = np.random.default_rng(2)
-    stages = [
-        dataclasses.replace(s, simulated=(), windowed=(test.y - 0.01 * rng.standard_normal(test.y.shape),))
-        for s in discovery.stages
-    ]
+    error = 0.01 * rng.standard_normal(test.y.shape)
+    error[test.N // 3, 0] = PEAK
+    stages = [dataclasses.replace(s, simulated=(), windowed=(test.y - error,)) for s in discovery.stages]
     rounds = tuple(dataclasses.replace(r, stage=s) for r, s in zip(discovery.rounds, stages[1:], strict=True))
-    long = dataclasses.replace(discovery, validation=(test,), baseline=stages[0], rounds=rounds)
-    page = render(long)
+    return dataclasses.replace(discovery, validation=(test,), baseline=stages[0], rounds=rounds)
+
+
+PEAK = 7.0
+
+
+def zoomable(page: str) -> list[tuple[dict[str, Any], str]]:
+    """The data of each figure that can be zoomed, and the address of its still picture."""
+    found = re.findall(
+        r'<figure class="zoomable">\s*<img [^>]*src="([^"]*)"[^>]*>\s*<script[^>]*>(.*?)</scr', page
+    )
+    return [(json.loads(data), address) for address, data in found]
+
+
+def numbers(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+def test_figures_to_zoom_hold_every_sample_of_a_common_recording(discovery) -> None:
+    """20 s at 500 Hz: the page is small, has the overlay as it was measured, and its still picture."""
+    found = validated(discovery, moved(10_000, 0.002))
+    page = render(found)
+    assert len(page) < 3e6
+    (overlay, still), (maps, other) = zoomable(page)
+    for address in (still, other):
+        assert unquote(address.removeprefix("data:image/svg+xml;charset=utf-8,")).startswith("<?xml")
+    theta, error, alpha, _ = overlay["panels"]
+    y = np.rad2deg(found.validation[0].y)
+    assert overlay["x"] == {"label": "time [s]", "start": 0.0, "step": 0.002, "count": 10_000}
+    assert [line["label"] for line in theta["lines"]] == ["measured", "baseline", "final model"]
+    assert np.allclose(numbers(theta["lines"][0]["values"]), y[:, 0], rtol=1e-6)
+    assert np.allclose(numbers(alpha["lines"][0]["values"]), y[:, 1], rtol=1e-6)
+    left = y[:, 0] - np.rad2deg(found.baseline.windowed[0][:, 0])
+    assert np.allclose(numbers(error["lines"][0]["values"]), left, atol=1e-5)
+    assert error["band"] == pytest.approx(2 * np.rad2deg(NOISE))
+    assert np.allclose(numbers(maps["y"]["values"]), y[:, 1], rtol=1e-6)
+    assert [m["squared"] for m in maps["panels"]] == [True, False, False]
+
+
+def test_long_recordings_keep_the_page_small_and_show_every_peak(discovery) -> None:
+    found = validated(discovery, moved(60_000, 0.002))
+    page = render(found)
     assert len(page) < 3e6
     assert "30 s of it are shown" in page
+    overlay = zoomable(page)[0][0]
+    x, error = overlay["x"], numbers(overlay["panels"][1]["lines"][0]["values"])
+    assert x["count"] == len(error) < 60_000
+    assert error.max() == pytest.approx(np.rad2deg(PEAK))
+    assert x["step"] * int(error.argmax()) == pytest.approx(40.0, abs=0.02)
+    assert x["step"] * (len(error) - 1) == pytest.approx(120.0, abs=0.02)
+
+
+# Keys, a button, mouse, wheel and a finger; then a drag over a map.
+EXERCISE = """
+const ranges = [], [over, map] = document.querySelectorAll("figure.zoomable");
+const note = (f) => ranges.push(f.zoom.visible.range);
+const press = (key) => over.querySelector(".zoom").dispatchEvent(new KeyboardEvent("keydown", { key }));
+const send = (to, type, x, y, more) => {
+  const given = { clientX: x, clientY: y, movementX: 1, bubbles: true, cancelable: true, ...more };
+  to.dispatchEvent(new ({ p: PointerEvent, w: WheelEvent }[type[0]] || MouseEvent)(type, given));
+};
+const drag = (f, from, to) => {
+  const field = f.querySelector(".u-over"), box = field.getBoundingClientRect();
+  const at = ([x, y]) => [box.left + x * box.width, box.top + y * box.height];
+  for (const type of ["mouseenter", "mousemove", "mousedown"]) send(field, type, ...at(from));
+  for (const place of [document, field]) send(place, "mousemove", ...at(to));
+  send(document, "mouseup", ...at(to));
+};
+note(over);
+press("+"); note(over);
+press("ArrowRight"); note(over);
+over.querySelector("button").click(); note(over);
+drag(over, [0.25, 0.5], [0.5, 0.5]); note(over);
+const field = over.querySelector(".u-over"), box = field.getBoundingClientRect();
+send(field, "wheel", box.left, box.top, { deltaY: -50, ctrlKey: true });
+note(over);
+field.setPointerCapture = () => {};
+const finger = { pointerId: 7, pointerType: "touch" };
+send(field, "pointerdown", box.left + 200, box.top + 20, finger);
+send(field, "pointermove", box.left + 100, box.top + 20, finger);
+note(over);
+note(map);
+drag(map, [0.5, 0.25], [1, 0.75]); note(map);
+console.info("ranges: " + JSON.stringify(ranges));
+"""
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_a_browser_shows_the_page_without_complaint(discovery, tmp_path) -> None:
     path = discovery.report(tmp_path)
+    page = path.read_text(encoding="utf-8")
+    path.write_text(page.replace("</body>", f"<script>{EXERCISE}</script></body>"), encoding="utf-8")
     shot = tmp_path / "shot.png"
     flags = [
         "--headless",
@@ -549,7 +655,23 @@ def test_a_browser_shows_the_page_without_complaint(discovery, tmp_path) -> None
     ]
     done = subprocess.run([str(CHROMIUM), *flags, path.as_uri()], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert "CONSOLE" not in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    whole, larger, right, again, dragged, wheel, pulled, plane, part = json.loads(
+        re.search(r"ranges: (\[.*\])\"", line).group(1)
+    )
+    (a, b), (a1, b1), (a2, b2) = whole[0], larger[0], right[0]
+    assert (a, b) == (0.0, pytest.approx(7.495))
+    assert b1 - a1 == pytest.approx((b - a) / 1.6) and a1 + b1 == pytest.approx(a + b)
+    assert (a2, b2) == pytest.approx((a1 + 0.2 * (b1 - a1), b1 + 0.2 * (b1 - a1)))
+    assert again == whole
+    assert dragged[0] == pytest.approx([b / 4, b / 2], abs=0.02)
+    assert wheel[0][1] - wheel[0][0] < dragged[0][1] - dragged[0][0]
+    assert wheel[0][0] == pytest.approx(dragged[0][0], abs=0.02)  # the point under the pointer stays
+    assert pulled[0][0] > wheel[0][0] and pulled[0][1] - pulled[0][0] == pytest.approx(
+        wheel[0][1] - wheel[0][0]
+    )
+    for (low, high), found, shares in zip(plane, part, ((0.5, 1.0), (0.25, 0.75)), strict=True):
+        assert found == pytest.approx([low + s * (high - low) for s in shares], abs=0.02 * (high - low))
     picture = image.imread(shot)
     assert picture.shape[:2] == (2400, 1000)
     # Text and figures: many tones, in the lower half (where the figures are) too.

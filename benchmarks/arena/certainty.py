@@ -19,6 +19,7 @@ from rotflex_jax.arena.marking import renamed
 from rotflex_jax.arena.simulator.hidden import DEFAULTS, SHAPES
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.discover.probabilities import FittedSet, probabilities
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.models.model import Model
@@ -119,9 +120,44 @@ def bands(job: dict[str, Any]) -> dict[str, Any]:
     return row
 
 
+def cost(job: dict[str, Any]) -> dict[str, Any]:
+    """Processor seconds of all that says how sure a fit is, compiling included, on one recording."""
+    row: dict[str, Any] = dict(job)
+    try:
+        (place,) = (tuple(p) for p in job["effects"])
+        rec, _ = record(job, job["kind"], 2 * COST_SECONDS)
+        train, held_out = rec.split(0.5)
+        fitted = rf.fit(true_model([place], job["size"]), train)
+        names = [n for n in fitted.free_names if n.startswith(f"{place[1]}.{place[0]}.")]
+        parts = {
+            "profiles": lambda: [rf.profile(fitted, train, n) for n in (*names, "joint.spring.stiffness")],
+            "identifiable": lambda: rf.identifiable(fitted, train),
+            "bands": lambda: rf.prediction_bands(fitted, held_out, LEVEL),
+            "probabilities": lambda: probabilities(twenty_sets(2 * COST_SECONDS), misfit=1.0),
+        }
+        row["profiled"], row["processor_s"] = len(names) + 1, {}
+        for name, part in parts.items():
+            began = time.process_time()
+            part()
+            row["processor_s"][name] = time.process_time() - began
+    except Exception as problem:
+        row["error"] = f"{type(problem).__name__}: {problem}"
+        row["traceback"] = traceback.format_exc()
+    return row
+
+
+COST_SECONDS = 20.0
+
+
+def twenty_sets(seconds: float) -> list[FittedSet]:
+    """Evidence of as many sets as a long search fits, half second by half second."""
+    rng, blocks = np.random.default_rng(0), round(2 * seconds)
+    return [FittedSet(frozenset({f"e{k}@hub"}), *rng.normal(size=(2, blocks))) for k in range(20)]
+
+
 def trial(job: dict[str, Any]) -> dict[str, Any]:
-    """One row of either kind."""
-    return {"intervals": intervals, "bands": bands}[job["part"]](job)
+    """One row of any part."""
+    return {"intervals": intervals, "bands": bands, "cost": cost}[job["part"]](job)
 
 
 def _plain(pair: tuple[float, float]) -> list[float | None]:

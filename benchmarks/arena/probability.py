@@ -39,7 +39,7 @@ def told(result: Discovery, evidence: bool = False) -> Row:
     found = result.probabilities
     if found is None:
         return {}
-    row: Row = {"probabilities": told_of(found)}
+    row: Row = {"probabilities": told_of(found), "misfit": result.assessment.misfit}
     if evidence:
         row["evidence"] = [
             [sorted(s.effects), _written(s.prediction, 2), _written(s.free_run, 4)] for s in found.evidence
@@ -70,7 +70,17 @@ def weighed(row: Row, rule: EvidenceRule) -> Probabilities:
     from rotflex_jax.discover.probabilities import FittedSet, probabilities
 
     sets = [FittedSet(frozenset(names), _read(p), _read(f)) for names, p, f in row["evidence"]]
-    return probabilities(sets, is_explained=row["verdict"] != "unexplained", rule=rule)
+    return probabilities(sets, misfit=misfit(row), rule=rule)
+
+
+def misfit(row: Row) -> float:
+    """What the model of a row leaves, as its verdict measured it; by its short runs alone in older rows."""
+    from rotflex_jax.discover.verdict import Assessment
+
+    if "misfit" in row:
+        return row["misfit"]
+    errors = row["errors"]["validation"]["final"]["windows"] if "errors" in row else row["windows"]
+    return Assessment({}, {c: errors[c] / row["noise_floor"][c] for c in errors}, 0.0).misfit
 
 
 def place_of(name: str) -> Place:
@@ -123,6 +133,23 @@ def usable(records: Iterable[Row]) -> list[Row]:
     return [r for r in good(list(records)) if "probabilities" in r and not r.get("outside")]
 
 
+def scatter_of_right(machines: Sequence[Sequence[float]], draws: int = 300) -> tuple[float, float]:
+    """Calibration error that so few machines would show if every probability were right: mean, 95 % below.
+
+    Args:
+        machines: Of each the probabilities of answers that exclude each other.
+        draws: How often the truth of all machines is drawn from these.
+    """
+    rng, found = np.random.default_rng(0), []
+    for _ in range(draws):
+        told = []
+        for claimed in machines:
+            true = int(np.searchsorted(np.cumsum(claimed), rng.random()))
+            told += [Event(p, k == true) for k, p in enumerate(claimed)]
+        found.append(calibration_error(told))
+    return float(np.mean(found)), float(np.quantile(found, 0.95))
+
+
 class CredibleSets(NamedTuple):
     """How often credible sets hold the truth, and how many sets that takes."""
 
@@ -157,10 +184,15 @@ def summary(records: Iterable[Row]) -> str:
         top, sets = [classes(r)[0] for r in rows], [e for r in rows for e in classes(r)]
         known = sum(any(e.true for e in classes(r)) for r in rows)
         c = credible(rows)
+        first = [[e.probability] for e in top]
+        every_set = [[e.probability for e in classes(r)] for r in rows]
+        expected = [scatter_of_right(machines) for machines in (first, every_set)]
+        least = [f"({mean:.3f} if all were right, up to {high:.3f})" for mean, high in expected]
         lines.append(
             f"{name}: {len(rows)} machines, the right set fitted in {known}; most probable set right in "
             f"{sum(e.true for e in top)}, mean probability {np.mean([e.probability for e in top]):.3f}, "
-            f"calibration error {calibration_error(top):.3f}; all sets {calibration_error(sets):.3f}; "
+            f"calibration error {calibration_error(top):.3f} {least[0]}; all sets "
+            f"{calibration_error(sets):.3f} {least[1]}; "
             f"effects {calibration_error([e for r in rows for e in effect_events(r)]):.3f}; sets of "
             f"{100 * CREDIBLE:g} % hold the truth in {100 * c.held:.1f} %, mean size {c.size:.2f}"
         )

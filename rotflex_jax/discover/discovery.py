@@ -1,13 +1,14 @@
 """The result of `discover`: what was found, and what can be done with it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rotflex_jax import checks
 from rotflex_jax.discover.conclusion import proposed
 from rotflex_jax.discover.explanation import (
+    SHOWN_SECONDS,
     Explanation,
     LatentTorqueComparison,
     compare_latent_torques,
@@ -28,8 +29,13 @@ from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
+from rotflex_jax.experiment.until_decided import models_of
+from rotflex_jax.fit.bands import Bands, prediction_bands
+from rotflex_jax.fit.greybox import fit
+from rotflex_jax.fit.identifiable import Identifiability, identifiable
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.model_json import Saved, save
+from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import as_json, bullets, card, folded, paragraph, picture, table, write_files
 from rotflex_jax.text.numbers import equation, plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import staircase
@@ -65,6 +71,19 @@ class Discovery(SearchResult):
         model = Model(m, self.model.solver)
         return learn_torque(model, self.train, self.validation, at, window_seconds=seconds, progress=progress)
 
+    def identifiability(self) -> Identifiability | None:
+        """What sensors and the longest fitted recording determine of the final model, at its parameters.
+
+        The noise of the sensors counts alone, which is the best case. None where nothing is free, or where
+        runs of other parameters diverge.
+        """
+        longest = max(self.train, key=lambda r: r.N)
+        shown = longest.slice(0, min(longest.N, round(SHOWN_SECONDS / longest.Ts)))
+        try:
+            return identifiable(self.model, shown) if self.model.mechanism.free_names else None
+        except InputError:
+            return None
+
     def explanation(
         self, learned: bool | None = None, progress: Callable[[str], None] | None = None
     ) -> Explanation:
@@ -85,12 +104,43 @@ class Discovery(SearchResult):
             except InputError:  # no sensor tells how that port moves
                 torque = None
         say("report: tests of the residuals and frequency responses")
-        return Explanation(latent, torque, remaining_failures(self), model_tests(self))
+        tests = model_tests(self)
+        say("report: what the recording determines")
+        return Explanation(latent, torque, remaining_failures(self), tests, self.identifiability())
 
     def save(self, path: str | Path) -> Path:
         """Write the final model as JSON, with its estimates; `Model.load` reads the model."""
         seen = self.train[0]
         return save(Saved(self.model, self.final.estimates, Ts=seen.Ts, n_init=seen.n_init), path)
+
+    def prediction_bands(
+        self,
+        recording: Recording,
+        level: float = 0.9,
+        *,
+        known: Recording | Sequence[Recording] = (),
+        progress: Callable[[str], None] | None = None,
+    ) -> Bands:
+        """Bands of a free run over the probable sets of effects, each fitted to the training recordings.
+
+        Sets weigh as much as they are probable; that the right one is none of them is not in the bands,
+        unless recordings are `known`. Of a search without probabilities the final model counts alone.
+
+        Args:
+            recording: Its input and first samples are used, its other samples only by `coverage`.
+            level: Probability, between 0 and 1.
+            known: Recordings by which the error of models is measured, see `rotflex_jax.prediction_bands`.
+            progress: Called with a line of text at each fit.
+
+        Raises:
+            InputError: As `rotflex_jax.prediction_bands`.
+        """
+        say = checks.progress(progress)
+        fits, share = (
+            models_of(self, say) if self.probabilities else ({"": fit(self.model, self.train)}, None)
+        )
+        weighted = [(fitted, share[name] if share else 1.0) for name, fitted in fits.items()]
+        return prediction_bands(weighted, recording, level, known=known)
 
     def next_experiment(self, **changes: Any) -> Experiment | None:
         """Design the input that distinguishes the first effect found from its equal; None where it has none.

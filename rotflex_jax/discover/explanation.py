@@ -13,6 +13,7 @@ from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.result import SearchResult, Stage, Where
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.fit.identifiable import Identifiability
 from rotflex_jax.latent import LatentTorque, latent_torque
 from rotflex_jax.latent.torque import Progress
 from rotflex_jax.models.model import Model
@@ -253,12 +254,14 @@ class Explanation:
         learned: A torque learned for what is left; None where none was asked for or none can be learned.
         remaining: Where the final model still fails; empty unless effects were found and something is left.
         tests: Tests of the residuals, and frequency responses; None where they were not computed.
+        known: What sensors and recording determine of the final model; None where it was not computed.
     """
 
     latent: LatentTorqueComparison | None = None
     learned: LearnedTorqueResult | None = None
     remaining: tuple[Where, ...] = ()
     tests: ModelTests | None = None
+    known: Identifiability | None = None
 
 
 def remaining_failures(found: SearchResult) -> tuple[Where, ...]:

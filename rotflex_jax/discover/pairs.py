@@ -107,6 +107,75 @@ def refit_pairs(
     return refit(problem, starts)
 
 
+def validated_pairs(
+    horizons: Horizons,
+    beside: ValidatedHypothesis,
+    pairs: Sequence[tuple[PairScore, PairScore]],
+    is_plausible: Callable[[Hypothesis, EffectLocation], bool],
+) -> dict[Pair, ValidatedHypothesis]:
+    """A model with each pair, refitted and validated at both horizons; what is not plausible is left out.
+
+    Args:
+        horizons: Training and validation recordings.
+        beside: The model that they are added to.
+        pairs: Their scores of predictions and of free runs.
+        is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
+    """
+    problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
+    assert beside.free_run
+    grown = refit_pairs(problem, beside.hypothesis, [a.starts for a, _ in pairs])
+    runs = refit_pairs(runs_problem, beside.free_run.hypothesis, [b.starts for _, b in pairs])
+    runs = refit_near_predictions(runs_problem, runs, grown)
+    found: dict[Pair, ValidatedHypothesis] = {}
+    for h, f, (score, _) in zip(grown, runs, pairs, strict=True):
+        if all(is_plausible(x, p) for x in (h, f) for p in score.locations if p in x.locations):
+            count = sum(parameter_count(problem.supermodel, h, p) for p in score.locations)
+            v = horizons.validated(h, f, beside)
+            found[score.locations] = dataclasses.replace(v, parameter_count=count)
+    return found
+
+
+def pairs_passed_by(
+    horizons: Horizons,
+    beside: ValidatedHypothesis,
+    pairs: Sequence[tuple[PairScore, PairScore]],
+    found: ValidatedHypothesis,
+    is_plausible: Callable[[Hypothesis, EffectLocation], bool],
+    say: Callable[[str], None],
+    known: Sequence[ValidatedHypothesis] = (),
+) -> tuple[list[ValidatedHypothesis], list[Pair]]:
+    """The best pairs at the start of a search that ended with two effects or more, of which it has not both.
+
+    Each step of a search adds the best single effect. Two that explain the recordings only together, while
+    another one imitates a part of both, would be passed by.
+
+    Args:
+        horizons: Training and validation recordings.
+        beside: The model at the start.
+        pairs: The best of it.
+        found: The model at the end.
+        is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
+        say: Called with lines of progress.
+        known: Models that were fitted before.
+
+    Returns:
+        What was fitted and validated, and the pairs that validation data do not distinguish from the model
+        found, or prefer.
+    """
+    calibrations = horizons.prediction.problem.supermodel.calibrations
+    effects = frozenset(found.hypothesis.locations) - set(calibrations)
+    fitted = {frozenset(v.hypothesis.locations) - set(calibrations) for v in known}
+    passed = (pair for pair in pairs if not effects >= set(pair[0].locations))
+    others = [pair for pair in passed if frozenset(pair[0].locations) not in fitted]
+    if len(effects) < 2 or not others:
+        return [], []
+    say("pairs of the start that were not found: " + ", ".join(_named(a.locations) for a, _ in others))
+    tried = validated_pairs(horizons, beside, others, is_plausible)
+    for pair, v in tried.items():
+        say(f"  {_named(pair)}: " + describe(v, found).removeprefix("None: "))
+    return list(tried.values()), [p for p, v in tried.items() if not distinguished(found, v)]
+
+
 @dataclasses.dataclass(frozen=True)
 class FoundPair:
     """Two effects that are needed together.
@@ -145,20 +214,12 @@ def find_pair(
     if not pairs:
         return None, []
     say("looking one step further, refitting " + ", ".join(_named(a.locations) for a, _ in pairs))
-    problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
+    problem = horizons.prediction.problem
     data, noise, s = problem.dataset.data, problem.noise, problem.supermodel
-    assert current.free_run
-    grown = refit_pairs(problem, current.hypothesis, [a.starts for a, _ in pairs])
-    runs = refit_pairs(runs_problem, current.free_run.hypothesis, [b.starts for _, b in pairs])
-    runs = refit_near_predictions(runs_problem, runs, grown)
-    tried: dict[Pair, ValidatedHypothesis] = {}
-    for h, f, (score, _) in zip(grown, runs, pairs, strict=True):
-        if all(is_plausible(x, p) for x in (h, f) for p in score.locations if p in x.locations):
-            count = sum(parameter_count(s, h, p) for p in score.locations)
-            v = dataclasses.replace(horizons.validated(h, f, current), parameter_count=count)
-            tried[score.locations] = v
-            line = describe(v, current).removeprefix("None: ")
-            say(f"  {_named(score.locations)}: {line}")
+    tried = validated_pairs(horizons, current, pairs, is_plausible)
+    for pair, v in tried.items():
+        line = describe(v, current).removeprefix("None: ")
+        say(f"  {_named(pair)}: {line}")
     able = {p: v for p, v in tried.items() if admissible(v, current, data, noise)}
     everyone = list(tried.values())
     if not able:

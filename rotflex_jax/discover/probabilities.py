@@ -6,7 +6,6 @@ again with random weights: what a set gains only in a few moments loses its lead
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -45,24 +44,31 @@ class EvidenceRule(NamedTuple):
     """How evidence becomes probability; the numbers are calibrated on simulated machines.
 
     Attributes:
-        temperature: Nats of predictions that are worth one: innovations are alike from sample to sample.
-        temperature_unexplained: The same where something remains unexplained. Predictions then follow the
-            data within a few samples whatever the model, and their nats say nothing of the right set.
+        temperature: Nats of predictions that are worth one: innovations are alike from sample to sample. It
+            is larger by as much as what remains exceeds what the verdict allows: predictions then follow the
+            data within a few samples, whatever the model.
         run_nats: What half a second says whose error in free run is larger by a factor e [nat].
         prior_nats: How much likelier than its presence the absence of an effect is beforehand [nat].
         passed_nats: How much likelier the set that has passed all tests of the search is beforehand than one
             that has not: they ask for more than evidence, such as a gain on the training data too [nat].
         elsewhere: Probability that the right set is none of those fitted, where the recordings are explained.
-        elsewhere_unexplained: The same where something remains unexplained.
+        elsewhere_unexplained: The same where they are far from explained.
     """
 
     temperature: float = 5.0
-    temperature_unexplained: float = math.inf
     run_nats: float = 0.2
     prior_nats: float = 2.0
     passed_nats: float = 3.0
     elsewhere: float = 0.02
     elsewhere_unexplained: float = 0.17
+
+    def none_of_them(self, misfit: float) -> float:
+        """Probability that the right set is none of those fitted.
+
+        Args:
+            misfit: Of the model that was found, 1 where it explains the recordings.
+        """
+        return self.elsewhere + (self.elsewhere_unexplained - self.elsewhere) * (1 - 1 / misfit)
 
 
 RULE = EvidenceRule()
@@ -187,13 +193,13 @@ def percent(probability: float) -> str:
 
 
 def set_probabilities(
-    fitted: Sequence[FittedSet], *, is_explained: bool = True, rule: EvidenceRule = RULE
+    fitted: Sequence[FittedSet], *, misfit: float = 1.0, rule: EvidenceRule = RULE
 ) -> Float[np.ndarray, " S"]:
     r"""Probabilities of fitted sets among each other, with the scatter of the half seconds.
 
     .. math::
         p_s = E_w \frac{e^{l_s(w)}}{\sum_r e^{l_r(w)}}, \qquad
-        l_s(w) = \frac{1}{T} \sum_b w_b v_{sb} + \nu \sum_b w_b f_{sb} - \lambda n_s + \rho_s
+        l_s(w) = \frac{1}{m T} \sum_b w_b v_{sb} + \nu \sum_b w_b f_{sb} - \lambda n_s + \rho_s
 
     with blocks of predictions `v` and of free runs `f` over validation recordings, `n` effects, `rho` for the
     set that passed the tests of the search, and weights `w` of mean one that are uniform over all there are
@@ -202,7 +208,7 @@ def set_probabilities(
     Args:
         fitted: The sets, first the one that passed the tests. A horizon at which a set was not fitted says as
             much for it as for the first that was fitted at both.
-        is_explained: Whether the search ended with nothing left above the noise.
+        misfit: What is left, `Assessment.misfit` m: 1 where the model that was found explains the recordings.
         rule: Temperature T, nats of free runs nu, prior nats lambda and rho.
 
     Returns:
@@ -226,8 +232,7 @@ def set_probabilities(
             drawn[d.shape[1]] = d.shape[1] * rng.dirichlet(np.ones(d.shape[1]), DRAWS)
         return drawn[d.shape[1]] @ np.nan_to_num(d, nan=DIVERGED).T
 
-    temperature = rule.temperature if is_explained else rule.temperature_unexplained
-    log_weight = resampled([s.prediction for s in fitted]) / temperature
+    log_weight = resampled([s.prediction for s in fitted]) / (misfit * rule.temperature)
     log_weight += rule.run_nats * resampled([s.free_run for s in fitted])
     log_weight -= rule.prior_nats * np.array([len(s.effects) for s in fitted])
     log_weight[:, 0] += rule.passed_nats
@@ -235,14 +240,12 @@ def set_probabilities(
     return np.mean(weight / weight.sum(axis=1, keepdims=True), axis=0)
 
 
-def probabilities(
-    fitted: Sequence[FittedSet], *, is_explained: bool, rule: EvidenceRule = RULE
-) -> Probabilities:
+def probabilities(fitted: Sequence[FittedSet], *, misfit: float, rule: EvidenceRule = RULE) -> Probabilities:
     """Probabilities of the sets that a search has fitted.
 
     Args:
         fitted: The sets, the one reported first; of several fits of one set the first counts.
-        is_explained: Whether the search ended with nothing left above the noise.
+        misfit: What is left, `Assessment.misfit`: 1 where the model that was found explains the recordings.
         rule: How evidence becomes probability.
 
     Returns:
@@ -250,8 +253,8 @@ def probabilities(
     """
     known = {s.effects: s for s in reversed(fitted)}
     once = [known[e] for e in dict.fromkeys(s.effects for s in fitted)]
-    elsewhere = rule.elsewhere if is_explained else rule.elsewhere_unexplained
-    p = (1 - elsewhere) * set_probabilities(once, is_explained=is_explained, rule=rule)
+    elsewhere = rule.none_of_them(misfit)
+    p = (1 - elsewhere) * set_probabilities(once, misfit=misfit, rule=rule)
     sets = [SetProbability(s.effects, float(x)) for s, x in zip(once, p, strict=True)]
     effects: dict[str, float] = {}
     for s in sets:
@@ -261,7 +264,7 @@ def probabilities(
         "Only sets that the search has fitted have a probability of their own; that the right one is none of "
         f"them has the probability {percent(elsewhere)}, as often as on simulated machines with such an end.",
     ]
-    if not is_explained:
+    if misfit > 1:
         remarks.append(
             "Something remains that no candidate explains: the probabilities are those of what the catalogue "
             "has names for."

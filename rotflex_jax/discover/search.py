@@ -14,6 +14,7 @@ from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.evaluation import Evaluation
 from rotflex_jax.discover.forward_selection import ROUNDS, add_best, add_pair, score_candidates
 from rotflex_jax.discover.likelihood import LikelihoodProblem, correct_discretisation_bias
+from rotflex_jax.discover.pairs import pairs_passed_by
 from rotflex_jax.discover.search_state import Progress, SearchState, as_it_was, fit_as_it_is
 from rotflex_jax.discover.stepwise import (
     Eliminated,
@@ -26,6 +27,7 @@ from rotflex_jax.discover.summary import conclude, evaluate_models
 from rotflex_jax.discover.supermodel import SuperModel, build, checked_candidates, scales
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
 from rotflex_jax.effects.base import Effect
+from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import padded_length, prepare, process_noise_ports
 from rotflex_jax.fit.plausibility import check_signs
@@ -116,8 +118,9 @@ def discover(
         # 4. Refit the best and decide; where none is worth it alone, two together may be.
         if not add_best(state, promising) and not add_pair(state, rounds):
             break
-    # 5. Leave out what is not needed.
+    # 5. Leave out what is not needed, and see whether steps of one effect have passed by a pair.
     _simplify(state)
+    _check_pairs(state)
     # 6. Evaluate every nested model, and localise what the baseline leaves.
     evaluated = evaluate_models(state, evaluation)
     # 7. The verdict, and what to record next where it is open.
@@ -214,6 +217,22 @@ def _simplify(state: SearchState) -> None:
         rivals[one.effect] = [*rivals.get(one.simpler, []), *(one.replaced if one.same_count else ())]
     state.order, state.own, state.notes, state.rivals = order, assigned.own, notes, rivals
     state.final = correct_discretisation_bias(problem, final)
+
+
+def _check_pairs(state: SearchState) -> None:
+    """Fit the best pairs of the start that were not found; they join the sets with probabilities."""
+    if state.start is None or state.validation.folds:  # a fit for each recording, for a check
+        return
+    beside, pairs = state.start
+    given = state.horizons, beside, pairs, state.current, state.is_plausible, state.say
+    tried, alike = pairs_passed_by(*given, known=state.tried)
+    state.tried += tried
+    for a, b in alike:
+        names = " and ".join(effect_phrase(p.effect, p.port) for p in (a, b))
+        state.notes = (
+            *state.notes,
+            f"Two effects fitted at once do as well on data that no fit has seen as what was found: {names}.",
+        )
 
 
 def _left_out(state: SearchState, needed: Eliminated) -> list[ValidatedHypothesis]:

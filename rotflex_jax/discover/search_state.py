@@ -18,8 +18,9 @@ from rotflex_jax.discover.checkpoint import (
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
 from rotflex_jax.discover.input_reading import nats_if_smooth, smooth_note
 from rotflex_jax.discover.likelihood import LikelihoodProblem
+from rotflex_jax.discover.pairs import promising_pairs
 from rotflex_jax.discover.result import HorizonGain
-from rotflex_jax.discover.score_test import Score, ScoreTest, residual_lines, score_test
+from rotflex_jax.discover.score_test import PairScore, Score, ScoreTest, residual_lines, score_test
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
 from rotflex_jax.discover.stepwise import as_given, far_from_given, fit_baseline, fit_free_run_baseline
 from rotflex_jax.discover.supermodel import EffectLocation
@@ -59,6 +60,7 @@ class SearchState:
         merged: The final model with one effect in the place of several, where it has one.
         in_place_of: That effect -> the one of several whose place in the order it took.
         machine: Calibrations that belong to the machine.
+        start: The model beside which all candidates were scored first, and the best pairs of these.
         tests: Score tests of the model of `tested`, of predictions and of free runs.
         tested: The model whose score tests were made last.
         nominal: The user's model with the values that it has, where the fit has moved far away from these.
@@ -91,6 +93,7 @@ class SearchState:
     merged: ValidatedHypothesis | None = None
     in_place_of: dict[EffectLocation, EffectLocation] = dataclasses.field(default_factory=dict)
     machine: list[EffectLocation] = dataclasses.field(default_factory=list)
+    start: tuple[ValidatedHypothesis, list[tuple[PairScore, PairScore]]] | None = None
     tests: tuple[ScoreTest, ScoreTest] | None = None
     tested: Hypothesis | None = None
     nominal: ValidatedHypothesis | None = None
@@ -175,6 +178,7 @@ class SearchState:
         if not self.ranking:
             by_runs = {x.location: x.nats for x in runs}
             self.ranking = [(x, by_runs[x.location]) for x in listed]
+            self.start = beside, promising_pairs(*self.score_tests(beside))
         return listed, runs
 
     def add(self, found: ValidatedHypothesis, added: Sequence[AddedEffect]) -> None:

@@ -37,7 +37,6 @@ from rotflex_jax.discover.selection import helps
 from rotflex_jax.discover.stepwise import calibration_notes, disturbance_notes, far_from_given, nested_models
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, validate
-from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.fit.plausibility import Remark, at_bounds, beyond_recordings
 from rotflex_jax.recording import Recording
 
@@ -140,18 +139,20 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *(f"{remark.sentence}." for remark in remarks),
         ),
         remarks=remarks,
-        probabilities=_probabilities(state, verdict is not Verdict.UNEXPLAINED),
+        probabilities=_probabilities(
+            state, assess_stages(baseline, final, state.noise_floor, held_back).misfit
+        ),
         conditional=conditional,
     )
 
 
-def _probabilities(state: SearchState, is_explained: bool) -> Probabilities:
+def _probabilities(state: SearchState, misfit: float) -> Probabilities:
     """Probabilities of the sets that were fitted, the one that is reported first."""
     reported, horizons = state.reported, state.horizons
     sets = fitted_sets(horizons, state.tried, state.alternatives, reported, state.machine)
     if state.merged:
         sets = fitted_sets(horizons, (), [state.merged], reported, ()) + sets
-    return probabilities(sets, is_explained=is_explained)
+    return probabilities(sets, misfit=misfit)
 
 
 def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:

@@ -73,6 +73,16 @@ class Assessment:
         return self.at_noise and self.torque_free
 
     @property
+    def misfit(self) -> float:
+        """Squared errors of short runs, or what random torques gain, over what the verdict allows of them.
+
+        The largest of these; 1 where the model explains the recordings.
+        """
+        shares = [(times / NEAR_FLOOR) ** 2 for times in self.remaining.values()]
+        shares.append(self.torque_nats / NATS_PER_SAMPLE)
+        return math.inf if any(map(math.isnan, shares)) else max(1.0, *shares)
+
+    @property
     def grade(self) -> Grade | None:
         """That of the channel that is furthest from its noise."""
         known = [times for times in self.remaining.values() if not math.isnan(times)]

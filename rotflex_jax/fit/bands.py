@@ -8,7 +8,7 @@ process torques, the sensor, and what the model lacks, as large as free runs ove
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -47,6 +47,9 @@ PARTS = (
 """What widens a band, in the order of tables."""
 # A recording starts at rest where its first speeds are below this share of the speeds that follow.
 AT_REST = 0.02
+# Steps of the search for a first state, halvings of one, and the gain below which it ends [squared error
+# in units of the noise].
+FIRST_STATE_STEPS, HALVED_STEPS, ENOUGH_GAIN = 12, 4, 0.1
 # Halvings of an interval that holds a quantile of a mixture.
 HALVINGS = 60
 
@@ -60,7 +63,7 @@ class Bands:
         channels: Of the model.
         units: Of these.
         level: Probability of each sample to lie inside.
-        middle: Free run; of several models the weighted mean.
+        middle: Free run, memories of its start from the first samples; of several models the weighted mean.
         lower: Lower end.
         upper: Upper end.
         parts: What widens the band -> standard deviation by this alone.
@@ -162,14 +165,15 @@ def prediction_bands(
 
         y_k - y_hat_k ~ N(0, v_k),   v_k = sum of the parts,   band: y_hat_k -+ quantile(level) sqrt(v_k)
 
-    The run starts from the first `n_init` samples, like every free run. The variance of a sample adds up
-    parameters (by the covariance of the fit, with the first state that follows them), the first state (by the
-    noise of the samples that it is estimated on), parameters that each recording has for itself (by their
-    spread), process torques (by the linear part of the machine), the noise of the sensors, and what the model
-    lacks. That is a constant for each channel, so large that bands over `known` recordings hold the share
-    `level` of their samples; without any as large as the residuals of the fit beyond the sensor's noise, and
-    nothing where these are of predictions, which do not show what a free run misses. Of several models with
-    weights the band is that of the mixture.
+    The run starts from the first `n_init` samples, like every free run; memories that no sensor shows, such
+    as that of a friction, are estimated from them too where the recording does not start at rest. The
+    variance of a sample adds up parameters (by the covariance of the fit, with the first state that follows
+    them), the first state (by the noise of the samples that it is estimated on), parameters that each
+    recording has for itself (by their spread), process torques (by the linear part of the machine), the
+    noise of the sensors, and what the model lacks. That is a constant for each channel, so large that bands
+    over `known` recordings hold the share `level` of their samples; without any as large as the residuals of
+    the fit beyond the sensor's noise, and nothing where these are of predictions, which do not show what a
+    free run misses. Of several models with weights the band is that of the mixture.
 
     Everything is propagated to first order: not for a run in which a small change of a parameter decides
     between two motions.
@@ -259,30 +263,41 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
     names = m.parameter_names
     free = np.array([names.index(n) for n in fitted.free_names], int)
     y = model.measured(recording).astype(float)
-    start = model.states_at(recording, np.array([0]))
-    y_hat, J = _slopes(model, m, recording, start, free)
+    noise = sensor_noise([recording], model)
+    moving, F = 2 * len(m.coordinates), len(free)
+    start = model.states_at(recording, np.array([0]))[0]
+    unseen = _unseen(model, recording, start, moving)
+
+    def run(state: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+        """Outputs; slopes by parameters, positions, speeds, and by shares of what no sensor shows."""
+        y_hat, J = _slopes(model, m, recording, state[None], free)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a run that diverges, which is refused below
+            return y_hat, np.concatenate([J[..., : F + moving], J[..., F + moving :] @ unseen], axis=-1)
+
+    if unseen.size:
+        start = _first_state(run, start, unseen, y, noise, recording.n_init, F)
+    y_hat, J = run(start)
     if not (np.isfinite(y_hat).all() and np.isfinite(J).all()):
         raise InputError(
             "The model diverges over a recording, so that it has no bands; fit it first, or leave the "
             "recording out."
         )
-    noise = sensor_noise([recording], model)
     known = np.array([n in recording.constants for n in fitted.free_names], bool)
-    J[..., : len(free)][..., known] = 0.0
-    # The first positions and speeds are the least-squares answer on the first samples, channels as they are,
-    # given parameters and states that no sensor shows.
-    head, moving, F = slice(0, recording.n_init), 2 * len(m.coordinates), len(free)
-    J = np.concatenate([J[..., :F], J[..., F + moving :], J[..., F : F + moving]], axis=-1)
-    first, by = J[head, :, -moving:], J[head, :, :-moving]
-    H = np.einsum("ncs,nct->st", first, first)
+    J[..., :F][..., known] = 0.0
+    # The first state is the least-squares answer on the first samples, given the parameters.
+    by, first = J[: recording.n_init, :, :F], J[: recording.n_init, :, F:]
+    if unseen.size:
+        weight, prior = 1 / noise**2, np.diag([0.0] * moving + [1.0] * unseen.shape[1])
+    else:
+        weight, prior = np.ones_like(noise), 0.0  # channels as they are, as a free run starts
+    H = np.einsum("ncs,c,nct->st", first, weight, first) + prior
     inverse = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
-    follows = -inverse @ np.einsum("ncs,ncp->sp", first, by)
-    cov_start = inverse @ np.einsum("ncs,c,nct->st", first, noise**2, first) @ inverse
-    whole = J[..., :-moving] + np.einsum("ncs,sp->ncp", J[..., -moving:], follows)
-    unseen = _unseen(model, recording, start[0], moving)
+    follows = -inverse @ np.einsum("ncs,c,ncp->sp", first, weight, by)
+    scatter = np.einsum("ncs,c,nct->st", first, (weight * noise) ** 2, first) + prior
+    whole = J[..., :F] + J[..., F:] @ follows
     parts = {
-        "parameters": _propagated(whole[..., :F], _finite(fitted.covariance)),
-        "first state": _propagated(J[..., -moving:], cov_start) + _propagated(whole[..., F:], unseen),
+        "parameters": _propagated(whole, _finite(fitted.covariance)),
+        "first state": _propagated(J[..., F:], inverse @ scatter @ inverse),
         "sensor": np.broadcast_to(noise**2, y.shape),
     }
     own = np.zeros_like(y)
@@ -299,18 +314,89 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
 
 def _unseen(
     model: Model, recording: Recording, start: Float[np.ndarray, " n"], moving: int
-) -> Float[np.ndarray, "h h"]:
-    """Covariance of the first states that no sensor shows, such as that of a friction with memory.
+) -> Float[np.ndarray, "h k"]:
+    """Spread of the first states that no sensor shows, such as that of a friction with memory.
 
     A recording that starts at rest, or goes on where another ended, is taken to start as the model has it.
     Otherwise these states may be as far from there as they ever are in a run over the recording.
+
+    Returns:
+        A root of their covariance, without columns where nothing is spread.
     """
     X = model.simulate_states(recording)
     n = moving // 2
     speed = np.sqrt(np.mean(np.square(X[:, n:moving]), axis=0))
     resting = bool(np.all(np.abs(start[n:moving]) < AT_REST * speed))
-    error = np.where(resting or recording.continues is not None, 0.0, X[:, moving:] - start[moving:])
-    return error.T @ error / len(X)
+    if resting or recording.continues is not None or not np.isfinite(X).all():
+        return np.zeros((len(start) - moving, 0))
+    error = X[:, moving:] - start[moving:]
+    size, axes = np.linalg.eigh(error.T @ error / len(X))
+    kept = size > 1e-12 * max(size.max(initial=0.0), 1e-300)
+    return axes[:, kept] * np.sqrt(size[kept])
+
+
+def _first_state(
+    run: Callable[[Float[np.ndarray, " n"]], tuple[np.ndarray, np.ndarray]],
+    start: Float[np.ndarray, " n"],
+    unseen: Float[np.ndarray, "h k"],
+    y: Float[np.ndarray, "N C"],
+    noise: Float[np.ndarray, " C"],
+    n_init: int,
+    parameters: int,
+) -> Float[np.ndarray, " n"]:
+    """The first state that the first samples ask for, memories included.
+
+        minimise  sum_k |(y_k - y_hat_k(x0)) / noise|^2 + |c|^2,   x0 = start + (moving, unseen c)
+
+    Where a friction remembers decides how far the machine moves before it slides, so the first samples show
+    it, and a run that starts from none of it is off by a constant ever after.
+
+    Args:
+        run: Outputs and slopes from a first state.
+        start: Where the search begins.
+        unseen: Root of the covariance of the states that no sensor shows.
+        y: What was measured.
+        noise: Of the sensors.
+        n_init: Samples that may be used.
+        parameters: Columns of the slopes that are of parameters.
+    """
+    moving = len(start) - len(unseen)
+
+    def state(x: np.ndarray) -> np.ndarray:
+        return start + np.concatenate([x[:moving], unseen @ x[moving:]])
+
+    def evaluated(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        y_hat, J = run(state(x))
+        e = ((y - y_hat) / noise)[:n_init].ravel()
+        S = (J[:n_init, :, parameters:] / noise[:, None]).reshape(len(e), -1)
+        c = np.concatenate([np.zeros(moving), x[moving:]])
+        finite = np.isfinite(e).all() and np.isfinite(S).all()
+        return (float(e @ e + c @ c) if finite else np.inf), e, S
+
+    best, least = np.zeros(moving + unseen.shape[1]), np.inf
+    axes = np.eye(len(best))[moving:]
+    for x in (0.0 * best, *axes, *-axes):  # a play may rest on either side
+        cost, e, S = evaluated(x)
+        for _ in range(FIRST_STATE_STEPS):
+            if not np.isfinite(cost):
+                break
+            prior = np.diag([0.0] * moving + [1.0] * unseen.shape[1])
+            H = S.T @ S + prior
+            step = np.linalg.lstsq(H, S.T @ e - prior @ x, rcond=1e-12)[0]
+            for _ in range(HALVED_STEPS):
+                tried = evaluated(x + step)
+                if tried[0] < cost:
+                    break
+                step = step / 2
+            else:
+                break
+            gained, x = cost - tried[0], x + step
+            cost, e, S = tried
+            if gained < ENOUGH_GAIN:
+                break
+        if cost < least:
+            best, least = x, cost
+    return state(best)
 
 
 def _finite(covariance: np.ndarray) -> np.ndarray:

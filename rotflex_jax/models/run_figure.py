@@ -1,5 +1,6 @@
 """Figure of measured against simulated outputs, with errors and the fit of each model."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +14,10 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.text.colours import FINAL, MEASURED, stage_colours
 from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.plotting import blank, styled, thinned
+from rotflex_jax.text.zoom import Line, LinePanel, LineView
+
+# A model that runs away must not hide what was measured: scales go no further than so many spans of it.
+MOST_SPANS, MOST_ERROR_SPANS = 2.0, 3.0
 
 
 @styled
@@ -57,23 +62,66 @@ def _channel(
 ) -> None:
     t, measured = recording.t, scale * recording.channel(channel).astype(float)
     above.plot(*thinned(t, measured), color=MEASURED, lw=2.6, label="measured", solid_capstyle="round")
-    colours = stage_colours(len(runs)) if len(runs) > 1 else (FINAL,)
-    for (name, values), colour in zip(runs, colours, strict=True):
+    for (name, values), colour in zip(runs, _colours(len(runs)), strict=True):
         run = np.where(np.isfinite(values), scale * values, np.nan)
         label = f"{name}: {_quality(recording, measured, run, read)}"
         above.plot(*thinned(t, run), color=colour, lw=1.1, label=label)
         below.plot(*thinned(t, measured - run), color=colour, lw=0.9)
-    # A model that runs away must not hide what was measured.
-    low, high = float(measured.min()), float(measured.max())
-    span = (high - low) or 1.0
-    shown = above.get_ylim()
-    above.set_ylim(max(shown[0], low - 2 * span), min(shown[1], high + 2 * span))
-    limit = below.get_ylim()
-    below.set_ylim(max(limit[0], -3 * span), min(limit[1], 3 * span))
+    for ax, (low, high) in zip((above, below), _limits(measured), strict=True):
+        shown = ax.get_ylim()
+        ax.set_ylim(max(shown[0], low), min(shown[1], high))
     above.margins(x=0)
     above.set_ylabel(f"{channel} [{read}]")
     below.set_ylabel(f"error [{read}]")
     above.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
+
+
+def _limits(measured: Float[np.ndarray, " N"]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What the scales of a channel and of its errors do not go beyond."""
+    low, high = float(measured.min()), float(measured.max())
+    span = (high - low) or 1.0
+    error = MOST_ERROR_SPANS * span
+    return (low - MOST_SPANS * span, high + MOST_SPANS * span), (-error, error)
+
+
+def run_panels(
+    label: str, below: str, measured: Float[np.ndarray, " N"], runs: Sequence[Line], band: float = 0.0
+) -> tuple[LinePanel, LinePanel]:
+    """Measured and simulated values of one channel to zoom, and the differences under them.
+
+    Args:
+        label: Of the upper scale, with its unit.
+        below: Of the lower one.
+        measured: What was measured.
+        runs: What models give.
+        band: Half width of what the sensor alone makes of the differences.
+    """
+    errors = tuple(dataclasses.replace(r, values=measured - r.values, width=1.0) for r in runs)
+    limits, error_limits = _limits(measured)
+    return (
+        LinePanel(label, (Line("measured", MEASURED, measured, 2.8), *runs), 190, limits=limits),
+        LinePanel(below, errors, 120, band, error_limits),
+    )
+
+
+def run_view(
+    recording: Recording, channels: Sequence[str], runs: Sequence[tuple[str, Float[np.ndarray, "N C"]]]
+) -> LineView:
+    """The same as `run_figure` to pan and zoom."""
+    panels = list[LinePanel]()
+    for c, channel in enumerate(channels):
+        scale, read = readable(1.0, recording.units[recording.channels.index(channel)])
+        lines = [
+            Line(name, colour, scale * y[:, c])
+            for (name, y), colour in zip(runs, _colours(len(runs)), strict=True)
+        ]
+        measured = scale * recording.channel(channel).astype(float)
+        panels += run_panels(f"{channel} [{read}]", f"error [{read}]", measured, lines)
+    return LineView(float(recording.t[0]), recording.Ts, tuple(panels))
+
+
+def _colours(count: int) -> tuple[str, ...]:
+    return stage_colours(count) if count > 1 else (FINAL,)
 
 
 def _quality(recording: Recording, measured: Any, run: Any, read: str) -> str:

@@ -75,6 +75,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "ranking": [_ranked(r, outcome) for r, outcome in outcomes(discovery)],
         "hidden": sum(not r.excited for r in discovery.ranking),
         "parameters": parameter_rows(discovery),
+        "known": [together(s) for s in explanation.known.sentences] if explanation.known else [],
         "recordings": _recordings(discovery),
         "settings": _settings(discovery),
         "model": str(discovery.model.mechanism),

@@ -16,7 +16,7 @@ from rotflex_jax.models.residual_tests import (
     frequency_response,
     residual_tests,
 )
-from rotflex_jax.models.run_figure import run_figure
+from rotflex_jax.models.run_figure import run_figure, run_view
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.residuals import residual_figure, response_figure
 from rotflex_jax.text.markup import as_json, fill_template, write_files
@@ -148,17 +148,17 @@ def _content(simulation: Simulation) -> dict[str, Any]:
 
 
 def _run_pictures(simulation: Simulation) -> list[Picture]:
-    channels = list(simulation.units)
-    figure = run_figure(
-        simulation.recording, channels, [(NAME, np.asarray(simulation.simulated, float))], "One free run"
+    given = (
+        simulation.recording,
+        list(simulation.units),
+        [(NAME, np.asarray(simulation.simulated, float))],
     )
     caption = (
         "Where the coloured line covers the grey one, the model is right. Fit is 100 % for a perfect model, "
         "0 for one that is as good as the mean. Lower rows: measured minus simulated."
     )
-    return [
-        Picture("runs", figure, caption, "Measured and simulated outputs over time, with their differences.")
-    ]
+    description = "Measured and simulated outputs over time, with their differences."
+    return [Picture("runs", run_figure(*given, "One free run"), caption, description, run_view(*given))]
 
 
 def _test_pictures(simulation: Simulation) -> list[Picture]:

@@ -3,7 +3,8 @@
 INK, MUTED, FAINT, AXIS = "#1f2933", "#66727f", "#d5dbe1", "#aeb7c0"
 MEASURED, BASELINE, FINAL, NOISE = "#9aa5b1", "#c8452f", "#0f6f86", "#5b6570"
 # Line of a baseline beside the solid one of a final model, so that no colour is needed to tell them apart.
-BASELINE_LINE = (0, (6, 1.5, 1, 1.5))
+BASELINE_DASH = (6, 1.5, 1, 1.5)
+BASELINE_LINE = (0, BASELINE_DASH)
 # Of further lines, in this order.
 FURTHER = ("#d98e04", "#7a5aa6", "#5f8f3a", "#b5587f")
 # Backgrounds: a stretch of time that is pointed at, and cells of a map without data.

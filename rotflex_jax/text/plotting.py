@@ -1,13 +1,14 @@
 """The style of the figures, without global state of pyplot, and the figures of a page with their captions."""
 
-import base64
 import dataclasses
 import functools
 import inspect
 import io
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
+from urllib.parse import quote
 
 import matplotlib
 import numpy as np
@@ -19,10 +20,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from rotflex_jax.text.colours import AXIS, INK, MUTED
+from rotflex_jax.text.zoom import LineView, MapView, as_text
 
 P = ParamSpec("P")
 Drawn = TypeVar("Drawn", bound=Figure | None)
 Caption = str | Callable[..., str]
+Zoom = Callable[..., LineView | MapView | None] | None
 
 _STYLE: Any = {
     "font.size": 9.0,
@@ -125,10 +128,24 @@ _SIGNS = str.maketrans({",": "\u202f", "-": "−"})
 
 def data_address(figure: Figure) -> str:
     """The figure as an SVG image inside an address, so that a page needs no other file."""
-    buffer = io.BytesIO()
+    buffer = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    svg = _UNUSED.sub("", buffer.getvalue())
+    svg = _COORDINATES.sub(lambda found: _LONG_NUMBER.sub(_rounded, found[0]), svg)
+    # A third less than in base 64, and a page is to stay small enough to be sent.
+    return "data:image/svg+xml;charset=utf-8," + quote(" ".join(svg.split()), safe=_KEPT)
+
+
+# What no browser reads: a document type, and metadata with addresses of vocabularies.
+_UNUSED = re.compile(r"<!DOCTYPE[^>]*>|<metadata>.*?</metadata>", re.DOTALL)
+# Coordinates [1/72 inch] are written to a hundredth, which nobody can see.
+_COORDINATES, _LONG_NUMBER = re.compile(r' (?:d|x|y)="[^"]*"'), re.compile(r"-?\d+\.\d{3,}")
+_KEPT = " =:/,;()!$*@?[]{}|^`~+"
+
+
+def _rounded(number: re.Match[str]) -> str:
+    return f"{float(number[0]):.2f}".rstrip("0").rstrip(".")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,29 +157,35 @@ class Picture:
         figure: What is drawn.
         caption: One or two sentences: what to see.
         description: For those who cannot see it.
+        zoom: The same to pan and zoom, on a page that carries the script; None for a still picture.
     """
 
     section: str
     figure: Figure
     caption: str
     description: str
+    zoom: LineView | MapView | None = None
 
     @property
     def on_page(self) -> dict[str, Any]:
-        """What a template needs: address, width [% of the page], caption and description."""
-        width = round(10 * self.figure.get_figwidth())
-        texts = {"caption": self.caption, "description": self.description}
-        return {"address": data_address(self.figure), "width": width, **texts}
+        """What a template needs: address, width [% of the page], caption, description, data to zoom."""
+        return {
+            "address": data_address(self.figure),
+            "width": round(10 * self.figure.get_figwidth()),
+            "caption": self.caption,
+            "description": self.description,
+            "zoom": as_text(self.zoom) if self.zoom else "",
+        }
 
 
 class FigureRegistry:
     """The figures of one kind of page: each stands with its caption where it is drawn."""
 
     def __init__(self) -> None:
-        self._entries: list[tuple[str, str, Callable[..., Figure | None], Caption, str]] = []
+        self._entries: list[tuple[str, str, Callable[..., Figure | None], Caption, str, Zoom]] = []
 
     def figure(
-        self, name: str, *, section: str, caption: Caption, description: str
+        self, name: str, *, section: str, caption: Caption, description: str, zoom: Zoom = None
     ) -> Callable[[Callable[P, Drawn]], Callable[P, Drawn]]:
         """Enter a function that draws a figure, or None where there is nothing to show.
 
@@ -171,11 +194,12 @@ class FigureRegistry:
             section: Of the page, where it stands, after those entered before it.
             caption: What to see; or a function that says so of what is drawn.
             description: For those who cannot see it.
+            zoom: Gives the same to pan and zoom; a still picture without.
         """
 
         def enter(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
             drawing = styled(draw)
-            self._entries.append((name, section, drawing, caption, description))
+            self._entries.append((name, section, drawing, caption, description, zoom))
             return drawing
 
         return enter
@@ -187,11 +211,12 @@ class FigureRegistry:
             subjects: What is drawn. Functions and captions are given as many of them as they take.
         """
         drawn = {}
-        for name, section, draw, caption, description in self._entries:
+        for name, section, draw, caption, description, zoom in self._entries:
             figure = _given(draw, subjects)
             if figure is not None:
                 text = caption if isinstance(caption, str) else _given(caption, subjects)
-                drawn[name] = Picture(section, figure, text, description)
+                view = _given(zoom, subjects) if zoom else None
+                drawn[name] = Picture(section, figure, text, description, view)
         return drawn
 
 

@@ -1,7 +1,11 @@
 """Figures of where the error occurs: maps over speed and deflection, and one profile per place."""
 
+import dataclasses
+
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.signal import savgol_filter
@@ -14,6 +18,7 @@ from rotflex_jax.report.figures.runs import Shown, shown
 from rotflex_jax.text.colours import BASELINE, INK, NO_DATA
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above
+from rotflex_jax.text.zoom import MapView, PlaneMap
 
 # Cells of a map along each axis, and samples without which one stays blank.
 MAP_CELLS, MIN_CELL_SAMPLES = 13, 8
@@ -115,62 +120,137 @@ def _map_caption(discovery: SearchResult) -> str:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class _Maps:
+    """What the maps of the residuals are drawn from.
+
+    Attributes:
+        over: Coordinates of each sample.
+        labels: Of both coordinates.
+        edges: Of the cells along both.
+        error: Of the baseline.
+        lacking: Title -> acceleration that a model lacks; not a number where it is unknown.
+        channel: Whose error it is.
+        units: Of the error and of the acceleration, in brackets.
+        floor: Errors up to this are noise.
+        usual: Accelerations up to this are noise.
+    """
+
+    over: list[np.ndarray]
+    labels: list[str]
+    edges: list[np.ndarray]
+    error: np.ndarray
+    lacking: dict[str, np.ndarray]
+    channel: str
+    units: tuple[str, str]
+    floor: float
+    usual: float
+
+    def mean(self, values: np.ndarray) -> np.ma.MaskedArray:
+        """Means over cells; cells that hardly any sample lies in are masked."""
+        seen = np.isfinite(values)
+        at = self.over[0][seen], self.over[1][seen]
+        count = np.histogram2d(*at, self.edges)[0]
+        total = np.histogram2d(*at, self.edges, weights=values[seen])[0]
+        return np.ma.masked_where(count < MIN_CELL_SAMPLES, total / np.maximum(count, 1))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Error and acceleration of the strongest colours: what is noise is to look pale."""
+        errors = _largest([np.ma.sqrt(self.mean(self.error**2))])
+        lacking = _largest([self.mean(v) for v in self.lacking.values()])
+        return max(errors, 4 * self.floor) or 1.0, max(lacking, 4 * self.usual) or 1.0
+
+
+def _maps(discovery: SearchResult) -> _Maps:
+    s, by_channel = shown(discovery), channel_units(discovery)
+    channel = worst_channel(discovery)
+    c, unit = list(by_channel).index(channel), by_channel[channel]
+    over, labels = _grid(discovery, s)
+    scale, read = readable(1.0, unit)
+    order = 1 if unit.endswith("/s") else 2
+    lacking = {}
+    for run, label in ((s.baseline, "baseline"), (s.final, "final model")):
+        if run is not None:
+            e = scale * (s.measured[:, c] - run[:, c])
+            values, seen = missing_acceleration(e, s.recording, s.starts.tolist(), order)
+            lacking[f"{label}: what it lacks"] = np.where(seen, values, np.nan)
+    pulse = np.eye(1, s.recording.N, s.recording.N // 2)[0]
+    weights = missing_acceleration(pulse, s.recording, order=order)[0]
+    floor = scale * discovery.noise_floor.get(channel, 0.0)
+    return _Maps(
+        over=over,
+        labels=labels,
+        edges=_cells(over),
+        error=scale * (s.measured[:, c] - s.baseline[:, c]),
+        lacking=lacking,
+        channel=channel,
+        units=(f"[{read}]", f"[{read}/s{'²' if order == 2 else ''}]"),
+        floor=floor,
+        usual=floor * float(np.linalg.norm(weights)),
+    )
+
+
+ERROR_COLOURS, SIGNED_COLOURS = "YlOrRd", "RdBu_r"
+# Steps of a colour scale in a browser.
+COLOUR_STEPS = 33
+ERROR_TITLE = "baseline: rms error"
+
+
+def _map_view(discovery: SearchResult) -> MapView:
+    """The maps to pan and zoom."""
+    m = _maps(discovery)
+    largest, strongest = m.limits
+
+    def colours(name: str) -> tuple[str, ...]:
+        return tuple(to_hex(colour) for colour in colormaps[name](np.linspace(0, 1, COLOUR_STEPS)))
+
+    first = PlaneMap(ERROR_TITLE, m.error, m.units[0], colours(ERROR_COLOURS), (0.0, largest), squared=True)
+    signed, limits = colours(SIGNED_COLOURS), (-strongest, strongest)
+    others = [PlaneMap(title, v, m.units[1], signed, limits) for title, v in m.lacking.items()]
+    x, y = ((float(e[0]), float(e[-1])) for e in m.edges)
+    return MapView(
+        x=m.over[0],
+        y=m.over[1],
+        labels=(m.labels[0], m.labels[1]),
+        ranges=(x, y),
+        maps=(first, *others),
+        cells=MAP_CELLS,
+        least=MIN_CELL_SAMPLES,
+    )
+
+
 @figure(
     "map",
     section="where",
     caption=_map_caption,
     description="Maps of the held-out error and of the missing acceleration over speed and position.",
+    zoom=_map_view,
 )
 def residual_map(discovery: SearchResult) -> Figure:
     """Error and missing acceleration over speed and deflection, before and after."""
-    s, by_channel = shown(discovery), channel_units(discovery)
-    channel = worst_channel(discovery)
-    c, unit = list(by_channel).index(channel), by_channel[channel]
-    over, labels = _grid(discovery, s)
-    edges = _cells(over)
-
-    def mean(values: np.ndarray, seen: np.ndarray) -> np.ma.MaskedArray:
-        count = np.histogram2d(over[0][seen], over[1][seen], edges)[0]
-        total = np.histogram2d(over[0][seen], over[1][seen], edges, weights=values[seen])[0]
-        return np.ma.masked_where(count < MIN_CELL_SAMPLES, total / np.maximum(count, 1))
-
-    scale, read = readable(1.0, unit)
-    all_samples = np.ones(s.recording.N, bool)
-    error = scale * (s.measured[:, c] - s.baseline[:, c])
-    maps = [(np.ma.sqrt(mean(error**2, all_samples)), "baseline: rms error", f"[{read}]")]
-    order = 1 if unit.endswith("/s") else 2
-    rate = f"[{read}/s{'²' if order == 2 else ''}]"
-    for run, label in ((s.baseline, "baseline"), (s.final, "final model")):
-        if run is not None:
-            e = scale * (s.measured[:, c] - run[:, c])
-            lacks = missing_acceleration(e, s.recording, s.starts.tolist(), order)
-            maps.append((mean(*lacks), f"{label}: what it lacks", rate))
+    m = _maps(discovery)
+    largest, strongest = m.limits
+    maps = [(ERROR_TITLE, np.ma.sqrt(m.mean(m.error**2)))]
+    maps += [(title, m.mean(values)) for title, values in m.lacking.items()]
     figure = blank(10.0 if len(maps) > 2 else 7.5, 3.5)
     axes = figure.subplots(1, len(maps), squeeze=False, sharey=True)[0]
-    # Below these sizes a map is noise, and is to look pale.
-    floor = scale * discovery.noise_floor.get(channel, 0.0)
-    pulse = np.eye(1, s.recording.N, s.recording.N // 2)[0]
-    weights = missing_acceleration(pulse, s.recording, order=order)[0]
-    usual = floor * float(np.linalg.norm(weights))
-    limit = max(_largest([m[0] for m in maps[1:]]), 4 * usual) or 1.0
-    signed = {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r"}
-    sized = {"vmin": 0.0, "vmax": max(_largest([maps[0][0]]), 4 * floor) or 1.0, "cmap": "YlOrRd"}
-    meshes = [
-        ax.pcolormesh(*edges, values.T, **(signed if k else sized))
-        for k, (ax, (values, _, _)) in enumerate(zip(axes, maps, strict=True))
-    ]
-    for ax, (_, title, _) in zip(axes, maps, strict=True):
+    sized = {"vmin": 0.0, "vmax": largest, "cmap": ERROR_COLOURS}
+    signed = {"vmin": -strongest, "vmax": strongest, "cmap": SIGNED_COLOURS}
+    meshes = []
+    for ax, (title, values), style in zip(axes, maps, [sized] + [signed] * len(m.lacking), strict=True):
+        meshes.append(ax.pcolormesh(*m.edges, values.T, **style))
         ax.set_facecolor(NO_DATA)
         ax.grid(False)
         ax.set_title(title)
-        ax.set_xlabel(labels[0])
-    axes[0].set_ylabel(labels[1])
-    what = "acceleration" if order == 2 else "change"
+        ax.set_xlabel(m.labels[0])
+    axes[0].set_ylabel(m.labels[1])
+    what = "acceleration" if m.units[1].endswith("²]") else "change"
     bar_style = {"orientation": "horizontal", "pad": 0.02}
     first = figure.colorbar(meshes[0], ax=[axes[0]], aspect=20, **bar_style)
-    first.set_label(f"rms error of {channel} {maps[0][2]}")
+    first.set_label(f"rms error of {m.channel} {m.units[0]}")
     second = figure.colorbar(meshes[1], ax=axes[1:].tolist(), aspect=20 * (len(maps) - 1), **bar_style)
-    second.set_label(f"missing {what} of {channel} {rate}")
+    second.set_label(f"missing {what} of {m.channel} {m.units[1]}")
     for bar in (first, second):
         bar.locator = MaxNLocator(5)
         bar.update_ticks()

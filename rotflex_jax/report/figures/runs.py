@@ -15,11 +15,22 @@ from rotflex_jax.discover.result import SearchResult, Stage
 from rotflex_jax.discover.tables import channel_units
 from rotflex_jax.latent.figure import latent_maps, latent_time
 from rotflex_jax.metrics import window_starts
+from rotflex_jax.models.run_figure import run_panels
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.registry import figure
-from rotflex_jax.text.colours import BASELINE, BASELINE_LINE, FAINT, FINAL, HIGHLIGHT, MEASURED, NOISE
+from rotflex_jax.text.colours import (
+    BASELINE,
+    BASELINE_DASH,
+    BASELINE_LINE,
+    FAINT,
+    FINAL,
+    HIGHLIGHT,
+    MEASURED,
+    NOISE,
+)
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, thinned
+from rotflex_jax.text.zoom import Line, LinePanel, LineView, Stretch
 
 # Longer recordings are shown in part [s]; the errors are those of the whole.
 OVERLAY_SECONDS = 30.0
@@ -74,10 +85,39 @@ def worst_window(discovery: SearchResult) -> tuple[int, int]:
 
 def _overlay_caption(discovery: SearchResult) -> str:
     long = shown(discovery).recording.duration > OVERLAY_SECONDS
-    part = f" {OVERLAY_SECONDS:g} s of it are shown." if long else ""
+    part = f" In the still picture {OVERLAY_SECONDS:g} s of it are shown." if long else ""
     return (
         "Top rows: where a thin line covers the broad grey one, the model is right. Bottom rows: "
         f"measured minus simulated; the grey band is what the sensor alone makes.{part}"
+    )
+
+
+def _overlay_view(discovery: SearchResult) -> LineView:
+    """The whole held-out recording to pan and zoom."""
+    s = shown(discovery)
+    runs: list[tuple[np.ndarray, str, str, tuple[float, ...]]] = [
+        (s.baseline, BASELINE, "baseline", BASELINE_DASH)
+    ]
+    if s.final is not None:
+        runs.append((s.final, FINAL, "final model", ()))
+    panels = list[LinePanel]()
+    for c, (channel, unit) in enumerate(channel_units(discovery).items()):
+        scale, read = readable(1.0, unit)
+        panels += run_panels(
+            f"{channel} [{read}]",
+            f"error [{read}]",
+            scale * s.measured[:, c],
+            [Line(label, colour, scale * run[:, c], dash=dash) for run, colour, label, dash in runs],
+            2 * scale * discovery.noise_floor.get(channel, 0.0),
+        )
+    t = s.recording.t
+    first, last = worst_window(discovery)
+    return LineView(
+        start=float(t[0]),
+        Ts=s.recording.Ts,
+        panels=tuple(panels),
+        stretches=(Stretch("Where the baseline is worst", float(t[first]), float(t[last - 1])),),
+        marks=tuple(t[s.starts[1:]].tolist()),
     )
 
 
@@ -86,6 +126,7 @@ def _overlay_caption(discovery: SearchResult) -> str:
     section="runs",
     caption=_overlay_caption,
     description="Measured and simulated outputs over time on held-out data, with their differences.",
+    zoom=_overlay_view,
 )
 def overlay(discovery: SearchResult) -> Figure:
     """Measured and simulated outputs on held-out data, with errors; the worst window enlarged."""
