@@ -27,13 +27,7 @@ the tables and figures beside it are of all its records.
 from __future__ import annotations
 
 import argparse
-import datetime
-import hashlib
-import importlib.metadata
 import json
-import os
-import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -55,6 +49,7 @@ from arena.probability import drawn_probabilities, summary
 from arena.table import answer, label, show
 from arena.wrong_seeds import REPORT as WORLDS_REPORT, TUNING as WORLDS_TUNING
 from arena.wrong_table import publish_worlds, show_worlds
+from origin import begin
 from rotflex_jax.arena.simulator.draws import drawn
 from rotflex_jax.arena.simulator.hidden import DEFAULTS, OUTSIDE
 from rotflex_jax.arena.simulator.records import INPUTS
@@ -164,30 +159,6 @@ def rows(
         left = broken
 
 
-def provenance() -> dict[str, Any]:
-    """What produced the numbers."""
-    code, arena = hashlib.sha256(), hashlib.sha256()
-    for file in sorted((HERE.parent / "rotflex_jax").rglob("*.py")):
-        code.update(file.read_bytes())
-    simulator = HERE.parent / "rotflex_jax" / "arena" / "simulator"
-    for file in sorted([*(HERE / "arena").glob("*.py"), *simulator.glob("*.py")]):
-        arena.update(file.read_bytes())
-    git = lambda *a: subprocess.run(  # noqa: E731
-        ["git", "-C", str(HERE), *a], capture_output=True, text=True, check=False
-    ).stdout.strip()
-    return {
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "commit": git("rev-parse", "--short", "HEAD"),
-        "changed": bool(git("status", "--porcelain", "--", "../rotflex_jax")),
-        "clean": not git("status", "--porcelain"),
-        "code": code.hexdigest()[:12],
-        "arena": arena.hexdigest()[:12],
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "versions": {n: importlib.metadata.version(n) for n in ("jax", "numpy", "scipy")},
-    }
-
-
 def save(path: Path, results: dict[str, Any]) -> None:
     """Write at once or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -242,12 +213,11 @@ def main() -> int:
     wanted = [{"world": s} for s in seeds] if a.wrong_worlds else jobs(a, seeds, inputs)
     if a.tuning:  # what probabilities are calibrated from
         wanted = [{**job, "keep_evidence": True} for job in wanted]
-    made = provenance()
     title = "B0, wrong worlds" if a.wrong_worlds else "B0"
     results: dict[str, Any] = {"benchmark": title, "runs": [], "records": {}}
     if path.exists() and not a.fresh:
         results = json.loads(path.read_text())
-    results["runs"].append({**made, "arguments": sys.argv[1:]})
+    made = begin(results, __file__, sys.argv[1:])
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
     known = results["records"]
     todo = [j for j in wanted if key(j) not in known or "error" in known[key(j)]]

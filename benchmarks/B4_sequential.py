@@ -19,12 +19,15 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import rotflex_jax as rf
+from origin import begin
 from rotflex_jax.arena.marking import renamed
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.data import excitation
@@ -302,16 +305,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     given = parser.parse_args()
     began, file = time.monotonic(), given.out / "B4_sequential.json"
-    rows = json.loads(file.read_text())["rows"] if file.exists() else []
+    found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"schema": 1, "rows": []}
+    made, rows = begin(found, __file__, sys.argv[1:]), found["rows"]
     have = {(r["case"], r["seed"], r["hopeless"]) for r in rows}
     todo = [(n, s, True) for s in given.hopeless for n in HOPELESS]
     todo += [(n, s, False) for s in given.seeds for n in given.cases]
     for name, seed, hopeless in todo:
         if (name, seed, hopeless) in have or time.monotonic() - began > 60 * given.minutes:
             continue
-        rows.append(trial(name, seed, lambda s: print(s, flush=True), hopeless, given.alone))
+        row = trial(name, seed, lambda s: print(s, flush=True), hopeless, given.alone)
+        rows.append({**row, "code": made["code"]})
         given.out.mkdir(exist_ok=True, parents=True)
-        write_file(file, json.dumps({"schema": 1, "rows": rows}, indent=1) + "\n")
+        write_file(file, json.dumps(found, indent=1) + "\n")
         write_file(file.with_suffix(".md"), summary(rows))
     print(summary(rows))
 

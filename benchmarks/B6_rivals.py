@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 import B0_discovery as B0
+from origin import begin
 
 HERE = Path(__file__).resolve().parent
 NAMES = (
@@ -194,7 +195,7 @@ def main() -> int:
     results: dict[str, Any] = {"benchmark": "B6", "runs": [], "rows": {}}
     if path.exists():
         results = json.loads(path.read_text())
-    results["runs"].append({**B0.provenance(), "arguments": vars(a)})
+    made = begin(results, __file__, vars(a))
     whole = argparse.Namespace(pairs=0, triples=0, size="1", channels="both", only=a.only)
     whole.nulls, whole.seconds = a.nulls, a.seconds
     base = B0.jobs(whole, seeds, [a.input])
@@ -206,7 +207,7 @@ def main() -> int:
     console.print(f"{len(wanted)} rows, {len(todo)} to run")
     began = time.perf_counter()
     for count, (job, row) in enumerate(rows(todo, a.workers), 1):
-        known[key(job)] = row
+        known[key(job)] = {"code": made["code"], **row}
         B0.save(path, results)
         left = (time.perf_counter() - began) / count * (len(todo) - count)
         found = " + ".join(f"{r['effect']}@{r['port']}" for r in row.get("rounds", [])) or "nothing"

@@ -26,9 +26,18 @@ def named(function: Callable[[], str]) -> Callable[[], str]:
     return function
 
 
-@functools.cache
+ASKED: set[str] = set()
+"""Files of results that were asked for since this was last emptied."""
+
+
 def results(file: str) -> Any:
     """A file of results."""
+    ASKED.add(file)
+    return _read(file)
+
+
+@functools.cache
+def _read(file: str) -> Any:
     return json.loads((RESULTS / file).read_text(encoding="utf-8"))
 
 
@@ -599,7 +608,8 @@ BESIDE = {
 
 def _cost(row: str) -> float:
     """Processor time of a row of the table of speed, in the unit of its table."""
-    groups = [g for part in results("B7.json").values() for g in part.get("groups", [])]
+    parts = (part for part in results("B7.json").values() if isinstance(part, dict))
+    groups = [g for part in parts for g in part.get("groups", [])]
     return next(r["cpu"] for g in groups for r in g["rows"] if r["name"] == row)
 
 
@@ -625,7 +635,7 @@ for _name, (_row_name, _base) in BESIDE.items():
 
 
 def _mutants() -> list[dict[str, Any]]:
-    return list(results("mutants.json").values())
+    return list(results("mutants.json")["mutants"].values())
 
 
 @named
@@ -655,5 +665,5 @@ def mutants_same() -> str:
 @named
 def mutants_fresh() -> str:
     """How many of a second sample were noticed when they were drawn."""
-    rows = results("mutants_fresh.json").values()
+    rows = results("mutants_fresh.json")["mutants"].values()
     return f"{sum(r['first'] for r in rows)} of {len(rows)}"
