@@ -1,6 +1,8 @@
 """Probabilities of sets of effects: known evidence, scatter, credible sets, what is told of them."""
 
+import dataclasses
 import json
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +12,7 @@ from scipy.stats import norm
 
 from arena.probability import Event, calibration_error, classes, credible, effect_events, reliability, weighed
 from rotflex_jax.discover.probabilities import (
+    RULE as CALIBRATED,
     EvidenceRule,
     FittedSet,
     Probabilities,
@@ -242,3 +245,15 @@ def test_a_row_is_weighed_again_as_it_was(found):
     kept = [[sorted(s.effects), line(s.prediction), line(s.free_run)] for s in found.evidence]
     again = weighed(row([], evidence=kept), RULE)
     assert again.sets == found.sets and again.effects == found.effects
+
+
+def test_the_rule_is_the_one_that_was_calibrated() -> None:
+    """What `benchmarks/set_probabilities.py` found on tuning seeds."""
+    assert EvidenceRule(5.0, math.inf, 0.2, 2.0, 3.0, 0.02, 0.17) == CALIBRATED
+    sets = [FittedSet(frozenset(), np.zeros(4), np.zeros(4))]
+    for is_explained, elsewhere in ((True, 0.02), (False, 0.17)):
+        found = probabilities(sets, is_explained=is_explained)
+        assert found.elsewhere == elsewhere and found.sets[0].probability == pytest.approx(1 - elsewhere)
+        assert len(found.remarks) == (1 if is_explained else 2)
+        # What they were computed from is neither shown nor compared.
+        assert "FittedSet" not in repr(found) and found == dataclasses.replace(found, evidence=())

@@ -260,3 +260,17 @@ def test_a_parameter_is_a_weighted_sum_of_what_was_fitted() -> None:
     first, held = estimates(["a", "b"], np.array([1.0, 2.0]), [spec] * 2, [sums[0], None], covariance)
     assert first.std == pytest.approx(np.sqrt((W @ covariance @ W.T)[0, 0]))
     assert (held.value, held.free) == (2.0, False) and np.isnan(held.std)
+
+
+def test_an_offset_of_residuals_is_no_correlation() -> None:
+    white = np.random.default_rng(9).standard_normal((COUNT, 1))
+    assert correlation_length(white + 5.0) == correlation_length(white) <= 4
+
+
+def test_what_lies_beyond_one_small_value_is_noise() -> None:
+    """Of a moving average with lags 1 and 3 the second lag is small, so that the third does not count."""
+    w = np.random.default_rng(10).standard_normal(100_000)
+    e = lfilter([1.0, 0.2, 0.0, 0.2], [1.0], w)
+    r = np.array([e[k:] @ e[: len(e) - k] for k in range(5)]) / (e @ e)
+    assert r[1] > 0.1 > 0.05 > r[2] and r[3] > 0.1 and abs(r[4]) < 0.05
+    assert correlation_length(e[:, None]) == 4  # twice the two samples that it lasts

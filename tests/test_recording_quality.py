@@ -9,7 +9,7 @@ from scipy.signal import StateSpace, lsim
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import INPUTS, make_record
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording import Recording
+from rotflex_jax.recording import Recording, quality
 from rotflex_jax.recording.quality import (
     cut_off,
     is_absolute,
@@ -361,3 +361,40 @@ def test_what_is_slow_needs_two_samples_in_the_shortest_period(samples: int, fou
     x = np.cos(np.linspace(0, 4 * np.pi, samples)) + 0.7 * np.random.default_rng(3).normal(size=samples)
     assert is_absolute(x, x) == found
     assert is_swapped(0.1 * x, x) == found
+
+
+def test_what_is_exactly_at_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Powers of two are exact in every sum: signals are brought to the limits, or limits to the signals."""
+    y = np.column_stack([WAVE, 0.1 * WAVE[::-1]])
+    for samples, short in ((49, True), (50, False)):
+        r = Recording(u=U[:samples], y=y[:samples], Ts=TS, accept=quality.ACCEPTABLE)
+        assert any(f.kind == "short" for f in r.findings) == short
+    assert "units voltage" not in kinds(u=100 * U) and np.max(np.abs(100 * U)) == 100.0
+    half_turn = np.where(K % 2, 1.0, -1.0) * np.pi
+    assert "units alpha" not in kinds(alpha=half_turn)
+    # The speed that a servo may just reach, over one sample of a quarter of a second.
+    for volts, speed in ((1.0, 60.0), (10.0, 150.0)):
+        for more, found in ((0.0, False), (1e-9, True)):
+            theta = np.array([0.0, 0.0, 0.25 * speed + more, 0.0])
+            told = quality._like_degrees(theta, volts * np.ones(4), 0.25, "theta", "V")
+            assert (told is not None) == found
+    x = slow(1.0, 1.0)
+    monkeypatch.setattr(quality, "SWAPPED_RATIO", 4.0)
+    assert not is_swapped(x, 4.0 * x) and is_swapped(x, 4.000001 * x)
+    # As much slow motion as is asked for in one band: the rest is in the other.
+    monkeypatch.setattr(quality, "_spectrum", lambda values: np.asarray(values, complex))
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.5)
+    hub = np.zeros(16)
+    hub[1], hub[4] = 3.0, 4.0  # of length five
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.6)
+    assert not is_absolute(hub, hub)
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.59)
+    assert is_absolute(hub, hub)
+    # A slope that is off by the tolerance, and one by more.
+    monkeypatch.setattr(quality, "SLOW_BANDS", ((1, 4, 0.25), (4, 8, 0.25)))
+    assert is_absolute(hub, 1.25 * hub) and not is_absolute(hub, 1.2500001 * hub)
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.06)
+    assert not is_swapped(0.1 * hub, hub)  # ten times as much is asked for
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.059)
+    assert is_swapped(0.1 * hub, hub)
+    assert not is_absolute(hub, 0.0 * hub)
