@@ -157,6 +157,12 @@ def records(
 
 
 @named
+def arena_seen() -> str:
+    """Seeds that are left out."""
+    return " and ".join(map(str, SEEN))
+
+
+@named
 def arena_hidden() -> str:
     """Records with one effect to be found."""
     return str(len(records()))
