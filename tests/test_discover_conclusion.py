@@ -91,6 +91,12 @@ def test_nats_above_the_noise_by_hand(same):
     assert nats_above_noise(tiny, h) == pytest.approx(expected, rel=1e-9)
     huge = dataclasses.replace(at, dataset=dataclasses.replace(at.dataset, noise=NOISE * 1e3))
     assert nats_above_noise(huge, h) == 0.0
+    # Samples that were not seen do not count, however large their error.
+    errors, seen = np.full((1, 8, 1), 2.0), np.arange(8)[None] < 6
+    errors[:, 6:] = 1e6
+    of = {"innovations": lambda hypotheses: [errors], "seen": seen.astype(float), "noise": np.ones(1)}
+    part: Any = SimpleNamespace(**of)
+    assert nats_above_noise(part, h) == pytest.approx(6 * np.log(2.0))
 
 
 def validated(h: Hypothesis) -> ValidatedHypothesis:
