@@ -483,5 +483,12 @@ def test_the_first_effect_with_an_equal_is_asked_about(monkeypatch: pytest.Monke
     assert given == ("the model", ("coulomb", "hub"), ("stribeck", "hub"))
     assert settings["Ts"] == 0.5 and settings["limits"] == seen_limits((short, long))
     np.testing.assert_array_equal(settings["reference"], long.u[:1000])
+    # A line has another phase in the next recording, whether it was found or is the equal.
+    (line,) = (name for name, effect in fx.CATALOG.items() if effect.line)
+    of_a_line = [SimpleNamespace(effect=line, port="input", equivalent=(("cogging", "hub"),))]
+    of_a_line += [SimpleNamespace(effect="cogging", port="hub", equivalent=((line, "input"),))]
+    for first in of_a_line:
+        found.rounds = [first, *rounds]
+        assert proposed(found)[0][1:] == (("coulomb", "hub"), ("stribeck", "hub"))  # pyright: ignore
     found.rounds = rounds[:1]
     assert proposed(found) is None
