@@ -550,7 +550,7 @@ def at_the_limit(monkeypatch, name: str, value: float, decides: Callable[[], boo
     return found
 
 
-UNTIL, UP_TO = [True, False, False], [True, True, False]
+UNTIL, UP_TO, BEYOND = [True, False, False], [True, True, False], [False, False, True]
 NOT_SURE = trial(COULOMB, **PLENTY | {"held_out": 20.0, "train": 50.0, "scatter": 0.3})
 RUNS = of_free_runs(windows=8.0, z=4.0, train_z=5.0)
 UNSURE_RUNS = at_both(not_quite_sure(5.0, windows=9.5), {"windows": 10.0}, COULOMB)
@@ -613,6 +613,18 @@ def lead(a: ValidatedHypothesis, b: ValidatedHypothesis = BASE) -> tuple[float, 
             -float(np.mean(np.log(trial(COULOMB, **GOOD).window_rmse / BASE.window_rmse))),
             lambda: admissible(trial(COULOMB, **GOOD), BASE, DATA, NOISE),
             UNTIL,
+        ),
+        (
+            "WINDOWS_BETTER",
+            float(np.mean(np.log(5.1 * NOISE / (5.0 * NOISE)))),
+            lambda: richer_wins(windows=5.1),
+            BEYOND,
+        ),
+        (
+            "WINDOWS_WORSE",
+            float(np.mean(np.log(1.125 * NOISE / (1.1 * NOISE)))),
+            lambda: admitted(trial(None, windows=1.1), windows=1.125),
+            BEYOND,
         ),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
