@@ -273,6 +273,12 @@ def arena_unexplained() -> str:
 
 
 @named
+def arena_outside_named() -> str:
+    """In how many of them an effect was named, which cannot be right."""
+    return str(sum(bool(r["rounds"]) for r in records(outside=True)))
+
+
+@named
 def arena_over_oracle() -> str:
     """Median of held-out error over that of the true structure, over all records and channels."""
     ratios = sorted(v for r in records() for v in r.get("over_oracle", {}).values())
@@ -501,6 +507,15 @@ def rivals_best() -> str:
 def rivals_count() -> str:
     """How many others there are."""
     return str(len(_rivals()))
+
+
+@named
+def rivals_columns() -> str:
+    """Whether the regressions that are counted had columns for states and for errors of sensors."""
+    counted = set(_rivals()) - {"refit + BIC"}
+    rows = [r for r in results("B6.json")["rows"].values() if r["rival"] in counted]
+    having = sum(bool(r.get("states")) for r in rows)
+    return "had none" if not having else "had them" if having == len(rows) else "had them in part"
 
 
 @named

@@ -176,6 +176,11 @@ def test_a_parameter_without_an_interval_is_not_called_held(monkeypatch) -> None
     assert "0.03 N m held" not in text
 
 
+def test_verdicts_differ_without_colour_too() -> None:
+    assert len({v.shown.marker for v in Verdict}) == len(Verdict)
+    assert {v for v in Verdict if not v.shown.filled} == {Verdict.AMBIGUOUS}
+
+
 def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
     near, far = 1.5, 5.0
     assert (near, far) == (NEAR_FLOOR, FAR_FLOOR)
