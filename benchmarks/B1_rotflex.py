@@ -152,6 +152,7 @@ def main(parts: list[str]) -> None:
         origin.part(kept, part)
         if part == "fits":
             kept["differences"] = differences(A, B)
+            origin.part(kept, "differences")
         RESULTS.parent.mkdir(exist_ok=True)
         write_file(RESULTS, json.dumps(kept, indent=1) + "\n")
 

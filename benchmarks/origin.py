@@ -247,6 +247,15 @@ def sources(*scripts: str) -> dict[str, str]:
 # -- what a run writes --------------------------------------------------------------------------------------
 
 
+def git(*command: str) -> str:
+    """What git says of the project; nothing where there is none."""
+    try:
+        done = subprocess.run(["git", "-C", str(ROOT), *command], capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return done.stdout.strip()
+
+
 def provenance() -> dict[str, Any]:
     """What produced the numbers."""
     code, arena = hashlib.sha256(), hashlib.sha256()
@@ -255,9 +264,6 @@ def provenance() -> dict[str, Any]:
     simulator = ROOT / "rotflex_jax" / "arena" / "simulator"
     for file in sorted([*(HERE / "arena").glob("*.py"), *simulator.glob("*.py")]):
         arena.update(file.read_bytes())
-    git = lambda *a: subprocess.run(  # noqa: E731
-        ["git", "-C", str(ROOT), *a], capture_output=True, text=True, check=False
-    ).stdout.strip()
     commit = git("rev-parse", "--short", "HEAD")
     # Results are written while a benchmark goes on, in pieces too; they are no code.
     changes = git("status", "--porcelain", "--", ".", ":!benchmarks/results", ":!docs/figures")
@@ -302,7 +308,15 @@ def begin(
     measured |= {path: meaning((ROOT / path).read_text(encoding="utf-8")) for path in files}
     name = hashlib.sha256(json.dumps(sorted(measured.items())).encode()).hexdigest()[:12]
     made = provenance() | {"arguments": arguments}
-    results.setdefault("runs", []).append(made | {"sources": name})
+    run = made | {"sources": name}
+    # What was changed and not committed beside the same sources made no other numbers.
+    same = lambda old: (old.get("code"), old.get("sources")) == (run["code"], run["sources"])  # noqa: E731
+    before = [
+        old
+        for old in results.get("runs", [])
+        if of_changed_tree(run) or not (of_changed_tree(old) and same(old))
+    ]
+    results["runs"] = [*before, run]
     results.setdefault("sources", {})[name] = measured
     used = {run.get("sources") for run in results["runs"]}
     results["sources"] = {key: value for key, value in results["sources"].items() if key in used}

@@ -129,7 +129,7 @@ def test_results_are_of_an_earlier_version_once_what_they_measure_has_changed(tm
     assert standing(results, tmp_path / "gone").changed == ("benchmarks/B1.py",)
 
 
-def test_a_run_says_what_made_it() -> None:
+def test_a_run_says_what_made_it(monkeypatch) -> None:
     results: dict = {"rows": {}}
     made = begin(results, "benchmarks/B12_control.py", ["coulomb"], files=["tests/conftest.py"])
     assert {"date", "commit", "clean", "python", "machine", "versions", "arguments"} <= set(made)
@@ -141,6 +141,16 @@ def test_a_run_says_what_made_it() -> None:
     part(results, "coulomb")
     assert runs_that_count(results) == [run]
     assert standing(results).changed == ()
+    # Other changes beside the same sources are forgotten once it runs on a clean tree; other sources are not.
+    said = {"rev-parse": "abc", "status": ""}
+    monkeypatch.setattr("origin.git", lambda *command: said[command[0]])
+    other = {**run, "clean": False, "sources": "others"}
+    results["runs"] = [{**run, "clean": False}, other]
+    begin(results, "benchmarks/B12_control.py", ["coulomb"], files=["tests/conftest.py"])
+    assert results["runs"][0] is other and [r["commit"] for r in results["runs"][1:]] == ["abc"]
+    assert not of_changed_tree(results["runs"][1])
+    said["status"] = " M rotflex_jax/fit/inference.py"
+    assert of_changed_tree(begin({}, "benchmarks/B12_control.py"))
 
 
 def test_what_is_said_beside_numbers(tmp_path: Path, monkeypatch) -> None:
