@@ -93,7 +93,8 @@ def main() -> int:
     results: dict[str, Any] = {"benchmark": "B2", "runs": [], "tables": {}}
     if path.exists() and not a.fresh:
         results = json.loads(path.read_text())
-    known, made = results["tables"], begin(results, __file__, sys.argv[1:])
+    modules = [f"seed_paper.{module}" for module in TABLES.values()]
+    known, made = results["tables"], begin(results, __file__, sys.argv[1:], scripts=modules)
     wanted = a.only or list(TABLES)
     todo = [s for s in wanted if a.only or a.fresh or s not in known]
     print(f"{len(wanted)} tables, {len(wanted) - len(todo)} known, {len(todo)} to compute")

@@ -220,6 +220,21 @@ def test_an_end_is_reached_straight_where_four_times_as_far_takes_longer(ratio: 
     assert is_cut(-visits(400, far, 20)) == found
 
 
+def test_a_signal_that_is_cut_at_zero_is_rectified() -> None:
+    x = 0.1 * visits(400, 1020, 20)
+    rng = np.random.default_rng(11)
+    u, theta = rng.normal(size=len(x)), np.cumsum(rng.normal(size=len(x))) / 100
+
+    def read(alpha: np.ndarray) -> Recording:
+        return Recording(u=u, y=np.column_stack([theta, alpha]), Ts=TS)
+
+    (told,) = (f for f in read(x - x.max()).findings if f.kind in ("rectified", "saturated"))
+    assert (told.kind, told.channel, told.severity) == ("rectified", "alpha", "warning")
+    assert f"exactly 0 rad, its extreme, in 40 of {len(x)} samples" in told.message
+    with pytest.raises(InputError, match=r"is exactly 0\.05 rad.* saturated"):
+        read(x - 0.05)
+
+
 @pytest.mark.parametrize(("at_end", "found"), [((5, 4), False), ((5, 5), True), ((10,), False)])
 def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: bool) -> None:
     x = np.concatenate([visits(100, 400, n, number=1) for n in at_end])
@@ -398,3 +413,27 @@ def test_what_is_exactly_at_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.059)
     assert is_swapped(0.1 * hub, hub)
     assert not is_absolute(hub, 0.0 * hub)
+
+
+def test_sentences_tell_the_numbers_that_decided() -> None:
+    y = np.column_stack([WAVE, 0.1 * WAVE[::-1]])
+
+    def said(u: np.ndarray = U, theta: np.ndarray = WAVE, alpha: np.ndarray = y[:, 1]) -> str:
+        r = Recording(u=u, y=np.column_stack([theta, alpha]), Ts=TS, accept=quality.ACCEPTABLE)
+        return " ".join(f.message for f in r.findings)
+
+    swapped = quality._swapped(slow(1.0, 1.0)[:, None] * [0.1, 1.0], ("theta", "alpha"))
+    assert swapped is not None and "moves 10 times as far as 'theta'" in swapped.message
+    assert "reaches 250 V" in said(u=250 * U)
+    assert "alpha' reaches 4 rad" in said(alpha=4 * WAVE[::-1])
+    told = quality._like_degrees(np.array([0.0, 25.0, 0.0]), np.full(3, -2.0), 0.25, "theta", "V")
+    assert told is not None and "up to 100 rad/s on 2 V" in told.message
+    assert "is 1.5 V throughout" in said(u=np.full(N, 1.5))
+    assert "'alpha' never changes from 0.25 rad" in said(alpha=np.full(N, 0.25))
+    step = 2 * np.pi / 4096
+    assert "in steps of 0.001534 rad (0.08789 deg)" in said(theta=step * np.round(WAVE / step))
+    assert "whole numbers from -30 to 30" in said(theta=np.round(30 * WAVE))
+    clipped = np.clip(2 * U, -0.5, 0.75)
+    assert "stands at its limit, -0.5 and 0.75 V" in said(u=clipped)
+    short = Recording(u=U[:40], y=y[:40], Ts=TS, accept=quality.ACCEPTABLE)
+    assert "at least 50 samples, but has 40" in " ".join(f.message for f in short.findings)
