@@ -233,3 +233,17 @@ def test_a_share_of_all_or_of_nothing_has_a_divergence() -> None:
 )
 def test_shares_as_they_are_read(share: float, said: str) -> None:
     assert localise.percent(share) == said
+
+
+def test_the_deflection_is_the_parabola_through_seven_samples() -> None:
+    """Least squares of a parabola over three samples to each side, at the middle one."""
+    alpha = np.zeros(400)
+    alpha[20:380] = np.random.default_rng(12).normal(size=360)
+    rec = Recording(u=np.cos(np.arange(400) / 11), y=np.column_stack([record().y[:, 0], alpha]), Ts=0.01)
+    sets = localise.condition_sets(rec, rec.channels, {}, None)
+    (found,) = (conditions for conditions in sets if conditions.kind == "deflection")
+    smooth = np.convolve(alpha, np.array([-2, 3, 6, 7, 6, 3, -2]) / 21, mode="same")
+    far = np.min(np.abs(smooth[:, None] - found.edges), axis=1) > 1e-9
+    expected = np.clip(np.searchsorted(found.edges, smooth, side="right") - 1, 0, len(found.edges) - 2)
+    np.testing.assert_array_equal(found.bins[far], expected[far])
+    assert far.sum() > 350

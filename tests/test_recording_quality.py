@@ -235,7 +235,10 @@ def test_a_signal_that_is_cut_at_zero_is_rectified() -> None:
         read(x - 0.05)
 
 
-@pytest.mark.parametrize(("at_end", "found"), [((5, 4), False), ((5, 5), True), ((10,), False)])
+@pytest.mark.parametrize(
+    ("at_end", "found"),
+    [((5, 4), False), ((5, 5), True), ((10,), False), ((2,) * 5, True)],
+)
 def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: bool) -> None:
     x = np.concatenate([visits(100, 400, n, number=1) for n in at_end])
     assert is_cut(x) == found
