@@ -13,6 +13,7 @@ report seeds.
     python benchmarks/B0_discovery.py --pairs 36 --triples 12 --inputs noise --seeds 1000
 
     python benchmarks/B0_discovery.py --oracles
+    python benchmarks/B0_discovery.py --again --minutes 5 --workers 16
 
     python benchmarks/B0_discovery.py --wrong-worlds 96 --workers 16
     python benchmarks/B0_discovery.py --wrong-worlds 24 --tuning
@@ -21,23 +22,19 @@ Wrong worlds (`rotflex_jax.arena.wrong_worlds`) are what laboratories record, of
 wrong in more than one way. They have seeds, results and a page of their own (`results/B0_wrong_worlds.json`).
 
 Records that the file has already are skipped unless `--fresh` is given; every run adds to the file, and
-the tables and figures beside it are of all its records.
+the tables and figures beside it are of all its records. With `--again` those of other code than the present
+one are run again, each in its place; the others stay, so that it may be stopped and gone on with.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
-import hashlib
-import importlib.metadata
 import json
-import os
-import platform
-import subprocess
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
@@ -55,12 +52,15 @@ from arena.probability import drawn_probabilities, summary
 from arena.table import answer, label, show
 from arena.wrong_seeds import REPORT as WORLDS_REPORT, TUNING as WORLDS_TUNING
 from arena.wrong_table import publish_worlds, show_worlds
+from origin import begin
 from rotflex_jax.arena.simulator.draws import drawn
 from rotflex_jax.arena.simulator.hidden import DEFAULTS, OUTSIDE
 from rotflex_jax.arena.simulator.records import INPUTS
 
 TUNING, REPORT = tuple(range(100, 120)), tuple(range(1000, 1020))
 Job = dict[str, Any]
+JOB = ("world", "effects", "kind", "seed", "size", "seconds", "channels", "keep_evidence")
+"""What a row has of the job that it is of."""
 
 from rotflex_jax.text.files import write_file
 
@@ -133,12 +133,23 @@ def again(row: Job) -> dict[str, Any]:
 
 
 def rows(
-    todo: list[Job], workers: int, task: Callable[[Job], dict[str, Any]] = one
+    todo: list[Job],
+    workers: int,
+    task: Callable[[Job], dict[str, Any]] = one,
+    minutes: float = math.inf,
 ) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Rows as they are ready; what was running when a process died is begun again."""
+    """Rows as they are ready; what was running when a process died is begun again.
+
+    Args:
+        todo: What is to be run.
+        workers: Processes.
+        task: What makes a row of a job.
+        minutes: After so long nothing is begun any more; what runs is waited for.
+    """
+    until = time.monotonic() + 60 * minutes
     if workers == 1:
         prepare()
-        yield from ((job, task(job)) for job in todo)
+        yield from ((job, task(job)) for job in todo if time.monotonic() < until)
         return
     context = get_context("spawn")
     started = context.Value("i", 0)
@@ -148,9 +159,14 @@ def rows(
         with ProcessPoolExecutor(workers, context, initializer=prepare, initargs=(started,)) as pool:
             running = {pool.submit(task, job): job for job in left}
             for done in as_completed(running):
+                if time.monotonic() > until:
+                    for waiting in running:
+                        waiting.cancel()
                 job = running[done]
                 try:
                     row = done.result()
+                except CancelledError:
+                    continue
                 except BrokenProcessPool:
                     broken.append(job)
                     continue
@@ -162,30 +178,6 @@ def rows(
                 yield job, {**job, "error": "its process died", "lines": []}
             return
         left = broken
-
-
-def provenance() -> dict[str, Any]:
-    """What produced the numbers."""
-    code, arena = hashlib.sha256(), hashlib.sha256()
-    for file in sorted((HERE.parent / "rotflex_jax").rglob("*.py")):
-        code.update(file.read_bytes())
-    simulator = HERE.parent / "rotflex_jax" / "arena" / "simulator"
-    for file in sorted([*(HERE / "arena").glob("*.py"), *simulator.glob("*.py")]):
-        arena.update(file.read_bytes())
-    git = lambda *a: subprocess.run(  # noqa: E731
-        ["git", "-C", str(HERE), *a], capture_output=True, text=True, check=False
-    ).stdout.strip()
-    return {
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "commit": git("rev-parse", "--short", "HEAD"),
-        "changed": bool(git("status", "--porcelain", "--", "../rotflex_jax")),
-        "clean": not git("status", "--porcelain"),
-        "code": code.hexdigest()[:12],
-        "arena": arena.hexdigest()[:12],
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "versions": {n: importlib.metadata.version(n) for n in ("jax", "numpy", "scipy")},
-    }
 
 
 def save(path: Path, results: dict[str, Any]) -> None:
@@ -214,6 +206,8 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--oracles", action="store_true", help="of all known records once more, no search")
     parser.add_argument("--fresh", action="store_true", help="do not reuse records in the file")
+    parser.add_argument("--again", action="store_true", help="known records of other code, once more")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no record after so long")
     parser.add_argument("--out", type=Path, default=None, help="results file")
     return parser.parse_args()
 
@@ -242,22 +236,24 @@ def main() -> int:
     wanted = [{"world": s} for s in seeds] if a.wrong_worlds else jobs(a, seeds, inputs)
     if a.tuning:  # what probabilities are calibrated from
         wanted = [{**job, "keep_evidence": True} for job in wanted]
-    made = provenance()
     title = "B0, wrong worlds" if a.wrong_worlds else "B0"
     results: dict[str, Any] = {"benchmark": title, "runs": [], "records": {}}
     if path.exists() and not a.fresh:
         results = json.loads(path.read_text())
-    results["runs"].append({**made, "arguments": sys.argv[1:]})
+    made = begin(results, __file__, sys.argv[1:])
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
     known = results["records"]
-    todo = [j for j in wanted if key(j) not in known or "error" in known[key(j)]]
+    if a.again:
+        wanted = [{name: row[name] for name in JOB if name in row} for row in known.values()]
+    current = lambda row: "error" not in row and (not a.again or row.get("code") == made["code"])  # noqa: E731
+    todo = [j for j in wanted if key(j) not in known or not current(known[key(j)])]
     task = one
     if a.oracles:
         task = again
         wanted = todo = [r for r in known.values() if "error" not in r]
     console.print(f"{len(wanted)} records, {len(wanted) - len(todo)} known, {len(todo)} to run")
     began = time.perf_counter()
-    for count, (job, row) in enumerate(rows(todo, a.workers, task), 1):
+    for count, (job, row) in enumerate(rows(todo, a.workers, task, a.minutes), 1):
         new = {"oracle_code": made["code"]} if a.oracles else {}
         known[key(job)] = {"code": made["code"], **row, **new}
         save(path, results)
@@ -265,7 +261,7 @@ def main() -> int:
         left = (time.perf_counter() - began) / count * (len(todo) - count)
         text = f"{count}/{len(todo)} {key(job)} -> {got} ({left:.0f} s left)"
         console.print(text, markup=False, soft_wrap=True)
-    shown = [known[key(j)] for j in wanted]
+    shown = [known[key(j)] for j in wanted if key(j) in known]
     (show_worlds if a.wrong_worlds else show)(console, shown)
     console.print(summary(shown), markup=False, soft_wrap=True)
     codes = {r.get("code") for r in shown}

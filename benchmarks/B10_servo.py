@@ -38,6 +38,7 @@ import jax
 import numba
 
 import rotflex_jax as rf
+from origin import begin, part
 
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
@@ -111,7 +112,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS / "B10.json")
     given = parser.parse_args()
     found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.is_file() else {"splits": {}}
-    began = time.perf_counter()
+    made, began = begin(found, __file__, sys.argv[1:]), time.perf_counter()
 
     def say(text: str) -> None:
         print(f"{time.perf_counter() - began:6.1f} s  {text}", flush=True)
@@ -128,22 +129,26 @@ def main() -> None:
         for row, compute in rows(known[name], given.parts, given.rollouts, say).items():
             if row in case and not given.fresh:
                 continue
-            case[row] = compute()
+            case[row] = {**compute(), "code": made["code"]}
             test = {k: round(v["mean"], 2) for k, v in case[row]["test"].items()}
             say(f"{name} left out, {row}: {test}")
             keep()
     if "direction" in given.parts and ("direction" not in found or given.fresh):
         found["direction"] = direction(known["gain 200"], say)
+        part(found, "direction")
         keep()
     if "supply" in given.parts and ("supply" not in found or given.fresh):
         found["supply"] = supply(known["gain 200"])
+        part(found, "supply")
         keep()
     if "released" in given.parts and ("released" not in found or given.fresh):
         found["released"] = released()
+        part(found, "released")
         keep()
     if "so101" in given.parts:
         if given.fresh:
             found["so101"] = []
+            part(found, "so101")
         search = "so101 search" in given.parts
         arm(say, given.rollouts // 5, found.setdefault("so101", []), keep, search, given.workers)
     keep()

@@ -183,8 +183,7 @@ def main() -> int:
     results: dict[str, Any] = {"benchmark": "B11", "runs": [], "rows": {}}
     if path.exists() and not a.fresh:
         results = json.loads(path.read_text())
-    made = B0.provenance()
-    results["runs"].append({**made, "arguments": sys.argv[1:]})
+    made = begin(results, __file__, sys.argv[1:])
     wanted = jobs(a, seeds, [k for k in a.inputs.split(",") if k])
     known = results["rows"]
     todo = [j for j in wanted if key(j) not in known or "error" in known[key(j)]]
@@ -192,7 +191,7 @@ def main() -> int:
     console.print(f"{len(wanted)} rows, {len(todo)} to run")
     began = saved = time.perf_counter()
     for count, (job, row) in enumerate(B0.rows(todo, a.workers, one), 1):
-        known[key(job)] = row
+        known[key(job)] = {"code": made["code"], **row}
         now = time.perf_counter()
         if now - saved > 5:
             B0.save(path, results)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import rotflex_jax as rf
+from origin import KEYS, begin, part
 
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
@@ -84,9 +85,12 @@ def main() -> None:
     )
     parser.add_argument("machines", nargs="*", default=list(MACHINES), help=", ".join(MACHINES))
     rows = json.loads(RESULT.read_text()) if RESULT.exists() else {}
-    for name in parser.parse_args().machines:
+    machines = parser.parse_args().machines
+    begin(rows, __file__, machines)
+    for name in machines:
         rows[name] = measured(name)
-        rows = {machine: rows[machine] for machine in MACHINES if machine in rows}
+        part(rows, name)
+        rows = {key: rows[key] for key in (*MACHINES, *KEYS) if key in rows}
         write_file(RESULT, json.dumps(rows, indent=1) + "\n")
         each = rows[name]["degrees"]
         told = ", ".join(f"{k} {v:.3f}" for k, v in each.items())

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 import rotflex_jax as rf
-from B0_discovery import provenance
+from origin import begin
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.simulate import free_run
 from rotflex_jax.text.files import write_file
@@ -77,7 +77,8 @@ def main() -> int:
             with jax.default_device(device):
                 found[name] = {"device": device.device_kind, "rows": times(device, COUNTS)}
     found["cpu"]["device"] = platform.processor() or platform.machine()
-    result = {"benchmark": "B13", **provenance(), "samples": SAMPLES, "devices": found}
+    result: dict[str, Any] = {"benchmark": "B13", "samples": SAMPLES, "devices": found}
+    begin(result, __file__)
     path = HERE / "results" / "B13.json"
     write_file(path, json.dumps(result, indent=1) + "\n")
     print(f"saved: {path}")

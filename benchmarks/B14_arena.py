@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import B0_discovery as B0
+from origin import begin
 from rotflex_jax.arena.entrants import ENTRANTS
 from rotflex_jax.arena.method import Apart
 from rotflex_jax.arena.problems import drawn
@@ -97,7 +98,7 @@ def main() -> int:
         if a.fresh:
             kept = {n: m for n, m in results["methods"].items() if n not in dropped}
             results |= {"settings": settings, "methods": kept}
-    results["runs"].append({**B0.provenance(), "arguments": sys.argv[1:]})
+    made = begin(results, __file__, sys.argv[1:])
     say = lambda line: print(line, flush=True)  # noqa: E731
     problems = drawn(a.records, a.seed, a.seconds, say)
     rows = {n: results["methods"].get(n, {"rows": []})["rows"] for n in a.entrants.split(",")}
@@ -109,7 +110,7 @@ def main() -> int:
                     continue
                 say(f"{name}: record {k} of {len(problems)}")
                 row = answered(method, problem, k, a.limit).to_dict()
-                rows[name].append({**row, "code": results["runs"][-1]["code"]})
+                rows[name].append({**row, "code": made["code"]})
                 keep(results, name, rows[name])
                 B0.save(a.out, results)
                 write_file(a.out.with_suffix(".md"), page(results))

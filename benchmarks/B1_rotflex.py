@@ -20,6 +20,7 @@ import time
 
 import numpy as np
 
+import origin
 import rotflex_jax as rf
 from measured_joint import arm_alone, drawing, fine_run, with_play
 
@@ -141,14 +142,17 @@ def main(parts: list[str]) -> None:
     A, B = rf.data.load_dataset("rotflex")
     kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     kept = kept if set(kept) & {"search", "repeats", "arm", "fits", "play"} else {}
+    origin.begin(kept, __file__, parts)
     does = {"search": search, "repeats": repeats, "arm": arm, "fits": fits, "play": play}
     for part in parts or [*does, "figures"]:
         if part == "figures":
             drawing.draw(A, B, kept["fits"], HERE.parent / "docs" / "figures")
             continue
         kept[part] = does[part](A, B)
+        origin.part(kept, part)
         if part == "fits":
             kept["differences"] = differences(A, B)
+            origin.part(kept, "differences")
         RESULTS.parent.mkdir(exist_ok=True)
         write_file(RESULTS, json.dumps(kept, indent=1) + "\n")
 

@@ -85,18 +85,19 @@ def main() -> int:
     from rotflex_jax.runtime.xla import enable_fast_loops
 
     enable_fast_loops()
-    from B0_discovery import provenance, save
+    from B0_discovery import save
+    from origin import begin
     from seed_paper.page import page
 
     path = a.json or HERE / "results" / f"B2{'_quick' if a.quick else ''}.json"
     results: dict[str, Any] = {"benchmark": "B2", "runs": [], "tables": {}}
     if path.exists() and not a.fresh:
         results = json.loads(path.read_text())
-    known, made = results["tables"], provenance()
+    modules = [f"seed_paper.{module}" for module in TABLES.values()]
+    known, made = results["tables"], begin(results, __file__, sys.argv[1:], scripts=modules)
     wanted = a.only or list(TABLES)
     todo = [s for s in wanted if a.only or a.fresh or s not in known]
     print(f"{len(wanted)} tables, {len(wanted) - len(todo)} known, {len(todo)} to compute")
-    results["runs"].append({**made, "arguments": sys.argv[1:]})
     for section in todo:
         known[section] = {**table(section, a.quick), "code": made["code"]}
         results["tables"] = {s: known[s] for s in TABLES if s in known}

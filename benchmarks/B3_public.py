@@ -23,6 +23,7 @@ if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
 import rotflex_jax as rf
+from origin import KEYS, begin, part
 from public_machines import CASES
 from public_machines.page import page
 
@@ -40,6 +41,7 @@ def main() -> None:
     rf.enable_fast_loops()
     rf.enable_compilation_cache()
     found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.is_file() else {}
+    begin(found, __file__, sys.argv[1:])
     for name in given.only:
         if name in found and not given.fresh:
             continue
@@ -49,7 +51,8 @@ def main() -> None:
             print(f"{name} {time.perf_counter() - began:6.1f} s  {text}", flush=True)
 
         found[name] = CASES[name](say) | {"seconds": round(time.perf_counter() - began, 1)}
-        found = {name: found[name] for name in CASES if name in found}
+        part(found, name)
+        found = {name: found[name] for name in (*CASES, *KEYS) if name in found}
         given.out.parent.mkdir(exist_ok=True)
         write_file(given.out, json.dumps(found, indent=1) + "\n")
         write_file(given.out.with_suffix(".md"), page(found))

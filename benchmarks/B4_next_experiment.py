@@ -14,12 +14,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import rotflex_jax as rf
+from origin import begin
 from rotflex_jax.arena.marking import renamed
 from rotflex_jax.arena.simulator.records import make_record
 
@@ -174,12 +177,14 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=2, help="standard inputs to improve")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     given = parser.parse_args()
-    rows = []
+    found: dict[str, Any] = {"schema": 1, "rows": []}
+    begin(found, __file__, sys.argv[1:])
+    rows = found["rows"]
     for name in given.pairs:
         for seed in given.seeds:
             rows.append(trial(name, seed, given.starts, lambda s: print(s, flush=True)))
             given.out.mkdir(exist_ok=True, parents=True)
-            write_file(given.out / "B4.json", json.dumps({"schema": 1, "rows": rows}, indent=1) + "\n")
+            write_file(given.out / "B4.json", json.dumps(found, indent=1) + "\n")
             write_file(given.out / "B4.md", summary(rows))
     print(summary(rows))
 

@@ -23,11 +23,13 @@ import math
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import B0_discovery as B0
 import rotflex_jax as rf
+from origin import begin
 from rotflex_jax.arena.marking import renamed
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.data import excitation
@@ -335,12 +337,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     given = parser.parse_args()
     file = given.out / "B4_sequential.json"
-    results = {"schema": 1, "runs": [], "rows": []}
+    results: dict[str, Any] = {"schema": 1, "rows": []}
     if file.exists() and not given.fresh:
         results |= json.loads(file.read_text())
     # First of all, since results that are written make the tree a changed one.
-    results["runs"].append({**B0.provenance(), "arguments": sys.argv[1:]})
-    rows = results["rows"]
+    made, rows = begin(results, __file__, sys.argv[1:]), results["rows"]
     have = {(r["case"], r["seed"], r["hopeless"]) for r in rows}
     todo: list[B0.Job] = [
         {"case": name, "seed": seed, "hopeless": lost, "alone": given.alone}
@@ -358,7 +359,7 @@ def main() -> None:
             print(f"{name}: {row['error']}", flush=True)
             continue
         print(f"{name}: {row['verdict']} after {row['seconds']:g} s ({row['elapsed_s']:.0f} s)", flush=True)
-        rows.append(row)
+        rows.append({**row, "code": made["code"]})
         rows.sort(key=lambda r: (r["hopeless"], r["seed"], [*CASES].index(r["case"])))
         B0.save(file, {**results, "summary": totals(rows)})
         write_file(file.with_suffix(".md"), page(rows))

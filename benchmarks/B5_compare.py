@@ -18,10 +18,13 @@ import math
 import pathlib
 import pickle
 from collections.abc import Callable
+from typing import Any
 
 import rotflex_jax as rf
+from origin import begin
 from rotflex_jax.compare import METHODS, QUICK, Comparison
 from rotflex_jax.compare.page import overlays, ranks
+from rotflex_jax.text.files import write_file
 from rotflex_jax.text.markup import write_files
 
 HERE = pathlib.Path(__file__).parent
@@ -89,6 +92,9 @@ def learn(name: str, method: str) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     (KEPT / ".gitignore").write_text("*\n")
     file.write_bytes(pickle.dumps(dataclasses.replace(found, rows=rows)))
+    of: dict[str, Any] = {}
+    begin(of, __file__, [name, method])
+    write_file(file.with_suffix(".json"), json.dumps(of) + "\n")
     row = found.rows[0]
     print(f"{name} {method}: {row.status} {row.reason} {found.elapsed_s:.0f} s", flush=True)
 
@@ -104,12 +110,23 @@ def draw(name: str) -> None:
         rows=tuple(sorted((part.rows[0] for part in parts), key=lambda row: row.score)),
         elapsed_s=sum(part.elapsed_s for part in parts),
     )
-    text = json.dumps(result.to_dict(), indent=1) + "\n"
+    text = json.dumps(result.to_dict() | made_by(kept), indent=1) + "\n"
     write_files(RESULTS, {f"{name}.json": text, f"{name}.md": result.to_markdown()})
     for label, figure in (("ranks", ranks(result)), ("overlays", overlays(result))):
         figure.savefig(RESULTS / f"{name}_{label}.png", dpi=80)
     result.report(KEPT / name)
     print(f"\n{name}\n{result}\n", flush=True)
+
+
+def made_by(kept: list[pathlib.Path]) -> dict[str, Any]:
+    """The runs that learnt rows, and what they measure."""
+    found: dict[str, Any] = {"runs": [], "sources": {}}
+    for file in (k.with_suffix(".json") for k in kept if k.exists()):
+        # What was learnt before results said what made them counts as of a tree that was changed.
+        of = json.loads(file.read_text()) if file.exists() else {"runs": [{}], "sources": {}}
+        found["runs"] += of["runs"]
+        found["sources"] |= of["sources"]
+    return found
 
 
 def summary() -> str:

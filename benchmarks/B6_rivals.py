@@ -1,6 +1,7 @@
 """Other ways to find the hidden effect, on the same records as B0, marked by the same rules.
 
     python benchmarks/B6_rivals.py --tuning --seeds 100 --workers 2
+    python benchmarks/B6_rivals.py --seeds 1002 --rivals "refit + BIC" --workers 16 --minutes 5
 
 The search's own row comes from the results of B0 (run that first, with the same arguments); nothing
 is recomputed that is in the results already, and the tables are of all that is there. The structure
@@ -16,9 +17,6 @@ import math
 import statistics
 import time
 import traceback
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import B0_discovery as B0
+from origin import begin
 
 HERE = Path(__file__).resolve().parent
 NAMES = (
@@ -84,18 +83,6 @@ def one(job: Job) -> dict[str, Any]:
         row["error"] = f"{type(problem).__name__}: {problem}"
         row["traceback"] = traceback.format_exc()
     return row
-
-
-def rows(todo: list[Job], workers: int) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Rows as they are ready; a process that dies takes only its own rows with it."""
-    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=B0.prepare) as pool:
-        running = {pool.submit(one, job): job for job in todo}
-        for done in as_completed(running):
-            job = running[done]
-            try:
-                yield job, done.result()
-            except Exception as problem:  # a dead process is a row too
-                yield job, {**job, "error": f"{type(problem).__name__}: {problem}"}
 
 
 def key(job: Job) -> str:
@@ -179,6 +166,7 @@ def main() -> int:
     parser.add_argument("--nulls", type=int, default=10, help="records with nothing hidden")
     parser.add_argument("--rivals", default=",".join(NAMES), help="names, with commas between")
     parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no row after so long")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a record [s]")
     a = parser.parse_args()
     known_seeds = B0.TUNING if a.tuning else B0.REPORT
@@ -194,7 +182,7 @@ def main() -> int:
     results: dict[str, Any] = {"benchmark": "B6", "runs": [], "rows": {}}
     if path.exists():
         results = json.loads(path.read_text())
-    results["runs"].append({**B0.provenance(), "arguments": vars(a)})
+    made = begin(results, __file__, vars(a))
     whole = argparse.Namespace(pairs=0, triples=0, size="1", channels="both", only=a.only)
     whole.nulls, whole.seconds = a.nulls, a.seconds
     base = B0.jobs(whole, seeds, [a.input])
@@ -205,8 +193,8 @@ def main() -> int:
     console = Console(highlight=False)
     console.print(f"{len(wanted)} rows, {len(todo)} to run")
     began = time.perf_counter()
-    for count, (job, row) in enumerate(rows(todo, a.workers), 1):
-        known[key(job)] = row
+    for count, (job, row) in enumerate(B0.rows(todo, a.workers, one, a.minutes), 1):
+        known[key(job)] = {"code": made["code"], **row}
         B0.save(path, results)
         left = (time.perf_counter() - began) / count * (len(todo) - count)
         found = " + ".join(f"{r['effect']}@{r['port']}" for r in row.get("rounds", [])) or "nothing"

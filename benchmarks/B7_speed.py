@@ -15,12 +15,14 @@ import dataclasses
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rotflex_jax
+from origin import begin, part
 
 HERE = Path(__file__).resolve().parent / "results"
 
@@ -52,9 +54,11 @@ def run(chosen: argparse.Namespace) -> None:
     path = HERE / ("B7_plain.json" if chosen.plain else "B7.json")
     results = json.loads(path.read_text()) if path.exists() else {}
     results["machine"] = machine()
+    begin(results, __file__, sys.argv[1:])
     with Progress() as progress:
         for name in chosen.only:
             results[name] = SUBSET[name](chosen, progress)
+            part(results, name)
             write_file(path, json.dumps(results, indent=1) + "\n")
     if not chosen.plain:
         write_file(path.with_suffix(".md"), table.page(results))

@@ -27,6 +27,7 @@ import rotflex_jax as rf
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
 
+from origin import begin, part
 from rotflex_jax import effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.basis import Delays, Orthonormal, Volterra
@@ -189,14 +190,18 @@ def main() -> None:
     """Run the parts that were asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("parts", nargs="*", help=f"among {', '.join(PARTS)}; all unless given")
-    for name in parser.parse_args().parts or PARTS:
+    chosen = parser.parse_args().parts or list(PARTS)
+    kept = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
+    begin(kept, __file__, chosen)
+    for name in chosen:
         try:
             found = PARTS[name]()
         except InputError as reason:  # measured data that are not here
             print(f"{name}: {reason}")
             continue
-        kept = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-        write_file(RESULT, json.dumps(kept | {name: found}, indent=1) + "\n")
+        kept[name] = found
+        part(kept, name)
+        write_file(RESULT, json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -35,8 +35,9 @@ if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
 import rotflex_jax as rf
-from B0_discovery import provenance, save
+from B0_discovery import save
 from measured_machines.page import page
+from origin import begin
 from rotflex_jax.arena.measured import MACHINES
 from rotflex_jax.compare import QUICK
 from rotflex_jax.text.files import write_file
@@ -144,8 +145,7 @@ def main() -> int:
     results: dict[str, Any] = {"benchmark": "B9", "runs": [], "rows": {}}
     if a.out.is_file():
         results = json.loads(a.out.read_text())
-    made = provenance()
-    results["runs"].append({**made, "arguments": sys.argv[1:]})
+    made = begin(results, __file__, sys.argv[1:], scripts=("measured_machines.child",))
     results["left_out"] = {**results.get("left_out", {}), **left_out}
     rows = results["rows"]
     known = {key for key, row in rows.items() if "error" not in row and not a.fresh}

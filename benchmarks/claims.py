@@ -26,9 +26,18 @@ def named(function: Callable[[], str]) -> Callable[[], str]:
     return function
 
 
-@functools.cache
+ASKED: set[str] = set()
+"""Files of results that were asked for since this was last emptied."""
+
+
 def results(file: str) -> Any:
     """A file of results."""
+    ASKED.add(file)
+    return _read(file)
+
+
+@functools.cache
+def _read(file: str) -> Any:
     return json.loads((RESULTS / file).read_text(encoding="utf-8"))
 
 
@@ -126,21 +135,31 @@ def joint_theta_fall() -> str:
 
 # -- the arena ----------------------------------------------------------------------------------------------
 
+SEEN = (1000, 1001)
+"""Seeds of records that were looked at while the search was revised; what is quoted is of the others."""
+
 
 def records(
     *, outside: bool = False, hidden: bool = True, effects: int = 1, size: float = 1.0
 ) -> list[dict[str, Any]]:
-    """Records of the arena: of effects that the search knows, of others, or of nothing it could find.
+    """Records that no revision saw: of effects that the search knows, of others, or of nothing it could find.
 
     Of known effects so many at once, of that share of the usual size, seen by both sensors.
     """
-    ran = [r for r in results("B0.json")["records"].values() if "error" not in r]
+    every = results("B0.json")["records"].values()
+    ran = [r for r in every if "error" not in r and r["seed"] not in SEEN]
     if outside:
         return [r for r in ran if r["outside"]]
     if not hidden:
         return [r for r in ran if not r["outside"] and not r["wanted"]]
     found = [r for r in ran if not r["outside"] and len(r["wanted"]) == effects and len(r["channels"]) == 2]
     return [r for r in found if len(r["effects"]) == effects and r.get("size", 1.0) == size]
+
+
+@named
+def arena_seen() -> str:
+    """Seeds that are left out."""
+    return " and ".join(map(str, SEEN))
 
 
 @named
@@ -251,6 +270,12 @@ def arena_outside() -> str:
 def arena_unexplained() -> str:
     """How many of them were called unexplained."""
     return str(sum(r["verdict"] == "unexplained" for r in records(outside=True)))
+
+
+@named
+def arena_outside_named() -> str:
+    """In how many of them an effect was named, which cannot be right."""
+    return str(sum(bool(r["rounds"]) for r in records(outside=True)))
 
 
 @named
@@ -454,10 +479,11 @@ def _search() -> dict[str, Any]:
 
 
 def _rivals() -> dict[str, dict[str, Any]]:
-    """Sums of every method on the same records, the search itself left out."""
+    """Sums of every method that was given all records that the search was, the search itself left out."""
     summary = results("B6.json")["summary"]
-    assert len({(sums["first"][1], sums["false_alarms"][1]) for sums in summary.values()}) == 1
-    return {name: sums for name, sums in summary.items() if name != "rotflex_jax"}
+    given = lambda sums: (sums["first"][1], sums["false_alarms"][1])  # noqa: E731
+    every = given(summary["rotflex_jax"])
+    return {n: sums for n, sums in summary.items() if n != "rotflex_jax" and given(sums) == every}
 
 
 @named
@@ -482,6 +508,15 @@ def rivals_best() -> str:
 def rivals_count() -> str:
     """How many others there are."""
     return str(len(_rivals()))
+
+
+@named
+def rivals_columns() -> str:
+    """Whether the regressions that are counted had columns for states and for errors of sensors."""
+    counted = set(_rivals()) - {"refit + BIC"}
+    rows = [r for r in results("B6.json")["rows"].values() if r["rival"] in counted]
+    having = sum(bool(r.get("states")) for r in rows)
+    return "had none" if not having else "had them" if having == len(rows) else "had them in part"
 
 
 @named
@@ -628,7 +663,8 @@ BESIDE = {
 
 def _cost(row: str) -> float:
     """Processor time of a row of the table of speed, in the unit of its table."""
-    groups = [g for part in results("B7.json").values() for g in part.get("groups", [])]
+    parts = (part for part in results("B7.json").values() if isinstance(part, dict))
+    groups = [g for part in parts for g in part.get("groups", [])]
     return next(r["cpu"] for g in groups for r in g["rows"] if r["name"] == row)
 
 
@@ -654,7 +690,7 @@ for _name, (_row_name, _base) in BESIDE.items():
 
 
 def _mutants() -> list[dict[str, Any]]:
-    return list(results("mutants.json").values())
+    return list(results("mutants.json")["mutants"].values())
 
 
 @named
@@ -684,5 +720,5 @@ def mutants_same() -> str:
 @named
 def mutants_fresh() -> str:
     """How many of a second sample were noticed when they were drawn."""
-    rows = results("mutants_fresh.json").values()
+    rows = results("mutants_fresh.json")["mutants"].values()
     return f"{sum(r['first'] for r in rows)} of {len(rows)}"

@@ -4,6 +4,7 @@ Each must end as a recording, a model, a page or `InputError`, a line with statu
 
     python benchmarks/fuzz_input.py                        # 2,000 of each format
     python benchmarks/fuzz_input.py --count 200 --formats mat hdf5
+    python benchmarks/fuzz_input.py --first 100000         # others than those
 
 Small files are made here and changed: bits, bytes, numbers that tell a size, blocks cut, put in or repeated;
 inside the compressed parts too. A process of its own reads them, since a fault may end it, under a limit
@@ -437,11 +438,11 @@ FORMATS = {
 }
 
 
-def inputs(name: str, start: int, count: int) -> Iterator[tuple[int, bytes]]:
+def inputs(name: str, start: int, stop: int) -> Iterator[tuple[int, bytes]]:
     """Changed files; each by its number alone, so that one can be made again."""
     form = FORMATS[name]
     seeds = form.seeds()
-    for k in range(start, count):
+    for k in range(start, stop):
         pick = random.Random(f"{name} {k}")
         yield k, form.change(pick.choice(seeds), pick, form.text)
 
@@ -548,7 +549,7 @@ def outcome(path: Path) -> str:
         return f"fault: {type(error).__name__} {str(error)[:80]!r} line {where.tb_lineno if where else 0}"
 
 
-def work(name: str, start: int, count: int, folder: Path) -> None:
+def work(name: str, start: int, stop: int, folder: Path) -> None:
     """In a process of its own: reads the files one by one, and tells the outcome of each on stdout."""
     path = folder / f"input{FORMATS[name].ending}"
     for seed in FORMATS[name].seeds():  # imports all that is needed, before memory is limited
@@ -557,7 +558,7 @@ def work(name: str, start: int, count: int, folder: Path) -> None:
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for k, data in inputs(name, start, count):
+    for k, data in inputs(name, start, stop):
         path.write_bytes(data)
         print(k, "started", flush=True)
         signal.alarm(SECONDS)  # ends the process, also where it hangs in a library
@@ -566,12 +567,12 @@ def work(name: str, start: int, count: int, folder: Path) -> None:
         print(k, said, flush=True)
 
 
-def run(name: str, count: int, folder: Path) -> list[tuple[int, str]]:
-    """Number and outcome of each file of a format."""
+def run(name: str, count: int, folder: Path, first: int = 0) -> list[tuple[int, str]]:
+    """Number and outcome of each file of a format, from the first number on."""
     found: dict[int, str] = {}
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONWARNINGS": "ignore"}
     while len(found) < count:
-        arguments = ["--worker", name, str(len(found)), str(count), str(folder)]
+        arguments = ["--worker", name, str(first + len(found)), str(first + count), str(folder)]
         done = subprocess.run(
             [sys.executable, __file__, *arguments],
             capture_output=True,
@@ -587,7 +588,7 @@ def run(name: str, count: int, folder: Path) -> list[tuple[int, str]]:
             raise RuntimeError(f"{name}: the process that reads ended at once: {done.stderr[-2000:]}")
         if done.returncode:
             name_of = signal.Signals(-done.returncode).name if done.returncode < 0 else str(done.returncode)
-            found[len(found) - 1] = f"fault: process ended by {name_of}"
+            found[first + len(found) - 1] = f"fault: process ended by {name_of}"
     return sorted(found.items())
 
 
@@ -597,6 +598,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--count", type=int, default=2000, help="files of each format")
+    parser.add_argument("--first", type=int, default=0, help="number of the first file: others are others")
     parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=list(FORMATS))
     parser.add_argument("--write", nargs=3, metavar=("FORMAT", "NUMBER", "FILE"), help="make one file again")
     parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
@@ -606,15 +608,15 @@ def main() -> int:
         Path(file).write_bytes(next(inputs(name, int(number), int(number) + 1))[1])
         return 0
     if chosen.worker:
-        name, start, count, folder = chosen.worker
-        work(name, int(start), int(count), Path(folder))
+        name, start, stop, folder = chosen.worker
+        work(name, int(start), int(stop), Path(folder))
         return 0
     faults = 0
     print(f"{'format':10}{'files':>8}{'read':>8}{'refused':>9}{'faults':>8}{'seconds':>9}")
     for name in chosen.formats:
         began = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
-            ends = run(name, chosen.count, Path(folder))
+            ends = run(name, chosen.count, Path(folder), chosen.first)
         kinds = Counter(said.partition(":")[0] for _, said in ends)
         faults += kinds["fault"]
         took = time.perf_counter() - began

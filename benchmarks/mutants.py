@@ -1,12 +1,13 @@
 """Change one constant or operator of a module at a time and run its tests: which changes does no test notice?
 
     python benchmarks/mutants.py [--number 150] [--seed 21] [--only selection] [--again] [--store FILE]
+    python benchmarks/mutants.py --workers 16 --seed 32 --fresh --store benchmarks/results/mutants_fresh.json
 
 The sample is fixed by its seed: as many places from each area of `AREAS`. Left out are annotations and what
 guards against a mistake of the programmer and changes no result (`strict` of zip, `frozen` of a dataclass).
-The working tree is copied once. Each mutant is a process of its own at low priority that loads the module in
-its changed form, so the files stay as they are and compiled programs are found again; for modules that are
-traced into programs those are not kept. Tests stop at the first failure.
+The working tree is copied, once for each worker. Each mutant is a process of its own at low priority that
+loads the module in its changed form, so the files stay as they are and compiled programs are found again; for
+modules that are traced into programs those are not kept. Tests stop at the first failure.
 
 Each answer is stored, and what is known of the same text of a module is not run again; `--again` runs those
 that survived once more, after tests were added ("first" is what came out when they were drawn). A survivor is
@@ -30,11 +31,13 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
 from types import CodeType
 from typing import Any, NamedTuple
+
+from origin import begin
 
 ROOT = Path(__file__).resolve().parents[1]
 STORE = Path(__file__).with_name("results") / "mutants.json"
@@ -70,6 +73,16 @@ AREAS: dict[str, tuple[Tested, ...]] = {
     ),
     "friction": (Tested("mechanism/friction.py", ("test_mechanism_friction.py",), traced=True),),
 }
+
+
+class Job(NamedTuple):
+    """A mutant that is to be tried; without a place the module as it is."""
+
+    area: str
+    tested: Tested
+    place: int | None = None
+
+
 LEAST_LIMIT, LIMIT = 60.0, 6.0
 """A mutant hangs, and counts as noticed, after so many seconds or times what its tests take."""
 _GUARDS = ("strict", "frozen")
@@ -146,15 +159,15 @@ def sample(number: int, seed: int) -> dict[str, list[tuple[Tested, int]]]:
     return drawn
 
 
-def in_turn(drawn: dict[str, list[tuple[Tested, int]]]) -> Iterator[tuple[str, Tested, int]]:
+def in_turn(drawn: dict[str, list[tuple[Tested, int]]]) -> Iterator[Job]:
     """One of each area after the other, so that all have had some where it is stopped."""
     for row in itertools.zip_longest(
-        *([(area, *place) for place in chosen] for area, chosen in drawn.items())
+        *([Job(area, *place) for place in chosen] for area, chosen in drawn.items())
     ):
         yield from (place for place in row if place is not None)
 
 
-def row_name(tested: Tested, number: int) -> str:
+def row_name(tested: Tested, number: int | None) -> str:
     """Name of a mutant in the store: module, version of its text, place."""
     return f"{tested.module} {hashlib.sha256(source(tested).encode()).hexdigest()[:12]} {number}"
 
@@ -192,6 +205,7 @@ class Changed(SourceFileLoader):
 def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
     """Runs in the child: status of the tests; the module as it is where there is no tree."""
     os.setpgid(0, 0)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(10)
     os.chdir(folder)
     with open(folder / "said.log", "w") as said:
@@ -222,28 +236,71 @@ def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
     return int(pytest.main([*options, *files]))
 
 
-def noticed(folder: Path, tested: Tested, tree: ast.AST | None, limit: float) -> bool:
-    """Whether tests fail, or go on for longer than the limit [s]."""
-    child = os.fork()
-    if not child:
+class Child(NamedTuple):
+    """A process that runs the tests of one mutant, or of the module as it is."""
+
+    process: int
+    begun: float
+    limit: float
+
+    def ended(self) -> bool | None:
+        """Whether tests failed or went on for longer than the limit; None while it runs."""
+        done, status = os.waitpid(self.process, os.WNOHANG)
+        if done:
+            return status != 0
+        if time.monotonic() - self.begun < self.limit:
+            return None
+        self.stop()
+        return True
+
+    def stop(self) -> None:
+        """End it and what it has started."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process, signal.SIGKILL)
+        os.waitpid(self.process, 0)
+
+
+def start(folder: Path, core: int | None, tested: Tested, tree: ast.AST | None, limit: float) -> Child:
+    """A child on a copy of the tree, on one core if one is given."""
+    process = os.fork()
+    if not process:
         status = 1
         try:
+            if core is not None:
+                os.sched_setaffinity(0, {core})
             status = run_tests(folder, tested, tree)
         except BaseException:  # a module that cannot be loaded is noticed
             traceback.print_exc()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
-    begun = time.monotonic()
-    while time.monotonic() - begun < limit:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return status != 0
-        time.sleep(0.05)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return True
+    return Child(process, time.monotonic(), limit)
+
+
+def done(jobs: Iterable[Job], folders: list[Path], limits: dict[Tested, float]) -> Iterator[tuple]:
+    """Job, whether it was noticed, seconds and its folder, as they end; one in each folder at a time."""
+    waiting, free = iter(jobs), list(range(len(folders)))
+    cores = sorted(os.sched_getaffinity(0))
+    running: dict[int, tuple[Job, Child]] = {}
+    try:
+        while True:
+            while free and (job := next(waiting, None)) is not None:
+                k = free.pop()
+                tree = None if job.place is None else mutant(source(job.tested), job.place)[0]
+                core = cores[k % len(cores)] if len(folders) > 1 else None
+                running[k] = job, start(folders[k], core, job.tested, tree, limits.get(job.tested, 3600))
+            if not running:
+                return
+            for k, (job, child) in list(running.items()):
+                found = child.ended()
+                if found is not None:
+                    del running[k]
+                    free.append(k)
+                    yield job, found, time.monotonic() - child.begun, folders[k]
+            time.sleep(0.05)
+    finally:
+        for _, child in running.values():
+            child.stop()
 
 
 def copy(folder: Path) -> None:
@@ -277,46 +334,64 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=21)
     parser.add_argument("--only", default="", help="part of an area or of the name of a module")
     parser.add_argument("--again", action="store_true", help="run survivors once more")
+    parser.add_argument("--fresh", action="store_true", help="begin the store anew")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="copies of the tree, each on a core of its own"
+    )
+    parser.add_argument("--minutes", type=float, default=1e9, help="begin no mutant after so long")
     parser.add_argument("--store", type=Path, default=STORE)
     asked = parser.parse_args()
-    kept: dict[str, dict[str, Any]] = json.loads(asked.store.read_text()) if asked.store.exists() else {}
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # children are ended then
+    begun = time.monotonic()
+    found: dict[str, Any] = {"runs": [], "sources": {}, "mutants": {}}
+    if asked.store.exists() and not asked.fresh:
+        found = json.loads(asked.store.read_text())
+    kept = found["mutants"]
     drawn = sample(asked.number, asked.seed)
-    # Loaded once for all, and not started.
-    import equinox  # noqa: F401
-    import hypothesis  # noqa: F401
-    import jax  # noqa: F401
-    import jinja2  # noqa: F401
-    import matplotlib.pyplot  # noqa: F401
-    import pytest  # noqa: F401
-    import scipy.signal
-    import scipy.stats  # noqa: F401
+    jobs = list[Job]()
+    for job in in_turn(drawn):
+        old = kept.get(row_name(job.tested, job.place))
+        known = old and (old["noticed"] or "equivalent" in old or not asked.again)
+        if not known and (asked.only in job.area or asked.only in job.tested.module):
+            jobs.append(job)
+    modules = list(dict.fromkeys(job.tested for job in jobs))
+    if jobs:
+        # What is measured are the modules and their tests.
+        files = [f"rotflex_jax/{t.module}" for t in modules] + [
+            f"tests/{f}" for t in modules for f in t.tests
+        ]
+        made = begin(found, __file__, sys.argv[1:], files=files)
+        # Loaded once for all, and not started.
+        import equinox  # noqa: F401
+        import hypothesis  # noqa: F401
+        import jax  # noqa: F401
+        import jinja2  # noqa: F401
+        import matplotlib.pyplot  # noqa: F401
+        import pytest  # noqa: F401
+        import scipy.signal
+        import scipy.stats  # noqa: F401
 
-    with tempfile.TemporaryDirectory() as temporary:
-        folder, limits = Path(temporary) / "tree", dict[Tested, float]()
-        copy(folder)
-        for area, tested, number in in_turn(drawn):
-            text = source(tested)
-            tree, line, what = mutant(text, number)
-            key = row_name(tested, number)
-            old = kept.get(key)
-            known = old and (old["noticed"] or "equivalent" in old or not asked.again)
-            if known or (asked.only not in area and asked.only not in tested.module):
-                continue
-            if tested not in limits:
-                begun = time.monotonic()
-                if noticed(folder, tested, None, 3600):
+        with tempfile.TemporaryDirectory() as temporary:
+            folders = [Path(temporary) / str(k) for k in range(min(asked.workers, len(jobs)))]
+            for folder in folders:
+                copy(folder)
+            limits = dict[Tested, float]()
+            for job, failed, took, folder in done([Job("", tested) for tested in modules], folders, {}):
+                if failed:
                     said = (folder / "said.log").read_text()[-2000:]
-                    sys.exit(f"{tested.module}: its tests fail as it is\n{said}")
-                took = time.monotonic() - begun
-                limits[tested] = max(LEAST_LIMIT, LIMIT * took)
-                print(f"{tested.module}: its tests take {took:.0f} s", flush=True)
-            begun = time.monotonic()
-            found = noticed(folder, tested, tree, limits[tested])
-            first = old["first"] if old else found
-            kept[key] = {"area": area, "line": line, "change": what, "first": first, "noticed": found}
-            write(asked.store, kept)
-            word, took = "noticed " if found else "SURVIVED", time.monotonic() - begun
-            print(f"  {word} {tested.module} {line}: {what[:90]} ({took:.0f} s)", flush=True)
+                    sys.exit(f"{job.tested.module}: its tests fail as it is\n{said}")
+                limits[job.tested] = max(LEAST_LIMIT, LIMIT * took)
+                print(f"{job.tested.module}: its tests take {took:.0f} s", flush=True)
+            in_time = itertools.takewhile(lambda _: time.monotonic() - begun < 60 * asked.minutes, jobs)
+            for job, seen, took, _ in done(in_time, folders, limits):
+                key = row_name(job.tested, job.place)
+                _, line, what = mutant(source(job.tested), job.place)
+                first = kept[key]["first"] if key in kept else seen
+                row = {"area": job.area, "line": line, "change": what, "first": first, "noticed": seen}
+                kept[key] = {**row, "code": made["code"]}
+                write(asked.store, found)
+                word = "noticed " if seen else "SURVIVED"
+                print(f"  {word} {job.tested.module} {line}: {what[:90]} ({took:.0f} s)", flush=True)
     total = []
     for area, chosen in drawn.items():
         keys = [row_name(*place) for place in chosen]
@@ -328,11 +403,13 @@ def main() -> None:
         print(f"all: {tally(total)}")
 
 
-def write(store: Path, kept: dict[str, dict[str, Any]]) -> None:
+def write(store: Path, found: dict[str, Any]) -> None:
     """Beside the file and renamed, so that a stop loses nothing."""
     store.parent.mkdir(parents=True, exist_ok=True)
     beside = store.with_name(f".{store.name}")
-    beside.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
+    beside.write_text(
+        json.dumps(found | {"mutants": dict(sorted(found["mutants"].items()))}, indent=1) + "\n"
+    )
     beside.replace(store)
 
 

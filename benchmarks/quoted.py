@@ -7,6 +7,12 @@ The first form names a file of `results/`, the way to a number in it, if need be
 [mm] or [%]), and a format; the second a function of `claims.py`. Both forms may stand in README.md, docs/*.md
 and paper/*.md.
 
+    <!--= versions -->Measured with an earlier version of the code: B3 (28c8341).<!--=-->
+
+says which of the results that its section quotes, and of those that it names (`versions B3.json B5`), were
+measured with code that has changed since (`origin.py`). It is put at the end of each section that needs it,
+unless it stands somewhere in the section already, and at the end of the pages in results/.
+
     python benchmarks/quoted.py           # write what the results say into the documents
     python benchmarks/quoted.py --check   # exit status 1 where a document says anything else
 """
@@ -17,15 +23,20 @@ import argparse
 import math
 import re
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from claims import NAMED, results
+from claims import ASKED, NAMED, RESULTS, results
+from origin import remark
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 MARK = re.compile(r"<!--= *(?P<source>[^>]*?) *-->(?P<text>.*?)<!--=-->", re.DOTALL)
 DIRECT = re.compile(r"(?P<file>\S+\.json) (?P<way>.+?)(?: \[(?P<unit>[^\]]+)\])? (?P<form>[.,+]?\S*[dfg])")
+HEADING = re.compile(r"^(?=#{1,6} )", re.MULTILINE)
+FENCE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
+VERSIONS = "versions"
 UNITS = {"deg": 180 / math.pi, "mm": 1e3, "%": 100.0, "ms": 1e3}
 
 from rotflex_jax.text.files import write_file
@@ -64,9 +75,66 @@ def documents() -> list[Path]:
     return sorted(p for p in found if p.is_file())
 
 
+def pages() -> list[Path]:
+    """What benchmarks write beside their results."""
+    return sorted(p for p in RESULTS.rglob("*.md") if p.with_suffix(".json").is_file())
+
+
 def renewed(text: str) -> str:
-    """A text with what the results say now between its marks."""
-    return MARK.sub(lambda m: f"<!--= {m['source']} -->{quoted(m['source'])}<!--=-->", text)
+    """A text with what the results say now between its marks, and in each section of which code they are."""
+    return "".join(_section(part) for part in sections(text))
+
+
+def renewed_page(page: Path, text: str) -> str:
+    """A page of results, with a last line where they are of an earlier version of the code."""
+    file = page.with_suffix(".json").relative_to(RESULTS).as_posix()
+    return _marked(text, [file])
+
+
+def sections(text: str) -> list[str]:
+    """The parts of a text from heading to heading; lines of code are no headings."""
+    code = [m.span() for m in FENCE.finditer(text)]
+    starts = [m.start() for m in HEADING.finditer(text)]
+    cuts = [k for k in starts if k and not any(first <= k < last for first, last in code)]
+    return [text[i:k] for i, k in zip([0, *cuts], [*cuts, len(text)], strict=True)]
+
+
+def told_of(text: str) -> set[str]:
+    """The files of results that a text quotes or names, and whose version it tells where it is earlier."""
+    ASKED.clear()
+    named = set[str]()
+    for mark in MARK.finditer(text):
+        if _of_versions(mark):
+            named |= set(mark["source"].split()[1:])
+        else:
+            quoted(mark["source"])
+    return ASKED | named
+
+
+def _section(text: str) -> str:
+    """One section with what the results say now."""
+    files = sorted(told_of(text))
+    now = lambda m: m[0] if _of_versions(m) else _mark(m["source"], quoted(m["source"]))  # noqa: E731
+    return _marked(MARK.sub(now, text), files)
+
+
+def _marked(text: str, files: list[str]) -> str:
+    """A text that tells of these files, with the mark of versions where it has one or needs one."""
+    said = remark(files)
+    if any(_of_versions(m) for m in MARK.finditer(text)):
+        return MARK.sub(lambda m: _mark(m["source"], said) if _of_versions(m) else m[0], text)
+    if not said:
+        return text
+    body = text.rstrip("\n")
+    return f"{body}\n\n{_mark(VERSIONS, said)}\n" + text[len(body) + 1 :]
+
+
+def _of_versions(mark: re.Match[str]) -> bool:
+    return mark["source"].split(" ", 1)[0] == VERSIONS
+
+
+def _mark(source: str, said: str) -> str:
+    return f"<!--= {source} -->{said}<!--=-->"
 
 
 def main() -> None:
@@ -75,15 +143,16 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
     arguments = parser.parse_args()
     stale = False
-    for document in documents():
+    for document in (*documents(), *pages()):
         text = document.read_text(encoding="utf-8")
-        new = renewed(text)
-        name = document.relative_to(ROOT)
-        for before, after in zip(MARK.finditer(text), MARK.finditer(new), strict=True):
-            if before["text"] != after["text"]:
-                stale = True
-                print(f"{name}: {before['source']} is {after['text']}, not {before['text']}")
-        if new != text and not arguments.check:
+        new = renewed_page(document, text) if RESULTS in document.parents else renewed(text)
+        if new == text:
+            continue
+        stale = True
+        before, after = (Counter((m["source"], m["text"]) for m in MARK.finditer(t)) for t in (text, new))
+        for source, said in after - before:
+            print(f"{document.relative_to(ROOT)}: {source}: {said}")
+        if not arguments.check:
             write_file(document, new)
     if stale and arguments.check:
         sys.exit("Run python benchmarks/quoted.py.")

@@ -1,4 +1,4 @@
-"""Results that documents quote: from code that was committed; bounds of their shares."""
+"""Results that documents quote: from committed code, and which code they measure; bounds of shares."""
 
 import json
 from pathlib import Path
@@ -8,28 +8,19 @@ import pytest
 import scipy.stats
 
 from claims import most
+from origin import RESULTS, Imports, begin, meaning, of_changed_tree, part, remark, runs_that_count, standing
 
-RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
+FILES = sorted(RESULTS.rglob("*.json"))
 # Files with runs of a tree that was changed, from before this was refused. A new run leaves the list.
 OF_CHANGED_TREES = {"B0.json", "B2.json", "B6.json"}
 
 
-def runs_of(found: Any) -> list[dict[str, Any]]:
-    """The runs of a file that says what made it, as `provenance` of the benchmarks writes them."""
-    return found.get("runs", []) if isinstance(found, dict) else []
-
-
-def of_changed_tree(run: dict[str, Any]) -> bool:
-    """Whether code that was not committed made the results; a run that does not say so might be of one."""
-    return not run.get("commit") or run.get("clean", not run.get("changed", True)) is not True
-
-
-@pytest.mark.parametrize("file", sorted(RESULTS.glob("*.json")), ids=lambda file: file.name)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
 def test_results_come_from_committed_code(file: Path) -> None:
-    runs = runs_of(json.loads(file.read_text(encoding="utf-8")))
-    if not runs:
-        pytest.skip("the file does not say what made it")
-    changed = [run.get("date") for run in runs if of_changed_tree(run)]
+    runs = runs_that_count(json.loads(file.read_text(encoding="utf-8")))
+    assert runs, f"{file.name} does not say what made it; see benchmarks/origin.py"
+    # `stored`: from before results said what made them; the commit that they came with.
+    changed = [run.get("date") for run in runs if of_changed_tree(run) and not run.get("stored")]
     if file.name in OF_CHANGED_TREES:
         assert changed, f"{file.name} is clean now: take it off the list"
     else:
@@ -51,6 +42,125 @@ def test_results_come_from_committed_code(file: Path) -> None:
 )
 def test_what_counts_as_committed(run: dict[str, Any], refused: bool) -> None:
     assert of_changed_tree(run) is refused
+
+
+def project(folder: Path, **modules: str) -> Imports:
+    """A package with benchmarks; names of modules with `__` in the place of `/`."""
+    for name, text in modules.items():
+        file = folder / (name.replace("__", "/").replace("/init", "/__init__") + ".py")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    return Imports(folder)
+
+
+def test_results_measure_what_their_script_imports(tmp_path: Path) -> None:
+    found = project(
+        tmp_path,
+        benchmarks__B1="import numpy\nimport rotflex_jax as rf\nfrom drawing import draw\nrf.fit(1)\n",
+        benchmarks__drawing="import rotflex_jax.export",
+        rotflex_jax__init="from .fit import fit as fit\nfrom .export import export as export\n",
+        rotflex_jax__fit__init="from .greybox import fit\nfrom .series import other\n",
+        rotflex_jax__fit__greybox="def fit(x):\n    from rotflex_jax.effects import base\n",
+        rotflex_jax__fit__series="",
+        rotflex_jax__effects__init="from .base import A\nfrom .gear import B\n",
+        rotflex_jax__effects__base="if TYPE_CHECKING:\n    from ..fit import series\n",
+        rotflex_jax__effects__gear="from ..text.files import write\n",
+        rotflex_jax__text__init="",
+        rotflex_jax__text__files="",
+        rotflex_jax__export="",
+    ).sources("B1")
+    # Effects are registered where they are declared, so all of them count.
+    effects = {f"rotflex_jax/effects/{name}.py" for name in ("__init__", "base", "gear")}
+    assert set(found) == {"benchmarks/B1.py", "rotflex_jax/fit/greybox.py"} | effects
+
+
+def test_the_arena_measures_the_search() -> None:
+    measured = set(Imports().sources("B0_discovery"))
+    parts = ["discover/selection", "discover/verdict", "effects/friction", "mechanism/step", "fit/inference"]
+    parts += ["arena/simulator/plant", "optimise/damped_least_squares", "recording/quality"]
+    assert {f"rotflex_jax/{name}.py" for name in parts} <= measured
+    assert "benchmarks/arena/trial.py" in measured
+    assert not any(path.startswith(("rotflex_jax/report", "rotflex_jax/cli")) for path in measured)
+
+
+MODULE = """'''A text.'''
+def f(x):
+    if x < 2:
+        raise ValueError("small")
+    return x
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "same"),
+    [
+        ("A text", "Another text", True),
+        ("def f(x):", "# why\n\ndef f( x ):\n    'What it does.'", True),
+        ("small", "too small", True),
+        ("ValueError", "TypeError", False),
+        ("<", "<=", False),
+        ("2", "2.5", False),
+        ("return x", "return x, None", False),
+        ("return x", "return 'x'", False),
+    ],
+)
+def test_what_changes_the_meaning_of_a_module(before: str, after: str, same: bool) -> None:
+    assert before in MODULE
+    assert (meaning(MODULE) == meaning(MODULE.replace(before, after))) is same
+
+
+def test_results_are_of_an_earlier_version_once_what_they_measure_has_changed(tmp_path: Path) -> None:
+    project(tmp_path, benchmarks__B1="a = 1\n")
+    run = {"commit": "abc", "clean": True, "code": "one", "sources": "s"}
+    sources = {"s": {"benchmarks/B1.py": meaning("a = 1")}}
+    results = {"runs": [run], "sources": sources, "rows": {"x": {"code": "one"}}}
+    assert standing(results, tmp_path) == (True, (), ())
+    # A run of which no row is left does not count; one that rows are of, and that is not there, does.
+    runs = [{"commit": "old", "clean": False, "code": "two"}, run]
+    assert standing({**results, "runs": runs}, tmp_path).present
+    assert standing({**results, "runs": runs, "parts": {"fits": "two"}}, tmp_path).of == ("old with changes",)
+    assert standing({**results, "rows": {"x": {"code": "three"}}}, tmp_path).of == ("not told",)
+    assert not standing({**results, "runs": [{**run, "clean": False}]}, tmp_path).present
+    assert standing({"runs": [{"stored": "abc"}]}, tmp_path).of == ("stored with abc",)
+    assert not standing({"rows": []}, tmp_path).present
+    other = tmp_path / "other"
+    project(other, benchmarks__B1="a = 2\n")
+    assert standing(results, other) == (False, ("abc",), ("benchmarks/B1.py",))
+    assert standing(results, tmp_path / "gone").changed == ("benchmarks/B1.py",)
+
+
+def test_a_run_says_what_made_it(monkeypatch) -> None:
+    results: dict = {"rows": {}}
+    made = begin(results, "benchmarks/B12_control.py", ["coulomb"], files=["tests/conftest.py"])
+    assert {"date", "commit", "clean", "python", "machine", "versions", "arguments"} <= set(made)
+    (run,) = results["runs"]
+    measured = results["sources"][run["sources"]]
+    assert {"benchmarks/B12_control.py", "tests/conftest.py", "rotflex_jax/control/design.py"} <= set(
+        measured
+    )
+    part(results, "coulomb")
+    assert runs_that_count(results) == [run]
+    assert standing(results).changed == ()
+    # Other changes beside the same sources are forgotten once it runs on a clean tree; other sources are not.
+    said = {"rev-parse": "abc", "status": ""}
+    monkeypatch.setattr("origin.git", lambda *command: said[command[0]])
+    other = {**run, "clean": False, "sources": "others"}
+    results["runs"] = [{**run, "clean": False}, other]
+    begin(results, "benchmarks/B12_control.py", ["coulomb"], files=["tests/conftest.py"])
+    assert results["runs"][0] is other and [r["commit"] for r in results["runs"][1:]] == ["abc"]
+    assert not of_changed_tree(results["runs"][1])
+    said["status"] = " M rotflex_jax/fit/inference.py"
+    assert of_changed_tree(begin({}, "benchmarks/B12_control.py"))
+
+
+def test_what_is_said_beside_numbers(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("origin.RESULTS", tmp_path)
+    (tmp_path / "B5").mkdir()
+    for name, commit in (("B1", "abc"), ("B2", "abc"), ("B5/a", "def"), ("B5/b", "abc")):
+        (tmp_path / f"{name}.json").write_text(json.dumps({"runs": [{"commit": commit, "clean": True}]}))
+    head = "Measured with an earlier version of the code: "
+    assert remark(["B1.json", "B2.json", "B5"]) == f"{head}B1, B2 (abc); B5 (def, abc)."
+    assert remark([]) == ""
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 116), (0, 1), (3, 60), (59, 60)])

@@ -349,6 +349,7 @@ BAD_TEXT: dict[str, tuple[bytes, str]] = {
         "field larger than field limit",
     ),
     "long header": (("x" * 140_000 + "," + text()).encode(), "field larger than field limit"),
+    "long name": (("x" * 100_000 + "\n1\n").encode(), r"it has x{37}\.\.\.:"),
     "400 digits": (text().replace("0.004000", "9" * 400).encode(), "'t' is inf at line 4"),
     "underscore": (text().replace("0.004000", "0.00_4").encode(), "holds '0.00_4' at line 4"),
     "UTF-16": (text().encode("utf-16"), "UTF-16"),

@@ -94,6 +94,10 @@ def test_candidates_whose_score_the_winner_took_are_refitted_too():
     rich = ({"lugre": 100.0}, {"lugre": 100.0})
     assert replaced(rich, ({}, {}), winner="coulomb") == []
     assert replaced(rich, ({}, {}), winner="cogging") == ["lugre"]
+    # A quarter of the best is enough, and a tenth of its own is not lost.
+    quarter = ({"gravity": 100.0, "coulomb": 25.0, "viscous": 24.9}, {})
+    assert replaced(quarter, ({"gravity": 95.0}, {})) == ["coulomb"]
+    assert replaced(({"gravity": 40.0}, {}), ({"gravity": 4.0}, {})) == []
     # Two at most, those that promised most over both horizons.
     gone = ({}, {})
     assert replaced(before, gone) == ["gravity", "cogging"]

@@ -1,6 +1,8 @@
 """Probabilities of sets of effects: known evidence, scatter, credible sets, what is told of them."""
 
+import dataclasses
 import json
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +22,7 @@ from arena.probability import (
     weighed,
 )
 from rotflex_jax.discover.probabilities import (
+    RULE as CALIBRATED,
     EvidenceRule,
     FittedSet,
     Probabilities,
@@ -270,3 +273,15 @@ def test_few_machines_scatter_as_much_as_their_probabilities_say():
     assert high == pytest.approx(np.quantile(drawn, 0.95), rel=0.3)
     # Answers exclude each other: of two of one half each, one is right.
     assert scatter_of_right([[0.5, 0.5]] * 20)[1] == 0.0
+
+
+def test_the_rule_is_the_one_that_was_calibrated() -> None:
+    """What `benchmarks/set_probabilities.py` found on tuning seeds."""
+    assert EvidenceRule(5.0, 0.2, 2.0, 3.0, 0.02, 0.17) == CALIBRATED
+    sets = [FittedSet(frozenset(), np.zeros(4), np.zeros(4))]
+    for misfit_of, elsewhere in ((1.0, 0.02), (math.inf, 0.17)):
+        found = probabilities(sets, misfit=misfit_of)
+        assert found.elsewhere == pytest.approx(elsewhere)
+        assert found.sets[0].probability == pytest.approx(1 - elsewhere)
+        # What they were computed from is neither shown nor compared.
+        assert "FittedSet" not in repr(found) and found == dataclasses.replace(found, evidence=())

@@ -1,6 +1,7 @@
 """Which candidate wins, which are not distinguished and which are refused; each limit from both sides."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -538,3 +539,113 @@ def test_parameters_of_predictions_suit_free_runs_better_by_a_hundredth(side: fl
     found = at_both({"windows": 5.0 * np.exp(-0.01 * side)}, {"windows": 5.0}, COULOMB)
     best = found if side > 1 else found.free_run
     np.testing.assert_array_equal(best_window_rmse(found), best.window_rmse)
+
+
+def at_the_limit(monkeypatch, name: str, value: float, decides: Callable[[], bool]) -> list[bool]:
+    """Decisions with a limit just below a value, at it, and just above."""
+    found = []
+    for limit in (np.nextafter(value, -np.inf), value, np.nextafter(value, np.inf)):
+        monkeypatch.setattr(selection, name, float(limit))
+        found.append(decides())
+    return found
+
+
+UNTIL, UP_TO, BEYOND = [True, False, False], [True, True, False], [False, False, True]
+NOT_SURE = trial(COULOMB, **PLENTY | {"held_out": 20.0, "train": 50.0, "scatter": 0.3})
+RUNS = of_free_runs(windows=8.0, z=4.0, train_z=5.0)
+UNSURE_RUNS = at_both(not_quite_sure(5.0, windows=9.5), {"windows": 10.0}, COULOMB)
+APART = [trial(p, 200.0, 200.0, w) for p, w in ((COULOMB, 5.0), (ARM, 6.0))]
+CERTAIN = trial(COULOMB, 220.0, 230.0, 5.0, 0.3), trial(ARM, 200.0, 200.0, 5.0)
+
+
+def lead(a: ValidatedHypothesis, b: ValidatedHypothesis = BASE) -> tuple[float, float]:
+    return paired_gain(a.blocks, b.blocks)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "decides", "expected"),
+    [
+        ("HELD_OUT_NATS", lead(NOT_SURE)[0], lambda: admissible(NOT_SURE, BASE, DATA, NOISE), UNTIL),
+        ("HELD_OUT_Z", lead(NOT_SURE)[1], lambda: admissible(NOT_SURE, BASE, DATA, NOISE), UNTIL),
+        (
+            "TRAIN_Z",
+            paired_gain(NOT_SURE.hypothesis.blocks, BASE.hypothesis.blocks)[1],
+            lambda: admissible(NOT_SURE, BASE, DATA, NOISE),
+            UNTIL,
+        ),
+        ("HELD_OUT_Z", 3.25, lambda: helps(HorizonGain(10.0, 3.25, 1.0)), UNTIL),
+        (
+            "FREE_RUN_Z",
+            lead(RUNS.free_run, FAR.free_run)[1],
+            lambda: admissible(RUNS, FAR, DATA, NOISE),
+            UNTIL,
+        ),
+        ("FREE_RUN_BETTER", np.log(10 / 8), lambda: admissible(RUNS, FAR, DATA, NOISE), None),
+        (
+            "PREDICTION_Z",
+            min(
+                lead(UNSURE_RUNS, FAR)[1],
+                paired_gain(UNSURE_RUNS.hypothesis.blocks, FAR.hypothesis.blocks)[1],
+            ),
+            lambda: admissible(UNSURE_RUNS, FAR, DATA, NOISE),
+            UNTIL,
+        ),
+        (
+            "SEPARATE_Z",
+            paired_gain(*(np.concatenate([t.blocks, t.hypothesis.blocks]) for t in CERTAIN))[1],
+            lambda: distinguished(*CERTAIN),
+            UP_TO,
+        ),
+        (
+            "WINDOWS_APART",
+            float(np.mean(np.log(APART[1].window_rmse / APART[0].window_rmse))),
+            lambda: distinguished(*APART),
+            UNTIL,
+        ),
+        (
+            "WINDOWS_BETTER",
+            -float(np.mean(np.log(APART[0].window_rmse / APART[1].window_rmse))),
+            lambda: runs_clearly_better(APART[0].window_rmse, APART[1].window_rmse),
+            UNTIL,
+        ),
+        (
+            "WINDOWS_BETTER",
+            -float(np.mean(np.log(trial(COULOMB, **GOOD).window_rmse / BASE.window_rmse))),
+            lambda: admissible(trial(COULOMB, **GOOD), BASE, DATA, NOISE),
+            UNTIL,
+        ),
+        (
+            "WINDOWS_BETTER",
+            float(np.mean(np.log(5.1 * NOISE / (5.0 * NOISE)))),
+            lambda: richer_wins(windows=5.1),
+            BEYOND,
+        ),
+        (
+            "WINDOWS_WORSE",
+            float(np.mean(np.log(1.125 * NOISE / (1.1 * NOISE)))),
+            lambda: admitted(trial(None, windows=1.1), windows=1.125),
+            BEYOND,
+        ),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_what_is_exactly_at_a_limit(monkeypatch, name, value, decides, expected) -> None:
+    """Only what exceeds a limit passes; two effects are distinguished from it on."""
+    if expected is None:  # the error must fall by the limit at least
+        value = -float(np.mean(np.log(RUNS.free_run.window_rmse / FAR.free_run.window_rmse)))
+        expected = UP_TO
+    assert at_the_limit(monkeypatch, name, value, decides) == expected
+
+
+def test_exactly_twice_the_noise_is_near_it() -> None:
+    base = trial(None, windows=2.0)
+    assert admitted(base, windows=2.0)  # far from it the error would have to fall
+    strong, weak = (trial(p, n, n, 2.0) for p, n in ((ARM, 1000.0), (COULOMB, 950.0)))
+    assert choose([strong, weak], BASE, DATA, NOISE) == (strong, [])
+
+
+def test_a_rival_gains_something_on_either_side() -> None:
+    best = trial(DRAG, **GOOD | {"held_out": 30.0, "train": 30.0, "scatter": 1.0})
+    for nothing in ({"held_out": 0.0, "train": 25.0}, {"held_out": 25.0, "train": 0.0}):
+        none = trial(ARM, **GOOD | nothing | {"scatter": 0.0}, seed=2)
+        assert choose([none, best], BASE, DATA, NOISE) == (best, [])

@@ -10,7 +10,17 @@ from test_report import NOISE, read, two_rounds
 
 from rotflex_jax.cli import terminal
 from rotflex_jax.discover.conclusion import end_state
-from rotflex_jax.discover.verdict import NATS_PER_SAMPLE, Grade, Verdict, assess, grade
+from rotflex_jax.discover.verdict import (
+    FAR_FLOOR,
+    NATS_PER_SAMPLE,
+    NEAR_FLOOR,
+    Assessment,
+    Grade,
+    Verdict,
+    assess,
+    grade,
+    percent,
+)
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.labels import effect_label, effect_phrase, sentence, with_titles
 from rotflex_jax.fit.result import Fit
@@ -164,3 +174,33 @@ def test_a_parameter_without_an_interval_is_not_called_held(monkeypatch) -> None
     text = read(render(dataclasses.replace(found, rounds=(first, *found.rounds[1:])))).text
     assert "0.03 N m no interval" in text
     assert "0.03 N m held" not in text
+
+
+def test_verdicts_differ_without_colour_too() -> None:
+    assert len({v.shown.marker for v in Verdict}) == len(Verdict)
+    assert {v for v in Verdict if not v.shown.filled} == {Verdict.AMBIGUOUS}
+
+
+def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
+    near, far = 1.5, 5.0
+    assert (near, far) == (NEAR_FLOOR, FAR_FLOOR)
+    assert (grade(near), grade(far)) == (Grade.NEAR, Grade.FAR)
+    end = Assessment({"theta": 0.5}, {"theta": near}, 0.0)
+    assert not end.at_noise and "above 1.5 times the sensor noise" in end.criterion
+    assert end.explained_text == "theta 0.5 % of the baseline's squared error is explained"
+    below = dataclasses.replace(end, remaining={"theta": np.nextafter(near, 0)})
+    assert below.at_noise and below.is_explained
+    assert not dataclasses.replace(below, torque_nats=NATS_PER_SAMPLE).torque_free
+    # A channel of unknown noise decides where the others are at theirs, not where one is at the limit.
+    unknown = {"alpha": NAN}
+    assert (
+        "noise of alpha is not known"
+        in dataclasses.replace(below, remaining=below.remaining | unknown).criterion
+    )
+    assert "error of theta" in dataclasses.replace(end, remaining=end.remaining | unknown).criterion
+    assert [percent(share) for share in (99.99, 99.0, 0.0)] == ["99.99 %", "99.0 %", "0 %"]
+    # Of a baseline without an error nothing can be explained.
+    assert np.isnan(assess({"theta": 0.0}, {"theta": 1.0}, {"theta": 1.0}, 0.0, 10).explained["theta"])
+    # Random torques gain per value of each channel; without a floor there is one.
+    ended_at = [assess({}, {}, floor, 6.0, 3).torque_nats for floor in ({}, {"a": 1.0}, {"a": 1.0, "b": 1.0})]
+    assert ended_at == [2.0, 2.0, 1.0]

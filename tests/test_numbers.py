@@ -62,10 +62,34 @@ def about_results(name: str) -> str:
 @pytest.mark.parametrize("document", quoted.documents(), ids=lambda p: p.name)
 def test_what_stands_between_marks_is_what_the_results_say(document: Path) -> None:
     text = document.read_text(encoding="utf-8")
-    for mark in quoted.MARK.finditer(text):
-        assert mark["text"] == quoted.quoted(mark["source"]), f"python benchmarks/quoted.py: {mark['source']}"
+    # Line by line, so that a failure shows the mark.
+    assert text.splitlines() == quoted.renewed(text).splitlines(), "python benchmarks/quoted.py"
     # A mark that is not closed, or spelt otherwise, would quote nothing.
     assert len(re.findall(r"<!--=(?!-->)", text)) == len(quoted.MARK.findall(text))
+
+
+@pytest.mark.parametrize("page", quoted.pages(), ids=lambda p: p.name)
+def test_pages_say_which_code_their_results_are_of(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert text == quoted.renewed_page(page, text), "python benchmarks/quoted.py"
+
+
+def test_a_section_says_where_its_results_are_of_an_earlier_version(monkeypatch) -> None:
+    earlier = ["B3.json"]
+    monkeypatch.setattr(quoted, "remark", lambda files: ", ".join(f for f in files if f in earlier))
+    monkeypatch.setattr(claims, "_read", lambda file: {"error": 0.0034})
+    quote = "<!--= {} error [mm] .1f -->3.4<!--=-->"
+    first, second = (quote.format(file) for file in ("B3.json", "B4.json"))
+    text = f"# One\n\n{first}\n\n```bash\n# no heading\n```\n\n# Two\n\n{second}\n"
+    marked = quoted.renewed(text)
+    assert marked == text.replace("```\n\n# Two", "```\n\n<!--= versions -->B3.json<!--=-->\n\n# Two")
+    assert quoted.renewed(marked) == marked
+    # Where a mark stands already it is kept there, and it may name results that stand in a table.
+    placed = f"# One <!--= versions B4.json --><!--=-->\n\n{first}\n"
+    assert quoted.renewed(placed) == placed.replace("--><!--=", "-->B3.json<!--=", 1)
+    earlier[:] = ["B4.json"]
+    assert quoted.renewed(placed) == placed.replace("--><!--=", "-->B4.json<!--=", 1)
+    assert quoted.renewed(marked).count("<!--= versions --><!--=-->") == 1
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -206,6 +230,9 @@ def test_pages_of_results_hold_what_the_results_hold(page: str) -> None:
     values = [v for file in TABLES[page] for v in leaves(claims.results(file))]
     text = prose((ROOT / "docs" / page).read_text(encoding="utf-8"))
     assert [n for n in untraced(text, values) if n not in KNOWN.get(page, ())] == []
+    # Which code the tables are of is said, by a mark that names them or one beside a quotation of them.
+    told = quoted.told_of((ROOT / "docs" / page).read_text(encoding="utf-8"))
+    assert [f for f in TABLES[page] if not {f, f.partition("/")[0]} & told] == []
     # A number that is nowhere is noticed.
     assert untraced("| error | 0.123456 |", values) == ["0.123456"]
 

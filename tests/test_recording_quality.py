@@ -9,7 +9,7 @@ from scipy.signal import StateSpace, lsim
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import INPUTS, make_record
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording import Recording
+from rotflex_jax.recording import Recording, quality
 from rotflex_jax.recording.quality import (
     cut_off,
     is_absolute,
@@ -220,7 +220,25 @@ def test_an_end_is_reached_straight_where_four_times_as_far_takes_longer(ratio: 
     assert is_cut(-visits(400, far, 20)) == found
 
 
-@pytest.mark.parametrize(("at_end", "found"), [((5, 4), False), ((5, 5), True), ((10,), False)])
+def test_a_signal_that_is_cut_at_zero_is_rectified() -> None:
+    x = 0.1 * visits(400, 1020, 20)
+    rng = np.random.default_rng(11)
+    u, theta = rng.normal(size=len(x)), np.cumsum(rng.normal(size=len(x))) / 100
+
+    def read(alpha: np.ndarray) -> Recording:
+        return Recording(u=u, y=np.column_stack([theta, alpha]), Ts=TS)
+
+    (told,) = (f for f in read(x - x.max()).findings if f.kind in ("rectified", "saturated"))
+    assert (told.kind, told.channel, told.severity) == ("rectified", "alpha", "warning")
+    assert f"exactly 0 rad, its extreme, in 40 of {len(x)} samples" in told.message
+    with pytest.raises(InputError, match=r"is exactly 0\.05 rad.* saturated"):
+        read(x - 0.05)
+
+
+@pytest.mark.parametrize(
+    ("at_end", "found"),
+    [((5, 4), False), ((5, 5), True), ((10,), False), ((2,) * 5, True)],
+)
 def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: bool) -> None:
     x = np.concatenate([visits(100, 400, n, number=1) for n in at_end])
     assert is_cut(x) == found
@@ -361,3 +379,64 @@ def test_what_is_slow_needs_two_samples_in_the_shortest_period(samples: int, fou
     x = np.cos(np.linspace(0, 4 * np.pi, samples)) + 0.7 * np.random.default_rng(3).normal(size=samples)
     assert is_absolute(x, x) == found
     assert is_swapped(0.1 * x, x) == found
+
+
+def test_what_is_exactly_at_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Powers of two are exact in every sum: signals are brought to the limits, or limits to the signals."""
+    y = np.column_stack([WAVE, 0.1 * WAVE[::-1]])
+    for samples, short in ((49, True), (50, False)):
+        r = Recording(u=U[:samples], y=y[:samples], Ts=TS, accept=quality.ACCEPTABLE)
+        assert any(f.kind == "short" for f in r.findings) == short
+    assert "units voltage" not in kinds(u=100 * U) and np.max(np.abs(100 * U)) == 100.0
+    half_turn = np.where(K % 2, 1.0, -1.0) * np.pi
+    assert "units alpha" not in kinds(alpha=half_turn)
+    # The speed that a servo may just reach, over one sample of a quarter of a second.
+    for volts, speed in ((1.0, 60.0), (10.0, 150.0)):
+        for more, found in ((0.0, False), (1e-9, True)):
+            theta = np.array([0.0, 0.0, 0.25 * speed + more, 0.0])
+            told = quality._like_degrees(theta, volts * np.ones(4), 0.25, "theta", "V")
+            assert (told is not None) == found
+    x = slow(1.0, 1.0)
+    monkeypatch.setattr(quality, "SWAPPED_RATIO", 4.0)
+    assert not is_swapped(x, 4.0 * x) and is_swapped(x, 4.000001 * x)
+    # As much slow motion as is asked for in one band: the rest is in the other.
+    monkeypatch.setattr(quality, "_spectrum", lambda values: np.asarray(values, complex))
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.5)
+    hub = np.zeros(16)
+    hub[1], hub[4] = 3.0, 4.0  # of length five
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.6)
+    assert not is_absolute(hub, hub)
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.59)
+    assert is_absolute(hub, hub)
+    # A slope that is off by the tolerance, and one by more.
+    monkeypatch.setattr(quality, "SLOW_BANDS", ((1, 4, 0.25), (4, 8, 0.25)))
+    assert is_absolute(hub, 1.25 * hub) and not is_absolute(hub, 1.2500001 * hub)
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.06)
+    assert not is_swapped(0.1 * hub, hub)  # ten times as much is asked for
+    monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.059)
+    assert is_swapped(0.1 * hub, hub)
+    assert not is_absolute(hub, 0.0 * hub)
+
+
+def test_sentences_tell_the_numbers_that_decided() -> None:
+    y = np.column_stack([WAVE, 0.1 * WAVE[::-1]])
+
+    def said(u: np.ndarray = U, theta: np.ndarray = WAVE, alpha: np.ndarray = y[:, 1]) -> str:
+        r = Recording(u=u, y=np.column_stack([theta, alpha]), Ts=TS, accept=quality.ACCEPTABLE)
+        return " ".join(f.message for f in r.findings)
+
+    swapped = quality._swapped(slow(1.0, 1.0)[:, None] * [0.1, 1.0], ("theta", "alpha"))
+    assert swapped is not None and "moves 10 times as far as 'theta'" in swapped.message
+    assert "reaches 250 V" in said(u=250 * U)
+    assert "alpha' reaches 4 rad" in said(alpha=4 * WAVE[::-1])
+    told = quality._like_degrees(np.array([0.0, 25.0, 0.0]), np.full(3, -2.0), 0.25, "theta", "V")
+    assert told is not None and "up to 100 rad/s on 2 V" in told.message
+    assert "is 1.5 V throughout" in said(u=np.full(N, 1.5))
+    assert "'alpha' never changes from 0.25 rad" in said(alpha=np.full(N, 0.25))
+    step = 2 * np.pi / 4096
+    assert "in steps of 0.001534 rad (0.08789 deg)" in said(theta=step * np.round(WAVE / step))
+    assert "whole numbers from -30 to 30" in said(theta=np.round(30 * WAVE))
+    clipped = np.clip(2 * U, -0.5, 0.75)
+    assert "stands at its limit, -0.5 and 0.75 V" in said(u=clipped)
+    short = Recording(u=U[:40], y=y[:40], Ts=TS, accept=quality.ACCEPTABLE)
+    assert "at least 50 samples, but has 40" in " ".join(f.message for f in short.findings)

@@ -98,9 +98,10 @@ def test_programs_are_counted_and_one_that_is_loaded_runs_once(
         return lambda *leaves: (runs.append(leaves), program(*leaves))[1]
 
     monkeypatch.setattr(serialize_executable, "deserialize_and_load", watched)
+    # A slope of its own: what JAX has compiled before it loads from its own cache, and cannot be stored.
     for program in (new(), new()):
         for _ in range(3):
-            np.testing.assert_array_equal(program(2.0, x), 2 * x)
+            np.testing.assert_array_equal(program(7.25, x), 7.25 * x)
     found = program_counts()
     assert (found.compiled - before.compiled, found.loaded - before.loaded) == (1, 1)
     assert found.seconds > before.seconds and len(runs) == 3  # one of them to see whether it can
@@ -239,20 +240,24 @@ def test_a_folder_may_be_chosen_and_the_usual_one_is_the_users(
 LOOPS = """
 import sys, os
 if "first" in sys.argv:
-    import jax.numpy
-    jax.numpy.ones(3)
+    import jax, jax.numpy as jnp
+    loop = jax.jit(lambda c: jax.lax.scan(lambda c, _: (jnp.tanh(c), None), c, None, length=1000))
+    print("small_call" in loop.lower(jnp.ones(400)).compile().as_text())
 import rotflex_jax as rf
-print(rf.performance().fast_loops, "XLA_FLAGS" in os.environ)
+print(rf.performance().fast_loops)
+print("XLA_FLAGS" in os.environ)
 """
 
 
-@pytest.mark.parametrize(("when", "expected"), [("last", "True False"), ("first", "False False")])
-def test_loops_are_fast_unless_jax_has_started_before(when: str, expected: str) -> None:
+@pytest.mark.parametrize("when", ["last", "first"])
+def test_loops_are_fast_unless_jax_has_started_before(when: str) -> None:
+    """Then they are what this JAX makes of them by itself; newer ones compile small loops as we ask for."""
     clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     run = subprocess.run(
         [sys.executable, "-c", LOOPS, when], capture_output=True, text=True, check=True, env=clean
     )
-    assert run.stdout.strip() == expected
+    *alone, found, left = run.stdout.split()
+    assert [found] == (alone or ["True"]) and left == "False"
 
 
 def test_old_versions_are_deleted(folder: Path) -> None:
@@ -343,9 +348,9 @@ def test_a_named_tuple_comes_back_from_disk_as_one(folder: Path) -> None:
 def test_a_compiler_without_these_choices_compiles_as_it_likes(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    known = persistent_jit._FOR_COMPILER
-    assert persistent_jit._options() == known  # this one has the choice
-    monkeypatch.setattr(persistent_jit, "_FOR_COMPILER", {"xla_no_such_option": False, **known})
+    wished, known = persistent_jit._FOR_COMPILER, persistent_jit._options()
+    assert known and known.items() <= wished.items()  # XLA drops a choice now and then
+    monkeypatch.setattr(persistent_jit, "_FOR_COMPILER", {"xla_no_such_option": False, **wished})
     persistent_jit._options.cache_clear()
     assert persistent_jit._options() == known
     np.testing.assert_array_equal(new()(2.0, np.ones(2, np.float32)), [2.0, 2.0])

@@ -9,6 +9,7 @@ import numpy as np
 
 from arena.marks import Kept, Row, confusion, good, grouped, intervals, mean_set, sets
 from arena.table import answer, label
+from claims import SEEN
 from rotflex_jax.text.colours import BASELINE, FINAL, INK
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.plotting import blank, styled
@@ -53,6 +54,7 @@ def written(records: list[Row], figures: list[Path]) -> str:
         cells += [f"{statistics.median(over):.3f}" if over else "-"]
         cells += [f"{statistics.median(r['cpu_s'] for r in rows):.1f}"]
         lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "## Seed by seed", "", *by_seed(records)]
     held = sets(records)
     lines += ["", "## Promises", "", "| claim | held | of |", "|---|---|---|"]
     lines += [
@@ -69,6 +71,29 @@ def written(records: list[Row], figures: list[Path]) -> str:
     failed = [r for r in records if "error" in r]
     lines += [f"- {label(r)} ({r['kind']}, seed {r['seed']}): {r['error']}" for r in failed]
     return "\n".join(lines) + "\n"
+
+
+def by_seed(records: list[Row]) -> list[str]:
+    """One effect of the usual size, effects without a name, and nothing hidden, for each seed."""
+    lines = [
+        "| seed | one effect, first right | without a name, unexplained | nothing hidden, alarms |",
+        "|---|---|---|---|",
+    ]
+    usual = [r for r in good(records) if r.get("size", 1.0) == 1.0 and len(r["effects"]) <= 1]
+    counts: dict[tuple[str, ...], list[int]] = {}
+    for seed in sorted({r["seed"] for r in usual}):
+        rows = [r for r in usual if r["seed"] == seed]
+        outside = [r["verdict_right"] for r in rows if r["outside"]]
+        named = [r["first"] for r in rows if r["wanted"] and not r["outside"]]
+        alarms = [r["extra"] for r in rows if not r["wanted"] and not r["outside"]]
+        cells = tuple(f"{sum(map(bool, m))}/{len(m)}" if m else "-" for m in (named, outside, alarms))
+        counts.setdefault(cells, []).append(seed)
+    for cells, seeds in counts.items():
+        first, last = seeds[0], seeds[-1]
+        several = f"{first} to {last}, each" if last > first else str(first)
+        lines.append(f"| {several} | {' | '.join(cells)} |")
+    seen = " and ".join(map(str, SEEN))
+    return [*lines, "", f"Records with seeds {seen} were looked at while the search was revised."]
 
 
 @styled

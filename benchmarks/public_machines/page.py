@@ -14,8 +14,8 @@ TITLES = {
 
 def page(found: dict[str, Any]) -> str:
     parts = ["# Discovery on public machines\n", "Written by `python benchmarks/B3_public.py`.\n"]
-    for name, case in found.items():
-        parts += [f"\n## {TITLES[name]}\n", *_case(case)]
+    for name in (n for n in TITLES if n in found):
+        parts += [f"\n## {TITLES[name]}\n", *_case(found[name])]
     return "\n".join(parts) + "\n"
 
 

@@ -97,7 +97,8 @@ class Table:
     def _lacks(self, what: str, then: str) -> InputError:
         longer = [key for key, values in self.columns.items() if len(values) > 1]
         there = longer or list(self.columns)  # settings of one value are not worth offering
-        names = ", ".join(there[:20]) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
+        short = [name if len(name) <= 40 else f"{name[:37]}..." for name in there[:20]]
+        names = ", ".join(short) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
         if objects:
             cure = "save a timetable or a timeseries with -v7, and of others .Time and .Data"

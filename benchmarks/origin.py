@@ -1,0 +1,440 @@
+"""What made a file of results: when, from which commit and versions, and which source files it measures.
+
+    python benchmarks/origin.py               # of each file: is it of the present code, and what has changed
+    python benchmarks/origin.py B3.json       # of one, each changed file
+
+A result measures the script of its benchmark and what that imports, of this folder and of the package, in
+functions too. Names that a package hands on are followed to the module that has them, so that a benchmark of
+fits does not depend on exports. Left out is what writes and shows (`SHOWN`), which changes no number. Of each
+file the meaning counts: neither comments, layout and docstrings nor the words of an error do.
+
+A file of results has `runs`, one entry for each time that its benchmark was started, and `sources`, the
+digests of the measured files under the name that the entries give them. What was done part by part says in
+`parts`, or in each row under `code`, which version did it; runs of which nothing is left do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import datetime
+import functools
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+RESULTS = HERE / "results"
+
+SHOWN = ("text", "report", "notebook", "cli", "errors", "checks")
+"""Parts of the package that write, show or refuse."""
+
+DRAWN = ("page", "pages", "figure", "figures", "drawing", "origin")
+"""Last words of the names of modules that do, wherever they stand."""
+
+REGISTRIES = ("rotflex_jax.effects", "rotflex_jax.compare")
+"""Packages that count as a whole, since what is in them is found by a registry."""
+
+
+# -- what a file of source means ----------------------------------------------------------------------------
+
+
+def meaning(text: str) -> str:
+    """Digest of a Python source without comments, layout, docstrings and the words of its errors.
+
+    The same in every version of Python that can read the source.
+
+    >>> meaning("a = 1  # one") == meaning("a = (1)"), meaning("a = 1") == meaning("a = 2")
+    (True, False)
+    """
+    found = hashlib.sha256()
+    for part in _parts(ast.parse(text), wordless=False):
+        found.update(part.encode() + b"\0")
+    return found.hexdigest()[:12]
+
+
+def _parts(node: Any, wordless: bool) -> Iterator[str]:
+    """Types and values of a tree, in order; without strings where an error is raised."""
+    if isinstance(node, list):
+        yield "["
+        for part in node:
+            yield from _parts(part, wordless)
+        yield "]"
+    elif isinstance(node, ast.AST):
+        yield type(node).__name__
+        wordless = wordless or isinstance(node, ast.Raise)
+        if wordless and isinstance(node, ast.Constant) and isinstance(node.value, str):
+            return
+        for name, value in ast.iter_fields(node):
+            # Fields that some versions of Python have, and others have not, are empty here.
+            if value in (None, []) or name in ("ctx", "kind", "type_comment"):
+                continue
+            if name == "body" and isinstance(value, list) and _is_text(value[0]):
+                value = value[1:]
+            yield name
+            yield from _parts(value, wordless)
+    else:
+        yield repr(node)
+
+
+def _is_text(statement: ast.AST) -> bool:
+    """Whether a statement is nothing but a text, as docstrings are."""
+    return (
+        isinstance(statement, ast.Expr)
+        and isinstance(statement.value, ast.Constant)
+        and isinstance(statement.value.value, str)
+    )
+
+
+# -- which files a script measures --------------------------------------------------------------------------
+
+
+class Imports:
+    """Modules of the package and of the benchmarks under a folder, and what each of them imports."""
+
+    def __init__(self, root: Path = ROOT) -> None:
+        self.root = root
+        self._read: dict[Path, str] = {}
+        self._handed_on: dict[str, dict[str, tuple[str, str]]] = {}
+
+    def file(self, name: str) -> Path | None:
+        """File of a module by its full name, `__init__.py` of a package; None for what is not ours."""
+        here = self.root if name.partition(".")[0] == "rotflex_jax" else self.root / "benchmarks"
+        base = here.joinpath(*name.split("."))
+        files = (base.with_suffix(".py"), base / "__init__.py")
+        return next((file for file in files if file.is_file()), None)
+
+    def text(self, file: Path) -> str:
+        """What a file holds."""
+        if file not in self._read:
+            self._read[file] = file.read_text(encoding="utf-8")
+        return self._read[file]
+
+    def sources(self, script: str) -> dict[str, str]:
+        """Digests of the files that a script of the benchmarks measures, its own first, by path.
+
+        Args:
+            script: name of the module, such as "B3_public".
+        """
+        found, waiting = dict[str, str](), [script]
+        seen = set(waiting)
+        while waiting:
+            name = waiting.pop()
+            file = self.file(name)
+            # The package itself is a list of names, each of which is followed.
+            if file is None or name == "rotflex_jax" or (name != script and _shows(name)):
+                continue
+            found[file.relative_to(self.root).as_posix()] = meaning(self.text(file))
+            new = self.imported(name) - seen
+            seen |= new
+            waiting += sorted(new)
+        return found
+
+    def imported(self, name: str) -> set[str]:
+        """Full names of the modules that declare what a module imports, if they are ours."""
+        file = self.file(name)
+        assert file is not None, name
+        found, called = set[str](), dict[str, str]()
+        tree = ast.parse(self.text(file))
+        for node in _executed(tree):
+            if isinstance(node, ast.ImportFrom):
+                source = _absolute(node, name, file)
+                for alias in node.names:
+                    modules = self.declares(source, alias.name)
+                    found |= modules
+                    if modules == {f"{source}.{alias.name}"}:
+                        called[alias.asname or alias.name] = f"{source}.{alias.name}"
+            elif isinstance(node, ast.Import):
+                for alias in node.names:
+                    first = alias.name.partition(".")[0]
+                    called[alias.asname or first] = alias.name if alias.asname else first
+                    found |= {alias.name} if self.file(alias.name) else set()
+            elif isinstance(node, ast.Attribute):
+                found |= self._by_attributes(node, called)
+        return found
+
+    def _by_attributes(self, node: ast.Attribute, called: dict[str, str]) -> set[str]:
+        """What `rf.effects.Coulomb` takes, where `rf` was imported."""
+        names = list[str]()
+        here: ast.AST = node
+        while isinstance(here, ast.Attribute):
+            names.append(here.attr)
+            here = here.value
+        package = called.get(here.id) if isinstance(here, ast.Name) else None
+        found = set[str]()
+        for attribute in reversed(names):
+            file = package and self.file(package)
+            if not package or not file or file.name != "__init__.py":
+                break
+            found = self.declares(package, attribute)
+            package = f"{package}.{attribute}" if f"{package}.{attribute}" in found else None
+        return found
+
+    def declares(self, source: str, name: str) -> set[str]:
+        """The module that has a name, where a package may hand it on; nothing for what is not ours."""
+        file = self.file(source)
+        if file is None:
+            return set()
+        whole = {source} if source in REGISTRIES else set()
+        if file.name == "__init__.py" and name != "*":
+            # A name may be that of a folder too: `rf.fit` is the function.
+            further = self.handed_on(source).get(name)
+            if further is not None and further != (source, name):
+                return whole | self.declares(*further)
+        inner = f"{source}.{name}"
+        return whole | {inner if self.file(inner) else source}
+
+    def handed_on(self, package: str) -> dict[str, tuple[str, str]]:
+        """Names that a package imports for others, from its list (`.pyi`) where it has one."""
+        if package not in self._handed_on:
+            file = self.file(package)
+            assert file is not None, package
+            listed = file.with_suffix(".pyi")
+            file = listed if listed.is_file() else file
+            self._handed_on[package] = {
+                alias.asname or alias.name: (_absolute(node, package, file), alias.name)
+                for node in ast.parse(self.text(file)).body
+                if isinstance(node, ast.ImportFrom)
+                for alias in node.names
+            }
+        return self._handed_on[package]
+
+
+def _shows(name: str) -> bool:
+    """Whether a module writes, shows or refuses."""
+    parts = name.split(".")
+    inside = parts[0] == "rotflex_jax" and len(parts) > 1
+    return parts[-1].split("_")[-1] in DRAWN or (inside and parts[1] in SHOWN)
+
+
+def _absolute(node: ast.ImportFrom, name: str, file: Path) -> str:
+    """Full name of the module that is imported from."""
+    if not node.level:
+        return str(node.module)
+    parts = name.split(".")
+    parts = parts[: len(parts) - node.level + (file.stem == "__init__")]
+    return ".".join([*parts, *([node.module] if node.module else [])])
+
+
+def _executed(node: ast.AST) -> Iterator[ast.AST]:
+    """Nodes of a tree, imports before the rest, without what is there for type checkers alone."""
+    inner = list[ast.AST]()
+    waiting = [node]
+    while waiting:
+        here = waiting.pop()
+        if isinstance(here, ast.If) and "TYPE_CHECKING" in ast.unparse(here.test):
+            waiting += here.orelse
+            continue
+        inner.append(here)
+        waiting += ast.iter_child_nodes(here)
+    return iter(sorted(inner, key=lambda n: not isinstance(n, ast.Import | ast.ImportFrom)))
+
+
+@functools.cache
+def sources(*scripts: str) -> dict[str, str]:
+    """Digests of what scripts of the benchmarks measure now, by path."""
+    imports = Imports()
+    return {path: digest for script in scripts for path, digest in imports.sources(script).items()}
+
+
+# -- what a run writes --------------------------------------------------------------------------------------
+
+
+def git(*command: str) -> str:
+    """What git says of the project; nothing where there is none."""
+    try:
+        done = subprocess.run(["git", "-C", str(ROOT), *command], capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return done.stdout.strip()
+
+
+def provenance() -> dict[str, Any]:
+    """What produced the numbers."""
+    code, arena = hashlib.sha256(), hashlib.sha256()
+    for file in sorted((ROOT / "rotflex_jax").rglob("*.py")):
+        code.update(file.read_bytes())
+    simulator = ROOT / "rotflex_jax" / "arena" / "simulator"
+    for file in sorted([*(HERE / "arena").glob("*.py"), *simulator.glob("*.py")]):
+        arena.update(file.read_bytes())
+    commit = git("rev-parse", "--short", "HEAD")
+    # Results are written while a benchmark goes on, in pieces too; they are no code.
+    changes = git("status", "--porcelain", "--", ".", ":!benchmarks/results", ":!docs/figures")
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "commit": commit,
+        "changed": not commit or bool(git("status", "--porcelain", "--", "rotflex_jax")),
+        "clean": bool(commit) and not changes,
+        "code": code.hexdigest()[:12],
+        "arena": arena.hexdigest()[:12],
+        "python": platform.python_version(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "versions": {n: importlib.metadata.version(n) for n in ("jax", "numpy", "scipy")},
+    }
+
+
+KEYS = ("runs", "sources", "parts")
+"""What stands beside the results in their file."""
+
+
+def begin(
+    results: dict[str, Any],
+    script: str,
+    arguments: Any = (),
+    *,
+    scripts: Sequence[str] = (),
+    files: Iterable[str] = (),
+) -> dict[str, Any]:
+    """Adds a run to a file of results, and what it measures.
+
+    Args:
+        results: the file, as it will be written; changed.
+        script: `__file__` of the benchmark.
+        arguments: with which it was started.
+        scripts: further modules that it runs, which it does not import.
+        files: further files that it measures, by path from the folder of the project.
+
+    Returns:
+        The entry, of which rows keep `code`.
+    """
+    measured = dict(sources(Path(script).stem, *scripts))
+    measured |= {path: meaning((ROOT / path).read_text(encoding="utf-8")) for path in files}
+    name = hashlib.sha256(json.dumps(sorted(measured.items())).encode()).hexdigest()[:12]
+    made = provenance() | {"arguments": arguments}
+    run = made | {"sources": name}
+    # What was changed and not committed beside the same sources made no other numbers.
+    same = lambda old: (old.get("code"), old.get("sources")) == (run["code"], run["sources"])  # noqa: E731
+    before = [
+        old
+        for old in results.get("runs", [])
+        if of_changed_tree(run) or not (of_changed_tree(old) and same(old))
+    ]
+    results["runs"] = [*before, run]
+    results.setdefault("sources", {})[name] = measured
+    used = {run.get("sources") for run in results["runs"]}
+    results["sources"] = {key: value for key, value in results["sources"].items() if key in used}
+    return made
+
+
+def part(results: dict[str, Any], name: str) -> None:
+    """Notes that a part of a file is of the run that was begun last."""
+    results.setdefault("parts", {})[name] = results["runs"][-1]["code"]
+
+
+# -- what a file says ---------------------------------------------------------------------------------------
+
+
+class Standing(NamedTuple):
+    """Whether results are of the present code, and if not the runs that they are of and what has changed."""
+
+    present: bool
+    of: tuple[str, ...]
+    changed: tuple[str, ...]
+
+
+def runs_that_count(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """Runs of which the file still holds something; one without a commit for rows of which no run is left."""
+    runs = list(results.get("runs") or ([results] if "commit" in results else []))
+    rest = {key: value for key, value in results.items() if key not in (*KEYS, "code")}
+    codes = set(results.get("parts", {}).values()) | set(_codes(rest))
+    if not codes:
+        return runs
+    lost = codes - {run.get("code") for run in runs}
+    return [run for run in runs if run.get("code") in codes] + [{"code": code} for code in sorted(lost)]
+
+
+def _codes(found: Any) -> Iterator[str]:
+    """Versions that rows are of."""
+    if isinstance(found, dict):
+        if isinstance(found.get("code"), str):
+            yield found["code"]
+        found = list(found.values())
+    if isinstance(found, list):
+        for inner in found:
+            if isinstance(inner, dict | list):
+                yield from _codes(inner)
+
+
+def of_changed_tree(run: dict[str, Any]) -> bool:
+    """Whether code that was not committed made the results; a run that does not say so might be of one."""
+    return not run.get("commit") or run.get("clean", not run.get("changed", True)) is not True
+
+
+def standing(results: dict[str, Any], root: Path = ROOT) -> Standing:
+    """Whether what results measure is still what the files under a folder say."""
+    told, changed = list[str](), set[str]()
+    present = True
+    runs = runs_that_count(results)
+    for run in runs:
+        measured = results.get("sources", {}).get(run.get("sources"))
+        other = {path for path, digest in (measured or {}).items() if _now(root / path) != digest}
+        if measured and not other and not of_changed_tree(run):
+            continue
+        present = False
+        changed |= other
+        told.append(_words(run))
+    return Standing(present and bool(runs), tuple(dict.fromkeys(told)), tuple(sorted(changed)))
+
+
+@functools.cache
+def _now(file: Path) -> str:
+    """Digest of a file; empty where it is gone."""
+    return meaning(file.read_text(encoding="utf-8")) if file.is_file() else ""
+
+
+def _words(run: dict[str, Any]) -> str:
+    """A run by its commit."""
+    if run.get("stored"):  # from before results said what made them
+        return f"stored with {run['stored']}"
+    if not run.get("commit"):
+        return "not told"
+    return run["commit"] + (" with changes" if of_changed_tree(run) else "")
+
+
+def remark(names: Sequence[str]) -> str:
+    """What is said beside numbers of these files of results; nothing where all are of the present code.
+
+    Args:
+        names: files, or folders of them.
+    """
+    told = dict[str, list[str]]()
+    for name in names:
+        files = [RESULTS / name] if name.endswith(".json") else sorted((RESULTS / name).glob("*.json"))
+        found = [standing(json.loads(file.read_text(encoding="utf-8"))) for file in files]
+        of = list(
+            dict.fromkeys(words for one in found if not one.present for words in one.of or ("not told",))
+        )
+        if of:
+            words = ", ".join(of[:3]) + (" and others" if len(of) > 3 else "")
+            told.setdefault(words, []).append(name.removesuffix(".json"))
+    every = "; ".join(f"{', '.join(of)} ({words})" for words, of in told.items())
+    return f"Measured with an earlier version of the code: {every}." if told else ""
+
+
+def main() -> None:
+    """Say it of every file."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "files", nargs="*", metavar="FILE", help="of benchmarks/results; all if none is named"
+    )
+    given = parser.parse_args()
+    for file in given.files or sorted(p.relative_to(RESULTS).as_posix() for p in RESULTS.rglob("*.json")):
+        found = standing(json.loads((RESULTS / file).read_text(encoding="utf-8")))
+        said = "of the present code" if found.present else f"of {', '.join(found.of) or 'what is not told'}"
+        changes = f"; {len(found.changed)} files have changed" if found.changed else ""
+        print(f"{file}: {said}{changes}")
+        if given.files:
+            print("".join(f"    {path}\n" for path in found.changed), end="")
+
+
+if __name__ == "__main__":
+    main()
