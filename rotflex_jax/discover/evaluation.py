@@ -356,19 +356,18 @@ class Evaluation:
             other = ValidationSet(cut, seconds)
         return cls(validation, other, calibrate_seconds)
 
-    def make_ahead(self, found: ValidatedHypothesis, solver: Solver, longest: Recording) -> None:
+    def make_ahead(self, found: ValidatedHypothesis, longest: Recording) -> None:
         """Have the programs made that evaluating nested models will need.
 
         Args:
             found: Has the effects that the largest of them will have, as far as is known.
-            solver: Of the model that a user gets.
             longest: The recording over which errors of the model as it is are localised.
         """
         h, s, seconds = found.adapted, self.validation.problem.supermodel, self.validation.window_seconds
         built = self.with_built_in(frozenset(s.calibrations).union(h.locations)).validation
-        recording, nested = built.problem.dataset.recordings[0], built.model_of(h, h.locations, 0)
-        make_ahead(lambda: (nested.simulate(recording), nested.simulate_windows(recording, seconds)))
-        make_ahead(Model(s.clean(h.mean_values(s), ()), solver).simulate_windows, longest, seconds)
+        recording, model = built.problem.dataset.recordings[0], built.model_of(h, h.locations, 0)
+        make_ahead(lambda: (model.simulate(recording), model.simulate_windows(recording, seconds)))
+        make_ahead(model.simulate_windows, longest, seconds)
 
     def with_built_in(self, effects: frozenset[EffectLocation]) -> "Evaluation":
         """The same with models that all have these effects, on or off, and so share their programs."""

@@ -196,7 +196,7 @@ def _make_ahead(state: SearchState, evaluation: Evaluation) -> None:
     if fine := finer_integration(state.reported.problem, h):
         fine.make_ahead([h])
     recordings = (*state.problem.dataset.recordings, *state.validation.problem.dataset.recordings)
-    evaluation.make_ahead(state.current, state.model.solver, max(recordings, key=lambda r: r.N))
+    evaluation.make_ahead(state.current, max(recordings, key=lambda r: r.N))
 
 
 def _simplify(state: SearchState) -> None:

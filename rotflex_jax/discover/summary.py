@@ -87,7 +87,8 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
     longest, channels = max((*train, *held_back), key=lambda r: r.N), model.mechanism.channels
     seconds, noise = validation.window_seconds, problem.noise
-    residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
+    as_it_is = built.model_of(models[0], (), 0)
+    residual = model.measured(longest) - as_it_is.simulate_windows(longest, seconds)
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     m = stages[-1].model.mechanism
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
