@@ -4,8 +4,8 @@
 
 State and tangents advance together and nothing of the length of the run is stored but what is asked for. The
 D directions are the last axis, so that vector units work on all at once. The state is repeated along that
-axis, so that one expression serves both; what is the same in all directions is computed once (`repetition`). `scan.states` stores the Jacobians of the
-step instead, for reverse mode and for inactive effects.
+axis, so that one expression serves both; what is the same in all directions is computed once (`repetition`).
+`scan.states` stores the Jacobians of the step instead, for reverse mode and for inactive effects.
 
 An effect whose amplitude is zero leaves the run and its Jacobians `A[k]` as they are without it. It only adds
 a forcing `b[k]` to the same recursion,
