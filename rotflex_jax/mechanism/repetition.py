@@ -71,9 +71,8 @@ def _applied(equation: Any, operands: list[Any], length: int) -> list[Any]:
     changed = _changed(primitive.name, params, operands, length)
     if changed is None:
         bound = primitive.get_bind_params(params)
-        functions, bound = (
-            bound if isinstance(bound, tuple) else ((), bound)
-        )  # as older versions of JAX have it
+        # Older versions of JAX give functions beside.
+        functions, bound = bound if isinstance(bound, tuple) else ((), bound)
         result = primitive.bind(*functions, *(_whole(x, length) for x in operands), **bound)
         return list(result) if primitive.multiple_results else [result]
     once = primitive.bind(*(x.once if isinstance(x, _Once) else x for x in operands), **(params | changed))
