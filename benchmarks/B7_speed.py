@@ -173,7 +173,7 @@ def _search(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
 def _waiting(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     from speed.waiting import waiting
 
-    return {"facts": waiting(6.0 if chosen.quick else 20.0)}
+    return {"waiting": waiting(6.0 if chosen.quick else 20.0)}
 
 
 def _fleet(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:

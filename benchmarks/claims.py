@@ -13,6 +13,7 @@ from typing import Any
 import scipy.stats
 
 from rotflex_jax.parameters import HALF_WIDTH_95
+from speed.table import waiting
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
@@ -684,6 +685,13 @@ for _name, (_row_name, _base) in BESIDE.items():
     NAMED[f"{_name}_beside"] = lambda base=_base: _digits(_cost(base))
     NAMED[f"{_name}_ratio"] = lambda row=_row_name, base=_base: f"{_cost(row) / _cost(base):.2g}"
     NAMED[f"{_name}_gain"] = lambda row=_row_name, base=_base: _digits(_cost(base) / _cost(row))
+
+
+@named
+def waiting_for_searches() -> str:
+    """The table of waiting."""
+    found = results("B7.json").get("waiting")
+    return "\n".join(["", *waiting(found["waiting"]), ""]) if found else "\nNot measured yet.\n"
 
 
 # -- mutants ------------------------------------------------------------------------------------------------

@@ -6,8 +6,10 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +31,7 @@ from rotflex_jax.runtime.persistent_jit import (
     PersistentJit,
     clear_compilation_caches,
     keep_programs,
+    make_ahead,
     performance,
     program_counts,
     programs_folder,
@@ -73,6 +76,70 @@ def test_a_second_process_does_not_trace(folder: Path) -> None:
     np.testing.assert_array_equal(first, again)
     np.testing.assert_array_equal(first, [0.0, 2.0, 4.0])
     assert traced == [2.0] and len(files(folder)) == 1
+
+
+class Held:
+    """A program whose tracing waits, and fails the first time if asked to."""
+
+    def __init__(self, fails: bool = False) -> None:
+        self.begun, self.go, self.threads = threading.Semaphore(0), threading.Event(), []
+
+        def line(slope: float, x: jax.Array) -> jax.Array:
+            self.threads.append(threading.current_thread().name)
+            self.begun.release()
+            assert self.go.wait(30.0)
+            if fails and len(self.threads) == 1:
+                raise ValueError("first")
+            return slope * x
+
+        self.program = PersistentJit(line, static=1)
+
+
+X = np.arange(3.0, dtype=np.float32)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_program_that_two_threads_need_is_made_by_one(folder: Path, fails: bool) -> None:
+    held = Held(fails)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(held.program, 2.0, X)
+        assert held.begun.acquire(timeout=30.0)
+        second = pool.submit(held.program, 2.0, X)
+        assert not held.begun.acquire(timeout=0.3)  # it waits
+        held.go.set()
+        np.testing.assert_array_equal(second.result(30.0), 2 * X)
+        if fails:  # then the one that has waited makes it
+            with pytest.raises(ValueError, match="first"):
+                first.result(30.0)
+        else:
+            np.testing.assert_array_equal(first.result(30.0), 2 * X)
+    assert len(held.threads) == 1 + fails and len(held.program) == 1
+
+
+def test_a_program_made_ahead_is_there_when_it_is_needed(folder: Path) -> None:
+    held, beyond, none_left = Held(), [], lambda: persistent_jit._ahead().submit(int).result(30.0)
+    make_ahead(held.program, 2.0, X)
+    assert held.begun.acquire(timeout=30.0)
+    held.go.set()
+    np.testing.assert_array_equal(held.program(2.0, X), 2 * X)
+    none_left()
+    assert len(held.threads) == 1 and held.threads[0].startswith("programs")
+    make_ahead(lambda: beyond.append(held.program(2.0, X)))  # there is nothing to make
+    make_ahead(lambda: beyond.append(held.program(3.0, X)))
+    none_left()
+    np.testing.assert_array_equal(beyond, [3 * X])
+
+
+def test_what_goes_wrong_ahead_goes_wrong_where_it_is_needed(folder: Path) -> None:
+    held = Held(fails=True)
+    held.go.set()
+    make_ahead(held.program, 2.0, X)
+    persistent_jit._ahead().submit(int).result(30.0)
+    assert len(held.threads) == 1
+    np.testing.assert_array_equal(held.program(2.0, X), 2 * X)
+    with pytest.raises(TypeError):
+        make_ahead(held.program, 2.0, "text")
+        held.program(2.0, "text")
 
 
 def test_what_differs_is_another_program(folder: Path) -> None:

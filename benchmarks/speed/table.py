@@ -42,6 +42,8 @@ def page(results: dict[str, Any]) -> str:
             lines += [f"- {what}: {value:.3g}" for what, value in part.get("facts", {}).items()]
             if "growth" in part:
                 lines += _growth(part["growth"])
+            if "waiting" in part:
+                lines += waiting(part["waiting"])
     text = "\n".join(lines)
     while "\n\n\n" in text:
         text = text.replace("\n\n\n", "\n\n")
@@ -77,4 +79,18 @@ def _growth(found: dict[str, Any]) -> list[str]:
                 f"| {work} | {int(N):,} | {r['seconds']:.4g} | {r['seconds'] / int(N) * 1e9:.1f} "
                 f"| {r['memory_mb']:.0f} |"
             )
+    return lines
+
+
+def waiting(rows: list[dict[str, Any]]) -> list[str]:
+    """Searches by name: what each has compiled and loaded, and what it took."""
+    shown = {"compiled": ".0f", "loaded": ".0f", "compiling": ".1f", "seconds": ".1f"}
+    shown |= {"processor": ".1f", "memory": ".0f"}
+    lines = [
+        "| | compiled | loaded | compiling, sum over threads [s] | whole [s] | processor [s] | memory [MB] |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        each = (format(row[what], form) if what in row else "" for what, form in shown.items())
+        lines.append(f"| {row['name']} | {' | '.join(each)} |")
     return lines

@@ -1,6 +1,6 @@
 """How long a person waits for a search: nothing compiled, compiled before, another effect, another length.
 
-Each line is a search in a process of this machine, with the number of programs that it compiled and loaded,
+Each row is a search in a process of this machine, with the number of programs that it compiled and loaded,
 the seconds that compiling took (by the clock, added over threads), the whole by the clock and of the
 processor, and the memory of the process after it.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from speed.processes import process
 FIRST = (("coulomb", "hub"), ("cubic_spring", "joint"))
 OTHER = (("quadratic_drag", "arm"),)
 SHORTER = 0.6
+# New processes of each kind, of which the medians are reported.
+TIMES = 3
 SEARCHES = """
 import json, resource, sys, time
 from pathlib import Path
@@ -26,7 +29,7 @@ import rotflex_jax as rf
 from rotflex_jax.runtime.persistent_jit import program_counts
 rf.keep_programs(sys.argv[1])
 used = lambda: sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-lines = []
+rows = []
 for path in sys.argv[2:]:
     if path == "measured":
         joint, (train, test) = rf.joints.quanser_2010(), rf.data.load_dataset("rotflex")
@@ -36,55 +39,86 @@ for path in sys.argv[2:]:
     found = rf.discover(joint, train, test)
     clock, processor, after = time.perf_counter() - began, used() - worked, program_counts()
     pages = int(Path("/proc/self/statm").read_text().split()[1]) if Path("/proc/self/statm").exists() else 0
-    lines.append({
+    rows.append({
         "compiled": after.compiled - before.compiled,
         "loaded": after.loaded - before.loaded,
-        "compiling, seconds": after.seconds - before.seconds,
+        "compiling": after.seconds - before.seconds,
         "seconds": clock,
-        "processor seconds": processor,
-        "memory in MB": pages * resource.getpagesize() / 1e6,
+        "processor": processor,
+        "memory": pages * resource.getpagesize() / 1e6,
         "effects": len(found.rounds),
     })
-print(json.dumps({"lines": lines}))
+print(json.dumps({"rows": rows}))
 """
+# The command, as a shell runs it, up to its report.
+DEMO = """
+import os, sys
+programs, report = sys.argv[1:]
+os.environ["ROTFLEX_PROGRAMS"] = programs
+sys.argv[1:] = ["demo", "--report", report]
+from rotflex_jax.cli import main
+main()
+"""
+HEAD = ("compiled", "loaded", "compiling", "seconds", "processor", "memory", "effects")
+
+Row = dict[str, Any]
 
 
-def waiting(seconds: float) -> dict[str, float]:
-    """Facts of each search by its name.
+def waiting(seconds: float) -> list[Row]:
+    """Each search by its name.
 
     Args:
-        seconds: Length of the recordings [s]; below 20 s the measured joint is left out.
+        seconds: Length of the recordings [s]; below 20 s each is searched once, the measured joint left out.
     """
+    whole = seconds >= 20.0
+    with tempfile.TemporaryDirectory() as folder:
+        files = _files(folder, seconds)
+        each_time = range(TIMES if whole else 1)
+        each = [_searches(f"{folder}/{k}", files) for k in each_time]
+        rows: list[Row] = [
+            {"name": rows[0]["name"], **{what: median(row[what] for row in rows) for what in HEAD}}
+            for rows in zip(*each, strict=True)
+        ]
+        took = [
+            process(DEMO, f"{folder}/demo{k}", f"{folder}/report{k}", cache=f"{folder}/own{k}")
+            for k in each_time
+        ]
+        clock, processor = (median(found[what] for found in took) for what in ("clock", "processor"))
+        name = "`rotflex demo` as a whole, nothing compiled"
+        rows.append({"name": name, "seconds": clock, "processor": processor})
+        if whole and os.environ.get("ROTFLEX_DATA"):
+            names = ("two measured runs, nothing compiled", "the same again")
+            found = process(SEARCHES, f"{folder}/measured", "measured", "measured", cache=f"{folder}/other")
+            rows += [{"name": name, **row} for name, row in zip(names, found["rows"], strict=True)]
+        return rows
+
+
+def _files(folder: str, seconds: float) -> dict[str, str]:
     from rotflex_jax.arena.simulator.records import make_record
 
-    facts: dict[str, float] = {}
+    files = {}
+    for name, effects, share in (
+        ("first", FIRST, 1.0),
+        ("other", OTHER, 1.0),
+        ("shorter", FIRST, SHORTER),
+    ):
+        made = make_record(effects, kind="noise", seed=104, seconds=share * seconds)
+        files[name] = f"{folder}/{name}.npz"
+        t = made["Ts"] * np.arange(len(made["u"]))
+        np.savez(files[name], t=t, voltage=made["u"], theta=made["y"][:, 0], alpha=made["y"][:, 1])
+    return files
 
-    def keep(name: str, line: dict[str, Any]) -> None:
-        facts.update({f"{name}: {what}": float(value) for what, value in line.items()})
 
-    with tempfile.TemporaryDirectory() as folder:
-        files = {}
-        for name, effects, share in (
-            ("first", FIRST, 1.0),
-            ("other", OTHER, 1.0),
-            ("shorter", FIRST, SHORTER),
-        ):
-            made = make_record(effects, kind="noise", seed=104, seconds=share * seconds)
-            files[name] = f"{folder}/{name}.npz"
-            t = made["Ts"] * np.arange(len(made["u"]))
-            np.savez(files[name], t=t, voltage=made["u"], theta=made["y"][:, 0], alpha=made["y"][:, 1])
-        cache, programs = f"{folder}/cache", f"{folder}/programs"
-        order = ("first", "first", "other", "shorter")
-        one = process(SEARCHES, programs, *(files[name] for name in order), cache=cache)
-        again = process(SEARCHES, programs, files["first"], cache=cache)
-        names = ("nothing compiled", "the same again", "another effect", "another length")
-        for name, line in zip(names, one["lines"], strict=True):
-            keep(name, line)
-        keep("second process", again["lines"][0])
-        if seconds >= 20.0 and os.environ.get("ROTFLEX_DATA"):
-            measured = process(SEARCHES, f"{folder}/measured", "measured", "measured", cache=cache)
-            for name, line in zip(
-                ("measured, nothing compiled", "measured, again"), measured["lines"], strict=True
-            ):
-                keep(name, line)
-    return facts
+def _searches(folder: str, files: dict[str, str]) -> list[Row]:
+    programs, cache = f"{folder}/programs", f"{folder}/cache"
+    order = ("first", "first", "other", "shorter")
+    one = process(SEARCHES, programs, *(files[name] for name in order), cache=cache)["rows"]
+    again = process(SEARCHES, programs, files["first"], cache=cache)["rows"]
+    names = (
+        "a new process, nothing compiled",
+        "the same again",
+        "another effect",
+        "another length",
+        "a second process",
+    )
+    return [{"name": name, **row} for name, row in zip(names, [*one, *again], strict=True)]

@@ -236,6 +236,10 @@ class BatchedPredictor:
             groups.setdefault(model.effects, (model, []))[1].append(i)
         return list(groups.values())
 
+    def has_innovations(self, gates: Float[np.ndarray, " E"]) -> bool:
+        """Whether innovations with what these gates switch on were run."""
+        return ("innovations", self.supermodel.active(gates).effects) in self.compiled
+
     def run_jobs(
         self, run: Callable[[Any], Any], jobs: list[Any], program: Callable[[Any], Any]
     ) -> list[Any]:
@@ -273,6 +277,8 @@ def _on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
         run: What to call; no two threads may compile the same.
         jobs: Its arguments.
     """
+    if len(jobs) == 1:
+        return [run(jobs[0])]
     return list(_threads().map(run, jobs))
 
 

@@ -34,6 +34,7 @@ from rotflex_jax.mechanism import Solver
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.persistent_jit import make_ahead
 
 # Amplitudes of an effect that differ by no more than this share are alike, however narrow their intervals.
 SAME_SIZE = 0.25
@@ -354,6 +355,27 @@ class Evaluation:
             cut = whole.of_free_runs(Windows.of_seconds(model, dataset, seconds, number))
             other = ValidationSet(cut, seconds)
         return cls(validation, other, calibrate_seconds)
+
+    def make_ahead(self, found: ValidatedHypothesis, longest: Recording) -> None:
+        """Have the programs made that evaluating nested models will need.
+
+        Args:
+            found: Has the effects that the largest of them will have, as far as is known.
+            longest: The recording over which errors of the model as it is are localised.
+        """
+        h, s, seconds = found.adapted, self.validation.problem.supermodel, self.validation.window_seconds
+        built = self.with_built_in(frozenset(s.calibrations).union(h.locations)).validation
+        recording, model = built.problem.dataset.recordings[0], built.model_of(h, h.locations, 0)
+        make_ahead(lambda: (model.simulate(recording), model.simulate_windows(recording, seconds)))
+        make_ahead(model.simulate_windows, longest, seconds)
+
+    def with_built_in(self, effects: frozenset[EffectLocation]) -> "Evaluation":
+        """The same with models that all have these effects, on or off, and so share their programs."""
+        return dataclasses.replace(
+            self,
+            validation=dataclasses.replace(self.validation, built_in=effects),
+            test=dataclasses.replace(self.test, built_in=effects) if self.test else None,
+        )
 
     @property
     def recordings(self) -> tuple[Recording, ...]:

@@ -21,6 +21,7 @@ from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows
 from rotflex_jax.mechanism import Exponential, Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise, minimise_together
+from rotflex_jax.runtime.persistent_jit import make_ahead
 
 # Hypotheses are compared block by block, so that the scatter shows what is chance.
 BLOCK_SECONDS = 0.5
@@ -162,6 +163,13 @@ class LikelihoodProblem:
     def innovations_of(self, parameter_sets: list[ParameterSet]) -> Float[np.ndarray, "L R N C"]:
         """Innovations of parameter sets."""
         return self.predictor.innovations(parameter_sets, self.windows.index)
+
+    def make_ahead(self, hypotheses: Sequence[Hypothesis]) -> None:
+        """Have the programs of innovations made for hypotheses whose slopes are needed first."""
+        s = self.supermodel
+        for locations, h in {frozenset(h.locations): h for h in hypotheses}.items():
+            if not self.predictor.has_innovations(s.gates(locations)):
+                make_ahead(self.innovations, [h])
 
     def slopes(
         self, hypotheses: Sequence[Hypothesis]
@@ -355,6 +363,8 @@ def refit(
     After so many alternations little is left to gain. What still gains much goes on for `EXTRA_ALTERNATIONS`
     at most: stopped too early, the right effect may look worse than a wrong one that has converged.
     """
+    if alternations and not problem.free_run:
+        problem.make_ahead(hypotheses)
     current = levenberg_marquardt(problem, hypotheses)
     converged = [False] * len(current)
     for k in range(alternations + EXTRA_ALTERNATIONS if alternations else 0):
@@ -379,6 +389,18 @@ CORRECTION_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-6, increase=30)
 MAX_CORRECTION_STEPS = 10
 
 
+def finer_integration(problem: LikelihoodProblem, h: Hypothesis) -> LikelihoodProblem | None:
+    """The problem with steps `SUBSTEP_FACTOR` times as short; None where the steps are exact as they are."""
+    predictor, s = problem.predictor, problem.supermodel
+    # A linear motion is integrated exactly, and effects on voltages and readings need no integration.
+    exact = all(e.exact_step for e in s.clean(h.mean_values(s), h.locations).effects)
+    if exact or not isinstance(predictor.solver, Exponential):
+        return None
+    solver = dataclasses.replace(predictor.solver, substeps=SUBSTEP_FACTOR * predictor.solver.substeps)
+    finer = BatchedPredictor(s, solver, predictor.data, predictor.constants)
+    return dataclasses.replace(problem, predictor=finer)
+
+
 def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
     """The hypothesis after a few damped Gauss-Newton steps on the innovations of a finer integration.
 
@@ -392,15 +414,9 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
         problem: With the training recordings.
         h: At its optimum.
     """
-    predictor, s, seen = problem.predictor, problem.supermodel, problem.seen
-    active = s.clean(h.mean_values(s), h.locations).effects
-    # A linear motion is integrated exactly, and effects on voltages and readings need no integration.
-    exact = all(e.exact_step for e in active)
-    if exact or not isinstance(predictor.solver, Exponential):
+    seen, fine = problem.seen, finer_integration(problem, h)
+    if fine is None:
         return h
-    solver = dataclasses.replace(predictor.solver, substeps=SUBSTEP_FACTOR * predictor.solver.substeps)
-    finer = BatchedPredictor(s, solver, predictor.data, predictor.constants)
-    fine = dataclasses.replace(problem, predictor=finer)
     coordinates = FitCoordinates.of(h, problem.windows)
     _, J = problem.slopes([h])
     W = h.whitener(J[0, : h.moved], seen)

@@ -33,7 +33,7 @@ from rotflex_jax.mechanism.sensitivities import (
     inactive_sensitivities,
     linearised_run,
 )
-from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.persistent_jit import make_ahead, persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 
@@ -267,6 +267,8 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
     candidates = list(tried.values())
     if not candidates:
         return ScoreTest([], {}, None)
+    thresholds = [c for c in candidates if c.threshold]
+    make_ahead(lambda: list(_changes(problem, h, np.zeros(1), thresholds)))
     # Families of all that is absent, so that a line that comes or goes compiles nothing.
     families = s.families([c for c in absent if not c.threshold])
     batches = [
@@ -289,7 +291,7 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
         W = h.whitener(J[: len(probes)], seen)
         for p, column in zip(probes, W, strict=True):
             columns.setdefault((p.candidate.location, p.shape), []).append(column)
-    for key, change in _changes(problem, h, e[0], [c for c in candidates if c.threshold]):
+    for key, change in _changes(problem, h, e[0], thresholds):
         columns[key] = [h.whitener(change, seen)]
     headroom = float(np.exp(h.whitener.log_det / (2 * e.shape[-1])) / np.exp(np.mean(np.log(problem.noise))))
     r = orthogonal(w[None])[0]

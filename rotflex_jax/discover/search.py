@@ -13,7 +13,11 @@ from rotflex_jax.discover.conclusion import with_proposal
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.evaluation import Evaluation
 from rotflex_jax.discover.forward_selection import ROUNDS, add_best, add_pair, score_candidates
-from rotflex_jax.discover.likelihood import LikelihoodProblem, correct_discretisation_bias
+from rotflex_jax.discover.likelihood import (
+    LikelihoodProblem,
+    correct_discretisation_bias,
+    finer_integration,
+)
 from rotflex_jax.discover.pairs import pairs_passed_by
 from rotflex_jax.discover.search_state import Progress, SearchState, as_it_was, fit_as_it_is
 from rotflex_jax.discover.stepwise import (
@@ -119,6 +123,7 @@ def discover(
         if not add_best(state, promising) and not add_pair(state, rounds):
             break
     # 5. Leave out what is not needed, and see whether steps of one effect have passed by a pair.
+    _make_ahead(state, evaluation)
     _simplify(state)
     _check_pairs(state)
     # 6. Evaluate every nested model, and localise what the baseline leaves.
@@ -186,6 +191,15 @@ def _check_constants(m: Mechanism, s: SuperModel, recordings: Sequence[Recording
                 f"The recording has the constant {known[0]!r}, but the model has no such effect and a search "
                 "fits what it adds; add the effect to the model, or leave the constant out."
             )
+
+
+def _make_ahead(state: SearchState, evaluation: Evaluation) -> None:
+    """Have the programs made that the end of a search needs for what was found so far."""
+    h = state.at(state.reported, state.current).hypothesis
+    if fine := finer_integration(state.reported.problem, h):
+        fine.make_ahead([h])
+    recordings = (*state.problem.dataset.recordings, *state.validation.problem.dataset.recordings)
+    evaluation.make_ahead(state.current, max(recordings, key=lambda r: r.N))
 
 
 def _simplify(state: SearchState) -> None:

@@ -44,6 +44,7 @@ from rotflex_jax.discover.validation import (
 )
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.runtime.persistent_jit import make_ahead
 
 
 def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
@@ -52,6 +53,7 @@ def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
     intensities = (most, np.sqrt(least * most), least)
     # A distant start is safe only with a short horizon: all paths begin with one.
     near = problem.with_process_noise(_start(problem), dict.fromkeys(problem.ports, 100 * most))
+    problem.make_ahead([near])
     near = refit(problem, [near], alternations=0)[0]
     paths = [problem.with_process_noise(near, dict.fromkeys(problem.ports, q)) for q in intensities]
     return max(refit(problem, paths, wide=True), key=lambda h: h.log_likelihood)
@@ -135,6 +137,8 @@ def refit_candidates(
         (i, dataclasses.replace(c, values=x)) for i, c in enumerate(starts) for x in (c.values, *c.others)
     ]
     grown = [[with_candidate(s, current, c, share) for share in AMPLITUDE_SHARES] for _, c in shapes]
+    for h in {i: row[0] for (i, _), row in zip(shapes, grown, strict=True)}.values():
+        make_ahead(problem.slopes, [h])
     likely = problem.log_likelihoods([h for row in grown for h in row]).reshape(len(grown), -1)
     likeliest = [row[int(np.argmax(ll))] for row, ll in zip(grown, likely, strict=True)]
     refitted = refit(problem, _best_shapes(problem, [i for i, _ in shapes], likeliest))

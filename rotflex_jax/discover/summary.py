@@ -72,17 +72,22 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
     assert final
     passed = [state.at(reported, v).hypothesis for v in state.passed]
     models = nested_models(problem, final, order, state.own, passed)
+    # Nested models share the programs of the largest.
+    every = frozenset(problem.supermodel.calibrations).union(*(h.locations for h in models))
+    evaluation = evaluation.with_built_in(every)
+    built = dataclasses.replace(validation, built_in=every)
     near = state.at(reported, state.current)
     validated = [validate(validation, h, near) for h in models]
     stages = []
     for k, v in enumerate(validated):
-        stage = evaluate(problem, validation, model.solver, v, order[:k])
+        stage = evaluate(problem, built, model.solver, v, order[:k])
         stage = _with_process_noise(state, stage, v.hypothesis)
         stages.append(evaluation.of_stage(stage, v, order[:k]))
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
     longest, channels = max((*train, *held_back), key=lambda r: r.N), model.mechanism.channels
     seconds, noise = validation.window_seconds, problem.noise
-    residual = model.measured(longest) - stages[0].model.simulate_windows(longest, seconds)
+    as_it_is = built.model_of(models[0], (), 0)
+    residual = model.measured(longest) - as_it_is.simulate_windows(longest, seconds)
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     m = stages[-1].model.mechanism
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))

@@ -165,12 +165,14 @@ class ValidationSet:
         window_seconds: Length of the windows of short free runs [s].
         chosen: Indices of the recordings that count; all if empty.
         folds: Where runs validate each other: for each, the others to fit and itself to validate.
+        built_in: Effects that every model of it has in its equations, switched off where they are not on.
     """
 
     problem: LikelihoodProblem
     window_seconds: float
     chosen: tuple[int, ...] = ()
     folds: "tuple[Fold, ...]" = ()
+    built_in: frozenset[EffectLocation] = frozenset()
 
     @classmethod
     def leave_one_out(cls, problem: LikelihoodProblem, window_seconds: float) -> "ValidationSet":
@@ -197,9 +199,9 @@ class ValidationSet:
 
     def model_of(self, h: Hypothesis, locations: Iterable[EffectLocation], recording: int) -> Model:
         """A model of one recording, with these effects on; all share the super-model's compiled code."""
-        s = self.problem.supermodel
-        gates = s.gates(locations)
-        reduced = s.active(gates)
+        s, on = self.problem.supermodel, frozenset(locations)
+        gates = s.gates(on)
+        reduced = s.active(s.gates(on | self.built_in))
         mechanism = reduced.mechanism.with_values(h.values(s)[recording, reduced.parameters])
         return Model(mechanism, self.problem.predictor.solver, tuple(gates[list(reduced.effects)]))
 

@@ -4,8 +4,8 @@
 
 State and tangents advance together and nothing of the length of the run is stored but what is asked for. The
 D directions are the last axis, so that vector units work on all at once. The state is repeated along that
-axis: the same arithmetic for all costs less than to keep it apart. `scan.states` stores the Jacobians of the
-step instead, for reverse mode and for inactive effects.
+axis, so that one expression serves both; what is the same in all directions is computed once (`repetition`).
+`scan.states` stores the Jacobians of the step instead, for reverse mode and for inactive effects.
 
 An effect whose amplitude is zero leaves the run and its Jacobians `A[k]` as they are without it. It only adds
 a forcing `b[k]` to the same recursion,
@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Integer
 from rotflex_jax.effects.base import Actuation, Gear, Memory
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, stamped
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.repetition import without_repetition
 from rotflex_jax.mechanism.scan import directional, forcing, state_jacobians, states, tangent_recursion
 from rotflex_jax.mechanism.simulate import (
     FreeStep,
@@ -254,23 +255,26 @@ def accumulate_outputs(
     v, dv = derivatives(drive) if effects_of(structure, Actuation) else (drive(values, gates), None)
     free, predictor = FreeStep(structure, solver), PredictorStep(structure, solver)
 
-    def step(v: Any, x: Array, c: Any, sample: Any) -> Array:
+    def step(v: Any, x: Array, c: Any, sample: Any, K: Any) -> Array:
         if K is None:
             return started_again(free(x, v, c), sample[2:])
-        return predictor(x, (v, *sample), (c, repeated(K) if repeats else K))
+        return predictor(x, (v, *sample), (c, K))
+
+    def along(at: Any, tangents: Any) -> tuple[Array, Array]:
+        """The state after a step and its derivative in one direction, or in all where all are repeated."""
+        v, x, c, *given = at
+        if tangents[0] is None:  # the voltage has no derivative
+            return jax.jvp(lambda x, c: step(v, x, c, *given), (x, c), tangents[1:])
+        return jax.jvp(lambda v, x, c: step(v, x, c, *given), (v, x, c), tangents)
 
     def later(x: Array, dx: Array, v: Any, dv: Any, sample: Any) -> tuple[Array, Array]:
-        at, tangents = (v, x, c), (dv, dx, dc)
+        at, tangents = (v, x, c, sample, K), (dv, dx, dc)
         if repeats:
-            at, sample = repeated(at), repeated(sample)
-        f: Callable[..., Array] = lambda *at: step(at[0], at[1], at[2], sample)  # noqa: E731
-        if dv is None:  # the voltage has no derivative
-            f, at, tangents = functools.partial(f, at[0]), at[1:], tangents[1:]
-        if repeats:
-            end, dend = jax.jvp(f, at, tangents)
+            once = jax.tree.map(lambda a: jnp.asarray(a)[..., None], at)
+            end, dend = without_repetition(along, D, once, tangents)
             return end[:, 0], dend
-        dend = jax.vmap(lambda *tangent: jax.jvp(f, at, tangent)[1], in_axes=-1, out_axes=-1)(*tangents)
-        return f(*at), dend
+        ends, dend = jax.vmap(functools.partial(along, at), in_axes=(-1,), out_axes=(None, -1))(tangents)
+        return ends, dend
 
     x0_directions = jnp.asarray(directions.x0).T
 

@@ -28,6 +28,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,6 +66,7 @@ _programs: list["PersistentJit"] = []
 MOST_HELD, LEFT_HELD = 96, 72
 _recent: collections.OrderedDict["_Held", None] = collections.OrderedDict()
 _recent_lock = threading.Lock()
+_thread = threading.local()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -108,6 +110,8 @@ class PersistentJit:
         self._static = static
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._held: dict[Any, _Held] = {}
+        # Programs that a thread is making; another one that needs the same waits.
+        self._in_work: dict[Any, Future[None]] = {}
         _programs.append(self)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -120,18 +124,41 @@ class PersistentJit:
         kinds = tuple(jax.typeof(leaf) for leaf in leaves)
         settings = tuple(getattr(jax.config, s) for s in _SETTINGS)
         key = (known, tree, kinds, settings)
-        held = self._held.get(key)
+        held = self._held.get(key) or self._awaited(key)
         if held is not None:
+            if getattr(_thread, "may_stop", False):
+                raise _NothingToMakeError
             _used(held)
             return held.program(*leaves)
-        texts, folder, file = [static_key(x) for x in known], programs_folder(), None
-        if folder is not None and all(texts) and _unchanged():
-            name = f"{self._name}{texts}{tree}{kinds}{settings}"
-            file = folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
-        program, result = self._made(known, tree, leaves, file)
-        held = self._held[key] = _Held(program, self._held, key)
+        _thread.may_stop = False
+        try:
+            program, result = self._made(known, tree, leaves, self._file(known, tree, kinds, settings))
+            held = self._held[key] = _Held(program, self._held, key)
+        finally:  # where it failed, the next thread that waits makes it itself
+            with _recent_lock:
+                self._in_work.pop(key).set_result(None)
         _used(held)
         return result
+
+    def _awaited(self, key: Any) -> _Held | None:
+        """The program that another thread makes, once it is there; None where this thread is to make it."""
+        while True:
+            with _recent_lock:
+                held, begun = self._held.get(key), self._in_work.get(key)
+                if held is not None:
+                    return held
+                if begun is None:
+                    self._in_work[key] = Future()
+                    return None
+            begun.result()
+
+    def _file(self, known: tuple[Any, ...], tree: Any, kinds: Any, settings: Any) -> Path | None:
+        """Where the program of some arguments is kept; None where it is not."""
+        texts, folder = [static_key(x) for x in known], programs_folder()
+        if folder is None or not all(texts) or not _unchanged():
+            return None
+        name = f"{self._name}{texts}{tree}{kinds}{settings}"
+        return folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
 
     def __len__(self) -> int:
         """How many programs the process holds: one per structure and shapes of the arguments."""
@@ -175,6 +202,40 @@ class PersistentJit:
 def persistent_jit(static: int, runs_rarely: bool = False) -> Callable[[Callable[..., Any]], PersistentJit]:
     """Decorator: the function as a `PersistentJit`; arguments as there."""
     return lambda function: PersistentJit(function, static, runs_rarely)
+
+
+def make_ahead(function: Callable[..., Any], *arguments: Any) -> None:
+    """Call a function on a thread of its own, for the programs that it makes; its result is dropped.
+
+    For programs that are needed soon, so that they are made while something else is waited for. Whoever needs
+    a program that is being made waits for it, and none is made twice. The call ends where the process holds
+    the first program that it needs. What goes wrong in it is not reported: it goes wrong again where the
+    result is needed.
+
+    Args:
+        function: Pure; it enters the precision that it needs by itself.
+        arguments: Of the function.
+    """
+    start_with_fast_loops()
+    # A new thread has none of the settings of a context.
+    if not _plain() and all(getattr(jax.config, s) is None for s in _SETTINGS[1:]):
+        _ahead().submit(_try, function, arguments)
+
+
+def _try(function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    if threading.main_thread().is_alive():  # not while the process ends
+        _thread.may_stop = True
+        with contextlib.suppress(Exception), np.errstate(all="ignore"):
+            function(*arguments)
+
+
+class _NothingToMakeError(Exception):
+    """Ends a call that was made ahead."""
+
+
+@functools.cache
+def _ahead() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="programs")
 
 
 def keep_programs(folder: str | Path | bool = True) -> None:
