@@ -42,7 +42,7 @@ from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 # Directions per pass where the step has the candidates in it.
-PROBES_PER_BATCH = 8
+PROBES_PER_BATCH = 4
 # Lines beside which a disturbance is tried, the clearest ones.
 MOST_LINES = 2
 
@@ -176,7 +176,9 @@ class Probe:
 def _packed(probes: Sequence[Probe]) -> list[list[Probe]]:
     """Probes that share a parameter set: as many as it has directions, of each candidate one shape only."""
     batches: list[list[Probe]] = []
-    for _, group in itertools.groupby(probes, key=lambda p: (p.candidate.location, p.shape)):
+    # Those with most shapes need most batches, and the others find room in these.
+    ordered = sorted(probes, key=lambda p: -len(p.candidate.probes))
+    for _, group in itertools.groupby(ordered, key=lambda p: (p.candidate.location, p.shape)):
         own = list(group)
         with_space = [b for b in batches if len(b) + len(own) <= PROBES_PER_BATCH]
         if suitable := [b for b in with_space if all(p.candidate is not own[0].candidate for p in b)]:
@@ -207,6 +209,17 @@ def _directions(current: ParameterSet, probes: Sequence[Probe], count: int) -> D
         d.values[row, affected, c.parameters] = p.along if c.line is not None else p.along[:, None]
         d.gates[row, c.effect] = 0.0 if any(c.amplitudes) else 1.0
     return d
+
+
+def _laws(own: Sequence[Sequence[Probe]]) -> Laws:
+    """Numbers of the laws of some candidates; where all shapes have as many members, these share a shape."""
+    values, along = [], []
+    for probes in own:
+        counts = {len(list(shape)) for _, shape in itertools.groupby(probes, key=lambda p: p.shape)}
+        members = counts.pop() if len(counts) == 1 else 1
+        values.append(np.array([p.values for p in probes[::members]]))
+        along.append(np.array([p.along for p in probes]).reshape(len(values[-1]), members, -1))
+    return Laws(tuple(values), tuple(along))
 
 
 class Slopes(NamedTuple):
@@ -295,15 +308,10 @@ def candidate_sensitivities(
         listed = [p for group in own for p in group]
         effects = tuple(s.mechanism.structure.effects[c.effect] for c in family)
         with double_precision():
-            numbers = (
-                tuple(jnp.array([getattr(p, what) for p in group]) for group in own) for what in Laws._fields
-            )
-            heard = answers.torques
+            heard, laws = answers.torques, jax.tree.map(jnp.asarray, _laws(own))
             if kind == "friction":
                 heard = _friction_answers(structure, solver, ports, inputs, samples, answers.run.X)
-            return Slopes(
-                listed, cut(_law_slopes(effects, ports, Laws(*numbers), samples, answers, heard), listed)
-            )
+            return Slopes(listed, cut(_law_slopes(effects, ports, laws, samples, answers, heard), listed))
 
     def along_signals() -> Slopes:
         model = s.with_family(current.gates, kinds.signals)

@@ -17,6 +17,7 @@ them.
 
 import contextlib
 import dataclasses
+import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -43,7 +44,6 @@ from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
 from rotflex_jax.mechanism.sensitivities import LinearisedRun, RecordingSamples, RunParameters
 from rotflex_jax.mechanism.simulate import PredictorStep, Solver, prepared_run, read_outputs
-from rotflex_jax.mechanism.small_matrices import matvec
 from rotflex_jax.mechanism.step import Exponential, exponential_euler
 
 
@@ -210,9 +210,14 @@ def friction_answers(
 
     Evaluations against positive and against negative motion alternate.
     """
-    listening = structure, solver, tuple(ListeningFriction(p) for p in ports)
-    motion, answers = _answers(listening, parameters, samples, X, laws_alone=True)
-    return _by_port(motion, answers, 2, len(ports))
+    # One contact beside those that are active: others without a level change nothing but the effort.
+    heard: list[Heard] = []
+    for p in ports:
+        listening = structure, solver, (ListeningFriction(p),)
+        count = heard[0].motion.shape[2] if heard else None
+        found = _answers(listening, parameters, samples, X, laws_alone=True, count=count)
+        heard.append(_by_port(*found, 2, 1))
+    return jax.tree.map(lambda *each: jnp.concatenate(each, axis=1), *heard)
 
 
 def _by_port(motion: Float[Array, "N L 2"], answers: Float[Array, "N L n"], kinds: int, ports: int) -> Heard:
@@ -232,11 +237,20 @@ def _answers(
     samples: RecordingSamples,
     X: Float[Array, "N n"],
     laws_alone: bool,
+    count: int | None = None,
 ) -> tuple[Float[Array, "N L 2"], Float[Array, "N _ n"]]:
     """Motion at the L evaluations of listeners, and how the state after each step answers to small changes.
 
     These are changes of the state before it, of the voltage, of what is measured and of what listeners give,
     in this order, or of the last alone.
+
+    Args:
+        listening: The step.
+        parameters: Of its structure without the listeners.
+        samples: The recording.
+        X: States.
+        laws_alone: Whether only changes of what listeners give are asked for.
+        count: Number of evaluations L, where it is known.
     """
     structure, solver, listeners = listening
     structure = dataclasses.replace(structure, effects=(*structure.effects, *listeners)).structure
@@ -253,13 +267,13 @@ def _answers(
     def here(piece: Any) -> tuple[Array, Array]:
         x, v, y, rest = piece
         S = x.shape[-1]
-        count = len(jax.eval_shape(lambda: heard(x, v, y, rest, None))[1])
-        none = jnp.zeros((count, S), x.dtype)
+        evaluations = count or len(jax.eval_shape(lambda: heard(x, v, y, rest, None))[1])
+        none = jnp.zeros((evaluations, S), x.dtype)
         moved = [none] if laws_alone else [x, v, y, none]
         sizes = [a.size // S for a in moved]
         units = jnp.split(jnp.eye(sum(sizes), dtype=x.dtype), np.cumsum(sizes)[:-1], axis=1)
         ways = [
-            jnp.broadcast_to(unit.reshape(-1, *a.shape[:-1], 1), (sum(sizes), *a.shape))
+            jnp.broadcast_to(unit.reshape(sum(sizes), *a.shape[:-1], 1), (sum(sizes), *a.shape))
             for unit, a in zip(units, moved, strict=True)
         ]
 
@@ -280,15 +294,15 @@ def _answers(
 
 
 class Laws(NamedTuple):
-    """Numbers of the laws of some inactive effects, for each effect those of its own directions.
+    """Numbers of the laws of some inactive effects, for each effect those of its own S shapes.
 
     Attributes:
-        values: Parameter values.
-        along: Directions in them; not used where an effect has no amplitude and is switched on as a whole.
+        values: Parameter values (S, P) of each effect.
+        along: D directions (S, D, P) in them; not used where an effect is switched on as a whole.
     """
 
     values: tuple[Float[Array, "_ _"], ...]
-    along: tuple[Float[Array, "_ _"], ...]
+    along: tuple[Float[Array, "_ _ _"], ...]
 
 
 def law_sensitivities(
@@ -313,37 +327,72 @@ def law_sensitivities(
     places = [ports.index(e.at) for e in effects]
     memories = _memories(effects, places, laws, samples, v, heard)
     forced = []
-    for e, p, z, values, along in zip(effects, places, memories, *laws, strict=True):
-        b: Any = 0.0
-        for j in range(heard.motion.shape[2]):
-            position, speed = heard.motion[:, p, j, 0], heard.motion[:, p, j, 1]
-            if isinstance(e, DryFriction):
-                law = lambda e, _, d=1.0 - 2.0 * (j % 2), q=position, s=speed: e.limit(q, s, d)  # noqa: E731
-            elif isinstance(e, Memory):
-                law = lambda e, z, q=position, s=speed: e.force(z, q, s, v)  # noqa: E731
-            else:
-                law = lambda e, _, q=position, s=speed: e.force(q, s, v)  # noqa: E731
-            said = _law_slopes(e, law, values, along, None if z is None else z[j], v)
-            b = b + heard.answer[:, p, j, :, None] * said[:, None]
-        forced.append(b)
-    return _recursion(answers, jnp.concatenate(forced, axis=2))
+    for p in range(len(ports)):
+        here = [i for i, place in enumerate(places) if place == p]
+        said = [_said(effects[i], heard.motion[:, p], v, laws.values[i], memories[i]) for i in here]
+        forced.append((heard.answer[:, p], jnp.concatenate(said, axis=2)) if here else None)
+    dy = _recursion(answers, [f for f in forced if f is not None])
+    found: list[Any] = [None] * len(effects)
+    for p, changes in zip(sorted(set(places)), dy, strict=True):
+        here = [i for i, place in enumerate(places) if place == p]
+        widths = [_basis(effects[i]) * len(laws.values[i]) for i in here]
+        for i, part in zip(here, jnp.split(changes, np.cumsum(widths)[:-1], axis=2), strict=True):
+            found[i] = _members(effects[i], laws.along[i], part)
+    return jnp.concatenate(found)
 
 
-def _law_slopes(
+def _basis(e: Effect) -> int:
+    """How many directions make up all of one shape: one per amplitude, or one where it is switched on."""
+    return max(len(e.amplitudes), 1)
+
+
+def _members(e: Effect, along: Float[Array, "S D P"], dy: Float[Array, "N C KS"]) -> Float[Array, "SD N C"]:
+    """Changes of the readings along the directions of each shape, from those along its amplitudes."""
+    parts = dy.reshape(*dy.shape[:2], _basis(e), -1)
+    if e.amplitudes:
+        share = along[:, :, np.array([list(e.values).index(name) for name in e.amplitudes])]
+    else:
+        share = jnp.ones((*along.shape[:2], 1), dy.dtype)
+    each = jnp.einsum("nckS,SDk->SDnc", parts, share)
+    return each.reshape(-1, *dy.shape[:2])
+
+
+def _said(
     e: Effect,
-    law: Callable[[Effect, Any], Scalar],
-    values: Float[Array, "D P"],
-    along: Float[Array, "D P"],
-    z: Float[Array, "N D"] | None,
-    like: Float[Array, " N"],
-) -> Float[Array, "N D"]:
-    """What a law says more along its directions, or at all where it is switched on as a whole."""
+    motion: Float[Array, "N J 2"],
+    v: Float[Array, " N"],
+    values: Float[Array, "S P"],
+    z: Float[Array, "J N S"] | None,
+) -> Float[Array, "N J KS"]:
+    """What a law says more at each evaluation along its amplitudes, or at all where it is switched on."""
 
-    def one(values: Array, along: Array, z: Array | None) -> Array:
-        at = lambda values: jnp.broadcast_to(law(_with(e, values), z), like.shape)  # noqa: E731
-        return jax.jvp(at, (values,), (along,))[1] if e.amplitudes else at(values)
+    def at(j: int, values: list[Array], z: Array | None) -> Array:
+        law: Any = e.replace(**dict(zip(e.values, values, strict=True)))
+        position, speed = motion[:, j, 0], motion[:, j, 1]
+        if isinstance(e, DryFriction):
+            said = law.limit(position, speed, 1.0 - 2.0 * (j % 2))
+        elif isinstance(e, Memory):
+            said = law.force(z, position, speed, v)
+        else:
+            said = law.force(position, speed, v)
+        return jnp.broadcast_to(said, v.shape)
 
-    return jax.vmap(one, in_axes=(0, 0, None if z is None else 1), out_axes=1)(values, along, z)
+    def slope(j: int, name: str | None, values: Array, z: Array | None) -> Array:
+        each = list(jnp.unstack(values))
+        if name is None:
+            return at(j, each, z)
+        k = list(e.values).index(name)
+        along = lambda a: at(j, [*each[:k], a, *each[k + 1 :]], z)  # noqa: E731
+        return jax.jvp(along, (each[k],), (jnp.ones_like(each[k]),))[1]
+
+    def shapes(j: int, name: str | None) -> Array:
+        own = None if z is None else z[j]
+        one = functools.partial(slope, j, name)
+        return jax.vmap(one, in_axes=(0, None if own is None else 1), out_axes=1)(values, own)
+
+    evaluations = range(motion.shape[1])
+    columns = [jnp.stack([shapes(j, name) for j in evaluations], axis=1) for name in e.amplitudes or (None,)]
+    return jnp.concatenate(columns, axis=2)
 
 
 def _with(e: Effect, values: Float[Array, " P"]) -> Any:
@@ -357,8 +406,8 @@ def _memories(
     samples: RecordingSamples,
     v: Float[Array, " N"],
     heard: Heard,
-) -> list[Float[Array, "2 N D"] | None]:
-    """States of memories at both evaluations of each step, (N, D); of other effects None."""
+) -> list[Float[Array, "2 N S"] | None]:
+    """States of memories at both evaluations of each step, by shape; of other effects None."""
     if not all(isinstance(e, Memory) for e in effects):
         return [None] * len(effects)
     # Motion is held in the middle of the step, which is linear in the states at both evaluations.
@@ -423,17 +472,28 @@ def signal_sensitivities(
         return jax.vmap(one, out_axes=-1)(values, gates, dvalues, dgates)
 
     dv, dy = slopes(voltage), slopes(reading)
-    forced = jnp.sum(answers.to_voltage[:, :, :, None] * dv[:, :, None], axis=1)
-    forced = forced + jnp.sum(answers.to_reading[:, :, :, None] * dy[:, :, None], axis=1)
-    return _recursion(answers, forced) + jnp.moveaxis(dy, -1, 0)
+    answer = jnp.concatenate([answers.to_voltage, answers.to_reading], axis=1)
+    (later,) = _recursion(answers, [(answer, jnp.concatenate([dv, dy], axis=1))])
+    return jnp.moveaxis(later + dy, -1, 0)
 
 
-def _recursion(answers: RunAnswers, b: Float[Array, "N n D"]) -> Float[Array, "D N C"]:
-    """Changes of the readings under a forcing of the run; the directions last, for the vector units."""
+def _recursion(
+    answers: RunAnswers, forced: list[tuple[Float[Array, "N _ n"], Float[Array, "N _ _"]]]
+) -> list[Float[Array, "N C _"]]:
+    """Changes of the readings under forcings of the run; the directions last, for the vector units.
 
-    def body(dx: Array, here: Any) -> tuple[Array, Array]:
-        a, h, force = here
-        return matvec(a.T, dx) + force, matvec(h, dx)
+    Args:
+        answers: Of the run.
+        forced: Answer of the state to some quantities, and what these are along some directions.
+    """
 
-    dy = jax.lax.scan(body, jnp.zeros_like(b[0]), (answers.run.A, answers.readings, b))[1]
-    return jnp.moveaxis(dy, -1, 0)
+    def body(states: list[Array], here: Any) -> tuple[list[Array], list[Array]]:
+        a, h, sources = here
+        later = [
+            jnp.sum(a[:, :, None] * dx[:, None], axis=0) + jnp.sum(g[:, :, None] * s[:, None], axis=0)
+            for dx, (g, s) in zip(states, sources, strict=True)
+        ]
+        return later, [jnp.sum(h[:, :, None] * dx[None], axis=1) for dx in states]
+
+    still = [jnp.zeros((answers.run.A.shape[1], s.shape[2]), s.dtype) for _, s in forced]
+    return jax.lax.scan(body, still, (answers.run.A, answers.readings, forced))[1]
