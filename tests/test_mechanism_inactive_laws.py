@@ -72,7 +72,8 @@ class Run:
         x, restart = restarts(jnp.asarray(rest), jnp.asarray(self.window))
         every = jnp.asarray(whole.values).at[first:].set(values)
         gates = jnp.ones(len(whole.effects))
-        mechanism, v, c = prepared_run(structure, self.solver, every, gates, jnp.asarray(self.u), jnp.asarray(Ts))
+        given = map(jnp.asarray, (self.u, Ts))
+        mechanism, v, c = prepared_run(structure, self.solver, every, gates, *given)
         step, K = PredictorStep(structure, self.solver), jnp.pad(self.K, ((0, size - own), (0, 0)))
         inputs = (v, jnp.asarray(self.y), jnp.asarray(self.seen), *restart)
         X = jax.lax.scan(lambda x, w: (step(x, w, (c, K)), x), x, inputs)[1]

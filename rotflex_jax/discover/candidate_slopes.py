@@ -117,7 +117,7 @@ def _signal_slopes(
     return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
 
 
-@persistent_jit(static=3, runs_rarely=True)
+@persistent_jit(static=3)
 def _inactive_slopes(
     structure: Mechanism,
     solver: Solver,

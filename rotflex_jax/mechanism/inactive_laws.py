@@ -19,7 +19,7 @@ import contextlib
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -50,10 +50,10 @@ from rotflex_jax.mechanism.step import Exponential, exponential_euler
 class _Tape:
     """Where laws are evaluated while one step is traced, in order, and what is added at each place."""
 
-    def __init__(self, added: Sequence[Array] | None = None) -> None:
+    def __init__(self, added: Float[Array, "L *S"] | None = None) -> None:
         self.added, self.heard = added, []
 
-    def __call__(self, *signals: Array) -> Array:
+    def __call__(self, *signals: Any) -> Array:
         self.heard.append(jnp.stack(signals))
         return jnp.zeros_like(signals[0]) if self.added is None else self.added[len(self.heard) - 1]
 
@@ -278,8 +278,8 @@ def _answers(
         ]
 
         def f(*moved: Array) -> tuple[Array, Array]:
-            given = (x, v, y) if laws_alone else moved[:3]
-            end, motion = heard(*given, rest, moved[-1])
+            at = (x, v, y) if laws_alone else moved[:3]
+            end, motion = heard(at[0], at[1], at[2], rest, moved[-1])
             return end, jnp.stack(motion) if motion else jnp.zeros((0, 2, S), x.dtype)
 
         def along(*way: Array) -> tuple[Array, Array]:
@@ -400,7 +400,7 @@ def _with(e: Effect, values: Float[Array, " P"]) -> Any:
 
 
 def _memories(
-    effects: tuple[Effect, ...],
+    effects: tuple[Any, ...],
     places: list[int],
     laws: Laws,
     samples: RecordingSamples,
