@@ -206,7 +206,8 @@ def _directions(current: ParameterSet, probes: Sequence[Probe], count: int) -> D
         c = p.candidate
         # Each recording has its own phase of a disturbance: only the one whose errors have the line counts.
         affected = slice(None) if c.line is None else c.recordings[p.shape]
-        d.values[row, affected, c.parameters] = p.along if c.line is not None else p.along[:, None]
+        for i, size in zip(c.parameters, p.along, strict=True):
+            d.values[row, affected, i] = size
         d.gates[row, c.effect] = 0.0 if any(c.amplitudes) else 1.0
     return d
 
@@ -327,7 +328,8 @@ def candidate_sensitivities(
             return Slopes(listed, cut(_signal_slopes(model.mechanism.structure, solver, *given), listed))
 
     def along_others(family: Sequence[Candidate], listed: Sequence[Probe]) -> Slopes:
-        model, d = s.with_family(current.gates, family), _directions(current, listed, PROBES_PER_BATCH)
+        model = s.with_family(current.gates, family)
+        d = _directions(current, listed, max(len(listed), PROBES_PER_BATCH))
         along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
         inputs = predictor.restrict(_with_probes(current, listed), model)
         inactive = tuple(model.effects.index(c.effect) for c in family)
