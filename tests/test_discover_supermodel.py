@@ -10,7 +10,7 @@ import pytest
 
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
-from rotflex_jax.discover.score_test import InactiveCandidates, candidate_sensitivities
+from rotflex_jax.discover.candidate_slopes import candidate_sensitivities
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.joints import paper
@@ -31,6 +31,8 @@ WANTED = (
     (fx.BoucWen, "joint"),
     (fx.Lag, "input"),
     (fx.Coulomb, "joint"),
+    (fx.Cogging, "arm"),
+    (fx.CrossTalk, "alpha"),
 )
 SETS = {
     "nothing": (),
@@ -209,21 +211,30 @@ def test_slopes_on_parts_are_those_of_the_whole():
 
 def test_probes_are_the_slopes_of_the_whole():
     """Along amplitudes of what is off, and along the gate of the lag, which has no amplitude."""
-    s, now = supermodel(), parameter_set("one memory")
-    names = ("hub.lugre.level", "joint.bouc_wen.level", "arm.second_mode.inertia", "joint.coulomb.level")
-    along = directions("one memory", *names)
-    along.gates[4] = s.gates([EffectLocation("lag", "input")]) - s.gates(())
-    values, put_in = now.values.copy(), parameter_set("all").gates - along.gates[4]
-    values[:, [s.mechanism.parameter_names.index(name) for name in names]] = 0.0
-    families = s.families([c for c in s.candidates.values() if not c.threshold])
-    put = ParameterSet(values, now.x0, put_in, now.K)
-    # A direction belongs to one family; in the programs of the others nothing moves along it.
-    J = candidate_sensitivities(
-        predictor(), now, [InactiveCandidates(family, put, along) for family in families], ONE_RUN
-    ).sum(axis=0)
-    assert len(families) == 4
-    whole = whole_run(numbers("one memory")._replace(values=values, gates=put_in), along)[1]
-    for name, mine, expected in zip((*names, "lag"), J, whole, strict=True):
+    s, now, put = supermodel(), parameter_set("one memory"), numbers("one memory")
+    # States of what is off are not corrected: gains are those of the baseline.
+    K = np.zeros_like(now.K)
+    K[:, s.baseline_states] = now.K[:, s.baseline_states]
+    now, put = now._replace(K=K), put._replace(K=K)
+    absent = [c for c in s.candidates.values() if now.gates[c.effect] == 0]
+    found = candidate_sensitivities(predictor(), now, absent, ONE_RUN)
+    tried = [(p.candidate.location, p.shape, p.member) for slopes in found for p in slopes.probes]
+    assert sorted(tried) == sorted(
+        (c.location, k, m) for c in absent for k, shape in enumerate(c.probes) for m in range(len(shape))
+    )
+    for p, mine in ((p, J) for slopes in found for p, J in zip(*slopes, strict=True)):
+        c, along = p.candidate, directions("one memory")
+        values, gates, own = put.values.copy(), put.gates.copy(), list(c.parameters)
+        shape = np.array(c.probes[p.shape][p.member])
+        values[:, own] = np.where(c.amplitudes, 0.0, shape)
+        along.values[0][:, own] = np.where(c.amplitudes, shape, 0.0)
+        if any(c.amplitudes):
+            gates[c.effect] = 1.0
+        else:
+            along.gates[0, c.effect] = 1.0
+        expected = whole_run(put._replace(values=values, gates=gates), along)[1][0]
         size = np.abs(expected).max()
-        assert size > 1e-6, name
-        np.testing.assert_allclose(mine, expected, rtol=0, atol=1e-9 * size, err_msg=name)
+        assert size > 1e-6, c.location
+        np.testing.assert_allclose(
+            mine, expected, rtol=0, atol=1e-9 * size, err_msg=f"{c.location} {p.shape}"
+        )

@@ -9,133 +9,24 @@ from a run at full size takes the place of the slope.
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, ProgramSamples
+from rotflex_jax.discover.batched_predictor import ParameterSet
+from rotflex_jax.discover.candidate_slopes import MOST_LINES, candidate_sensitivities
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ErrorLine, ReducedModel, SuperModel
+from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ErrorLine
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.coordinates import FitCoordinates, Projection
-from rotflex_jax.fit.problem import each_recording
 from rotflex_jax.latent.in_time import periodic_torques
-from rotflex_jax.mechanism import Exponential, Mechanism, Solver
-from rotflex_jax.mechanism.assembly import Layout, rest_state
-from rotflex_jax.mechanism.sensitivities import (
-    LinearisedRun,
-    RecordingSamples,
-    RunParameters,
-    inactive_sensitivities,
-    linearised_run,
-)
-from rotflex_jax.runtime.persistent_jit import make_ahead, persistent_jit
-from rotflex_jax.runtime.xla import double_precision
-
-
-@persistent_jit(static=2, runs_rarely=True)
-def _run_slopes(
-    structure: Mechanism,
-    solver: Solver,
-    parameter_set: ParameterSet,
-    samples: ProgramSamples,
-) -> LinearisedRun:
-    def one(values: Any, x0: Any, K: Any, *samples: Any) -> Any:
-        return linearised_run(
-            structure, solver, RunParameters(values, parameter_set.gates, x0, K), RecordingSamples(*samples)
-        )
-
-    p, (data, window, _) = parameter_set, samples
-    return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
-
-
-@persistent_jit(static=3, runs_rarely=True)
-def _inactive_slopes(
-    structure: Mechanism,
-    solver: Solver,
-    inactive: tuple[int, ...],
-    parameter_set: ParameterSet,
-    present: jax.Array,
-    run: LinearisedRun,
-    directions: Directions,
-    samples: ProgramSamples,
-) -> jax.Array:
-    def one(values: Any, x0: Any, K: Any, run: Any, dvalues: Any, *samples: Any) -> Any:
-        rest = jnp.broadcast_to(rest_state(structure, np.float64), (len(x0), K.shape[0]))
-        numbers = RunParameters(values, parameter_set.gates, rest.at[:, present].set(x0), K)
-        given = (numbers, RecordingSamples(*samples), present, run, dvalues, directions.gates)
-        return inactive_sensitivities(structure, solver, inactive, *given)
-
-    data, window, _ = samples
-    J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0, 0), out_axes=1)(
-        parameter_set.values, parameter_set.x0, parameter_set.K, run, directions.values, *data, window
-    )
-    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
-
-
-class InactiveCandidates(NamedTuple):
-    """Candidates that are probed together.
-
-    Attributes:
-        family: Candidates that the program has; none of them with a threshold.
-        parameter_set: The hypothesis with some of them put in, at zero amplitude or with a closed gate.
-        directions: Along these.
-    """
-
-    family: Sequence[Candidate]
-    parameter_set: ParameterSet
-    directions: Directions
-
-
-def candidate_sensitivities(
-    predictor: BatchedPredictor,
-    current: ParameterSet,
-    batches: Sequence[InactiveCandidates],
-    window: Int[np.ndarray, "R N"],
-) -> Float[np.ndarray, "B D R N C"]:
-    """Slopes of innovations along candidates that are not active.
-
-    Args:
-        predictor: Runs hypotheses.
-        current: The hypothesis as it is.
-        batches: What to probe.
-        window: Window of each sample.
-    """
-    s, solver = predictor.supermodel, predictor.solver
-    active = s.active(current.gates)
-    if isinstance(solver, Exponential) and solver.passes is not None:
-        # A contact without a level never sticks, so only those of the hypothesis are coupled.
-        contacts = Layout.of(active.mechanism.structure).contacts
-        solver = dataclasses.replace(solver, passes=min(solver.passes, contacts + 1))
-    with double_precision():
-        structure, inputs = active.mechanism.structure, predictor.restrict(current, active)
-        samples = predictor.on_device(window)
-        linearised = _run_slopes(structure, solver, inputs, samples)
-
-    def run(job: tuple[ReducedModel, InactiveCandidates]) -> np.ndarray:
-        model, (family, parameter_set, d) = job
-        along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
-        with double_precision():
-            present = jnp.array([model.states.index(i) for i in active.states])
-            structure, inputs = model.mechanism.structure, predictor.restrict(parameter_set, model)
-            inactive = tuple(model.effects.index(c.effect) for c in family)
-            given = (present, linearised, along, samples)
-            J = _inactive_slopes(structure, solver, inactive, inputs, *given)
-            return np.asarray(J)[:, :, : window.shape[1]]
-
-    jobs = [(s.with_family(current.gates, b.family), b) for b in batches]
-    return np.stack(predictor.run_jobs(run, jobs, lambda job: ("probes", active.effects, job[0].effects)))
-
+from rotflex_jax.runtime.persistent_jit import make_ahead
 
 # An effect that can gain this much (chi-square) is found about every other time: both the training and
 # the validation data must have their share of it.
 DETECTABLE_CHI2 = 40.0
-# Directions per pass.
-PROBES_PER_BATCH = 8
 # An effect with a threshold acts at its size: this share of it at most.
 MAX_THRESHOLD_AMPLITUDE = 1.5
 # A candidate whose scores of both horizons add up to less than this share of the best one's is not refitted.
@@ -168,64 +59,9 @@ class Score:
         return self.start.location
 
 
-@dataclasses.dataclass(frozen=True)
-class _Probe:
-    """One direction of the test: candidate, alternative, member of the alternative."""
-
-    candidate: Candidate
-    shape: int
-    member: int
-
-
-def _packed(candidates: list[Candidate]) -> list[list[_Probe]]:
-    """Probes that share a parameter set: as many as it has directions, of each candidate one shape only."""
-    batches: list[list[_Probe]] = []
-    for c in candidates:
-        for shape, group in enumerate(c.probes):
-            own = [_Probe(c, shape, member) for member in range(len(group))]
-            with_space = [b for b in batches if len(b) + len(own) <= PROBES_PER_BATCH]
-            if suitable := [b for b in with_space if all(p.candidate is not c for p in b)]:
-                suitable[0].extend(own)
-            else:
-                batches.append(own)
-    return batches
-
-
-def _with_probes(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> ParameterSet:
-    """The hypothesis with candidates on at zero amplitude, or off where they have no amplitude."""
-    values, gates = h.values(s), s.gates(h.locations)
-    for p in probes:
-        c = p.candidate
-        for k, i in enumerate(c.parameters):
-            values[:, i] = 0.0 if c.amplitudes[k] else c.probes[p.shape][0][k]
-        gates[c.effect] = 1.0 if any(c.amplitudes) else 0.0
-    return ParameterSet(values, h.x0, gates, h.K)
-
-
-def _directions(s: SuperModel, h: Hypothesis, probes: list[_Probe]) -> Directions:
-    """Directions of probes: along amplitudes by their values, along effects without any by the gate."""
-    D, (R, _, m), P, E = PROBES_PER_BATCH, h.x0.shape, len(h.z), len(s.mechanism.effects)
-    d = Directions(np.zeros((D, R, P)), np.zeros((D, m)), np.zeros((D, E)))
-    for row, p in enumerate(probes):
-        c = p.candidate
-        if not any(c.amplitudes):
-            d.gates[row, c.effect] = 1.0
-            continue
-        # Each recording has its own phase of a disturbance: only the one whose errors have the line counts.
-        affected = slice(None) if c.line is None else c.recordings[p.shape]
-        for k, i in enumerate(c.parameters):
-            if c.amplitudes[k]:
-                d.values[row, affected, i] = c.probes[p.shape][p.member][k]
-    return d
-
-
 def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
     """Scores of all candidates that are not yet in the hypothesis, best first."""
     return score_test(problem, h).listed
-
-
-# Lines beside which a disturbance is tried, the clearest ones.
-MOST_LINES = 2
 
 
 def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[ErrorLine, ...]:
@@ -269,27 +105,15 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
         return ScoreTest([], {}, None)
     thresholds = [c for c in candidates if c.threshold]
     make_ahead(lambda: list(_changes(problem, h, np.zeros(1), thresholds)))
-    # Families of all that is absent, so that a line that comes or goes compiles nothing.
-    families = s.families([c for c in absent if not c.threshold])
-    batches = [
-        (family, probes)
-        for family in families
-        for probes in _packed([tried[c.location] for c in family if c.location in tried])
-    ]
     e, J = problem.slopes([h])
     w = h.whitener(e[0], seen)
     coordinates = FitCoordinates.of(h, problem.windows)
     orthogonal = coordinates.orthogonal_to(h.whitener(J[0, : h.moved], seen))
-    jobs = [
-        InactiveCandidates(family, _with_probes(s, h, probes), _directions(s, h, probes))
-        for family, probes in batches
-    ]
-    index = problem.windows.index
-    slopes = candidate_sensitivities(problem.predictor, h.parameter_set(s), jobs, index) if jobs else ()
+    smooth = [c for c in candidates if not c.threshold]
+    found = candidate_sensitivities(problem.predictor, h.parameter_set(s), smooth, problem.windows.index)
     columns: dict[tuple[EffectLocation, int], list[np.ndarray]] = {}
-    for (_, probes), J in zip(batches, slopes, strict=True):
-        W = h.whitener(J[: len(probes)], seen)
-        for p, column in zip(probes, W, strict=True):
+    for probes, J in found:
+        for p, column in zip(probes, h.whitener(J, seen), strict=True):
             columns.setdefault((p.candidate.location, p.shape), []).append(column)
     for key, change in _changes(problem, h, e[0], thresholds):
         columns[key] = [h.whitener(change, seen)]

@@ -122,7 +122,7 @@ def split_into_chunks(tree: Any) -> Any:
 def join_chunks(pieces: Shaped[Array, "K *a S"], N: int) -> Shaped[Array, "N *a"]:
     """The inverse: (K, ..., CHUNK_SAMPLES) -> (N, ...)."""
     rows = jnp.moveaxis(pieces, -1, 1)
-    return rows.reshape(-1, *rows.shape[2:])[:N]
+    return rows.reshape(rows.shape[0] * rows.shape[1], *rows.shape[2:])[:N]
 
 
 def state_jacobians(

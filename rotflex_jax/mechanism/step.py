@@ -356,8 +356,17 @@ def advance_memories(
     """Memories after `h` [s], motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
     if not z.shape[0]:
         return z
-    flow = lambda s: memory_rates(mechanism, x, s, v, gates, z)  # noqa: E731
-    # Each flow depends on its own state only, what drives it held, so one direction gives all derivatives.
+    # What drives a flow is held, other states of memories too.
+    return exponential_euler(lambda s: memory_rates(mechanism, x, s, v, gates, z), z, h)
+
+
+def exponential_euler(
+    flow: Callable[[Float[Array, "z *S"]], Float[Array, "z *S"]],
+    z: Float[Array, "z *S"],
+    h: Float[Array, "*D"],
+) -> Float[Array, "z *S"]:
+    """States after `h` [s], each with a flow that depends on no other one."""
+    # So one direction gives all derivatives.
     rate, slope = jax.jvp(flow, (z,), (jnp.ones_like(z),))
     h = expand_axes(h[None], z)
     a = slope * h

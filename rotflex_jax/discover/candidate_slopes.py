@@ -1,0 +1,354 @@
+"""Slopes of the innovations along effects that are absent: the programs, and the directions they run along.
+
+Laws at ports, on the voltage and on readings are evaluated along the run of the hypothesis, whose steps are
+differentiated once for all of them (`mechanism.inactive_laws`). Effects that enter the matrices of the step
+need a program that has them in its step (`mechanism.sensitivities`).
+"""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, ProgramSamples
+from rotflex_jax.discover.supermodel import Candidate, ReducedModel, SuperModel
+from rotflex_jax.effects.base import Effect
+from rotflex_jax.fit.problem import each_recording
+from rotflex_jax.mechanism import Exponential, Mechanism, Solver
+from rotflex_jax.mechanism.assembly import Layout, rest_state
+from rotflex_jax.mechanism.inactive_laws import (
+    Heard,
+    Laws,
+    RunAnswers,
+    friction_answers,
+    is_heard,
+    law_sensitivities,
+    run_answers,
+    signal_sensitivities,
+)
+from rotflex_jax.mechanism.sensitivities import (
+    LinearisedRun,
+    RecordingSamples,
+    RunParameters,
+    inactive_sensitivities,
+)
+from rotflex_jax.runtime.persistent_jit import persistent_jit
+from rotflex_jax.runtime.xla import double_precision
+
+# Directions per pass where the step has the candidates in it.
+PROBES_PER_BATCH = 4
+# Lines beside which a disturbance is tried, the clearest ones.
+MOST_LINES = 2
+
+
+@persistent_jit(static=3, runs_rarely=True)
+def _run_answers(
+    structure: Mechanism,
+    solver: Solver,
+    ports: tuple[str, ...],
+    parameter_set: ParameterSet,
+    samples: ProgramSamples,
+) -> RunAnswers:
+    def one(values: Any, x0: Any, K: Any, *samples: Any) -> RunAnswers:
+        numbers = RunParameters(values, parameter_set.gates, x0, K)
+        return run_answers(structure, solver, ports, numbers, RecordingSamples(*samples))
+
+    p, (data, window, _) = parameter_set, samples
+    return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
+
+
+@persistent_jit(static=3, runs_rarely=True)
+def _friction_answers(
+    structure: Mechanism,
+    solver: Solver,
+    ports: tuple[str, ...],
+    parameter_set: ParameterSet,
+    samples: ProgramSamples,
+    X: jax.Array,
+) -> Heard:
+    def one(values: Any, x0: Any, K: Any, X: Any, *samples: Any) -> Heard:
+        numbers = RunParameters(values, parameter_set.gates, x0, K)
+        return friction_answers(structure, solver, ports, numbers, RecordingSamples(*samples), X)
+
+    p, (data, window, _) = parameter_set, samples
+    return each_recording(one, (0,) * 9)(p.values, p.x0, p.K, X, *data, window)
+
+
+@persistent_jit(static=2)
+def _law_slopes(
+    effects: tuple[Effect, ...],
+    ports: tuple[str, ...],
+    laws: Laws,
+    samples: ProgramSamples,
+    answers: RunAnswers,
+    heard: Heard,
+) -> jax.Array:
+    def one(answers: Any, heard: Any, *samples: Any) -> jax.Array:
+        return law_sensitivities(effects, ports, laws, RecordingSamples(*samples), answers, heard)
+
+    data, window, _ = samples
+    J = each_recording(one, (0,) * 7, out_axes=1)(answers, heard, *data, window)
+    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+
+
+@persistent_jit(static=2)
+def _signal_slopes(
+    structure: Mechanism,
+    solver: Solver,
+    values: jax.Array,
+    gates: jax.Array,
+    directions: Directions,
+    samples: ProgramSamples,
+    answers: RunAnswers,
+) -> jax.Array:
+    def one(values: Any, dvalues: Any, answers: Any, *samples: Any) -> jax.Array:
+        ways = (values, gates, dvalues, directions.gates)
+        return signal_sensitivities(structure, solver, *ways, RecordingSamples(*samples), answers)
+
+    data, window, _ = samples
+    axes = (1, 1, *(0,) * 6)
+    J = each_recording(one, axes, out_axes=1)(values, directions.values, answers, *data, window)
+    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+
+
+@persistent_jit(static=3)
+def _inactive_slopes(
+    structure: Mechanism,
+    solver: Solver,
+    inactive: tuple[int, ...],
+    parameter_set: ParameterSet,
+    present: jax.Array,
+    run: LinearisedRun,
+    directions: Directions,
+    samples: ProgramSamples,
+) -> jax.Array:
+    def one(values: Any, x0: Any, K: Any, run: Any, dvalues: Any, *samples: Any) -> Any:
+        rest = jnp.broadcast_to(rest_state(structure, np.float64), (len(x0), K.shape[0]))
+        numbers = RunParameters(values, parameter_set.gates, rest.at[:, present].set(x0), K)
+        given = (numbers, RecordingSamples(*samples), present, run, dvalues, directions.gates)
+        return inactive_sensitivities(structure, solver, inactive, *given)
+
+    data, window, _ = samples
+    J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0, 0), out_axes=1)(
+        parameter_set.values, parameter_set.x0, parameter_set.K, run, directions.values, *data, window
+    )
+    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """One direction of the test.
+
+    Attributes:
+        candidate: Along this one.
+        shape: Which of its alternatives.
+        member: Which member of the alternative.
+    """
+
+    candidate: Candidate
+    shape: int
+    member: int
+
+    @property
+    def values(self) -> Float[np.ndarray, " p"]:
+        """Values of the candidate's parameters where it is tried: of amplitudes zero."""
+        c = self.candidate
+        return np.where(c.amplitudes, 0.0, c.probes[self.shape][0])
+
+    @property
+    def along(self) -> Float[np.ndarray, " p"]:
+        """Direction in these values; none where the candidate has no amplitude and is switched on."""
+        c = self.candidate
+        return np.where(c.amplitudes, c.probes[self.shape][self.member], 0.0)
+
+    @classmethod
+    def of(cls, c: Candidate) -> "list[Probe]":
+        """All of a candidate, shape by shape."""
+        return [cls(c, shape, k) for shape, group in enumerate(c.probes) for k in range(len(group))]
+
+
+def _packed(probes: Sequence[Probe]) -> list[list[Probe]]:
+    """Probes that share a parameter set: as many as it has directions, of each candidate one shape only."""
+    batches: list[list[Probe]] = []
+    # Those with most shapes need most batches, and the others find room in these.
+    ordered = sorted(probes, key=lambda p: -len(p.candidate.probes))
+    for _, group in itertools.groupby(ordered, key=lambda p: (p.candidate.location, p.shape)):
+        own = list(group)
+        with_space = [b for b in batches if len(b) + len(own) <= PROBES_PER_BATCH]
+        if suitable := [b for b in with_space if all(p.candidate is not own[0].candidate for p in b)]:
+            suitable[0].extend(own)
+        else:
+            batches.append(own)
+    return batches
+
+
+def _with_probes(current: ParameterSet, probes: Sequence[Probe]) -> ParameterSet:
+    """The hypothesis with candidates on at zero amplitude, or off where they have no amplitude."""
+    values, gates = current.values.copy(), current.gates.copy()
+    for p in probes:
+        c = p.candidate
+        values[:, c.parameters] = p.values
+        gates[c.effect] = 1.0 if any(c.amplitudes) else 0.0
+    return current._replace(values=values, gates=gates)
+
+
+def _directions(current: ParameterSet, probes: Sequence[Probe], count: int) -> Directions:
+    """Directions of probes: along amplitudes by their values, along effects without any by the gate."""
+    (R, P), m, E = current.values.shape, current.x0.shape[-1], len(current.gates)
+    d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
+    for row, p in enumerate(probes):
+        c = p.candidate
+        # Each recording has its own phase of a disturbance: only the one whose errors have the line counts.
+        affected = slice(None) if c.line is None else c.recordings[p.shape]
+        for i, size in zip(c.parameters, p.along, strict=True):
+            d.values[row, affected, i] = size
+        d.gates[row, c.effect] = 0.0 if any(c.amplitudes) else 1.0
+    return d
+
+
+def _laws(own: Sequence[Sequence[Probe]]) -> Laws:
+    """Numbers of the laws of some candidates; where all shapes have as many members, these share a shape."""
+    values, along = [], []
+    for probes in own:
+        counts = {len(list(shape)) for _, shape in itertools.groupby(probes, key=lambda p: p.shape)}
+        members = counts.pop() if len(counts) == 1 else 1
+        values.append(np.array([p.values for p in probes[::members]]))
+        along.append(np.array([p.along for p in probes]).reshape(len(values[-1]), members, -1))
+    return Laws(tuple(values), tuple(along))
+
+
+class Slopes(NamedTuple):
+    """Slopes of innovations along some directions.
+
+    Attributes:
+        probes: The directions.
+        J: Slopes along them.
+    """
+
+    probes: Sequence[Probe]
+    J: Float[np.ndarray, "D R N C"]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Kinds:
+    """Candidates by how a run answers to them.
+
+    Attributes:
+        laws: Laws at ports, by what they add; those of the hypothesis too, so that an effect that is found
+            compiles nothing for the others.
+        signals: What changes the voltage or a reading, of those that are absent.
+        others: The rest of those that are absent.
+    """
+
+    laws: dict[str, list[Candidate]]
+    signals: list[Candidate]
+    others: list[Candidate]
+
+    @classmethod
+    def of(cls, s: SuperModel, active: ReducedModel, solver: Solver) -> "_Kinds":
+        """Those of a super-model beside what is active."""
+        found = cls({}, [], [])
+        for c in s.candidates.values():
+            e, absent = s.mechanism.effects[c.effect], c.effect not in active.effects
+            if c.threshold:
+                continue
+            at_port = e.acts_on == "port"
+            if not is_heard(e, active.mechanism.structure, solver) or (at_port and c.line is not None):
+                found.others.extend([c] * absent)
+            elif at_port:
+                kind = "friction" if e.dry_contact else e.state_part or "torque"
+                found.laws.setdefault(kind, []).append(c)
+            else:
+                found.signals.extend([c] * absent)
+        return found
+
+    def ports(self, friction: bool) -> tuple[str, ...]:
+        """Where laws add friction levels, or torques."""
+        of_kind = (found for kind, found in self.laws.items() if (kind == "friction") == friction)
+        return tuple(sorted({c.location.port for found in of_kind for c in found}))
+
+
+def candidate_sensitivities(
+    predictor: BatchedPredictor,
+    current: ParameterSet,
+    tried: Sequence[Candidate],
+    window: Int[np.ndarray, "R N"],
+) -> list[Slopes]:
+    """Slopes of innovations along candidates that are not active.
+
+    Programs have room for all candidates that are absent, so that a line that comes or goes compiles nothing.
+
+    Args:
+        predictor: Runs hypotheses.
+        current: The hypothesis as it is.
+        tried: What to probe, shape by shape; none of them with a threshold.
+        window: Window of each sample.
+    """
+    s, solver = predictor.supermodel, predictor.solver
+    active = s.active(current.gates)
+    structure = active.mechanism.structure
+    if isinstance(solver, Exponential) and solver.passes is not None:
+        # A contact without a level never sticks, so only those of the hypothesis are coupled.
+        solver = dataclasses.replace(solver, passes=min(solver.passes, Layout.of(structure).contacts + 1))
+    kinds, asked = _Kinds.of(s, active, solver), {c.location: c for c in tried}
+    with double_precision():
+        inputs, samples = predictor.restrict(current, active), predictor.on_device(window)
+        answers = _run_answers(structure, solver, kinds.ports(friction=False), inputs, samples)
+    cut = lambda J, listed: np.asarray(J)[: len(listed), :, : window.shape[1]]  # noqa: E731
+
+    def along_laws(kind: str) -> Slopes:
+        family, ports = kinds.laws[kind], kinds.ports(kind == "friction")
+        # Of a candidate that is active, or not tried, as well: a place that is not looked at.
+        own = [Probe.of(asked.get(c.location, c)) for c in family]
+        listed = [p for group in own for p in group]
+        effects = tuple(s.mechanism.structure.effects[c.effect] for c in family)
+        with double_precision():
+            heard, laws = answers.torques, jax.tree.map(jnp.asarray, _laws(own))
+            if kind == "friction":
+                heard = _friction_answers(structure, solver, ports, inputs, samples, answers.run.X)
+            return Slopes(listed, cut(_law_slopes(effects, ports, laws, samples, answers, heard), listed))
+
+    def along_signals() -> Slopes:
+        model = s.with_family(current.gates, kinds.signals)
+        listed = [p for c in kinds.signals if c.location in asked for p in Probe.of(asked[c.location])]
+        count = sum(len(g) * (1 if c.line is None else MOST_LINES) for c in kinds.signals for g in c.probes)
+        points = [predictor.restrict(_with_probes(current, [p]), model) for p in listed]
+        points += [predictor.restrict(current, model)] * (count - len(points))
+        d = _directions(current, listed, count)
+        along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
+        with double_precision():
+            values, gates = (jnp.array([getattr(p, what) for p in points]) for what in ("values", "gates"))
+            given = (values, gates, along, samples, answers)
+            return Slopes(listed, cut(_signal_slopes(model.mechanism.structure, solver, *given), listed))
+
+    def along_others(family: Sequence[Candidate], listed: Sequence[Probe]) -> Slopes:
+        model = s.with_family(current.gates, family)
+        d = _directions(current, listed, max(len(listed), PROBES_PER_BATCH))
+        along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
+        inputs = predictor.restrict(_with_probes(current, listed), model)
+        inactive = tuple(model.effects.index(c.effect) for c in family)
+        with double_precision():
+            present = jnp.array([model.states.index(i) for i in active.states])
+            given = (inputs, present, answers.run, along, samples)
+            return Slopes(
+                listed, cut(_inactive_slopes(model.mechanism.structure, solver, inactive, *given), listed)
+            )
+
+    jobs: list[tuple[Any, Callable[[], Slopes]]] = [
+        (("laws", kind, active.effects), functools.partial(along_laws, kind)) for kind in kinds.laws
+    ]
+    if kinds.signals:
+        jobs.append((("signals", active.effects), along_signals))
+    for family in [kinds.others] if kinds.laws else s.families(kinds.others):
+        probes = [p for c in family if c.location in asked for p in Probe.of(asked[c.location])]
+        name = ("others", active.effects, *(c.effect for c in family))
+        jobs += [(name, functools.partial(along_others, family, b)) for b in _packed(probes)]
+    found = predictor.run_jobs(lambda job: job[1](), jobs, lambda job: job[0])
+    wanted = [[p.candidate.location in asked for p in slopes.probes] for slopes in found]
+    return [Slopes(list(itertools.compress(f.probes, w)), f.J[w]) for f, w in zip(found, wanted, strict=True)]

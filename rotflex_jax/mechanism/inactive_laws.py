@@ -1,0 +1,499 @@
+"""Sensitivities along laws that are inactive: what they would add to a step, and how the run answers.
+
+A torque, a friction level, a voltage or a reading that an inactive effect would add changes a step by
+
+    b[k] = sum over j of G[k, j] s[k, j],
+
+where `s[k, j]` is what its law says at the j-th place of the step where laws are evaluated, and `G` is how
+the state after the step answers to a little more there. `G` belongs to the active model and is formed once
+for all laws; each law is evaluated along the run for its own directions alone, without a step around it; and
+one recursion carries all directions side by side,
+
+    dx[k+1] = A[k] dx[k] + b[k],   dy[k] = H[k] dx[k].
+
+Effects that enter the matrices of the step or have linear states are not of this form; `sensitivities` has
+them.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Integer
+
+from rotflex_jax.effects.base import (
+    Actuation,
+    DryFriction,
+    Effect,
+    Force,
+    Gear,
+    Linear,
+    Memory,
+    Scalar,
+    Sensing,
+)
+from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
+from rotflex_jax.mechanism.gear import gear_steps
+from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
+from rotflex_jax.mechanism.sensitivities import LinearisedRun, RecordingSamples, RunParameters
+from rotflex_jax.mechanism.simulate import PredictorStep, Solver, prepared_run, read_outputs
+from rotflex_jax.mechanism.step import Exponential, exponential_euler
+
+
+class _Tape:
+    """Where laws are evaluated while one step is traced, in order, and what is added at each place."""
+
+    def __init__(self, added: Float[Array, "L *S"] | None = None) -> None:
+        self.added, self.heard = added, []
+
+    def __call__(self, *signals: Any) -> Array:
+        self.heard.append(jnp.stack(signals))
+        return jnp.zeros_like(signals[0]) if self.added is None else self.added[len(self.heard) - 1]
+
+
+class _Traced(threading.local):
+    tape = _Tape()
+
+
+_traced = _Traced()
+
+
+@contextlib.contextmanager
+def _recorded(tape: _Tape) -> Iterator[None]:
+    _traced.tape = tape
+    try:
+        yield
+    finally:
+        _traced.tape = _Tape()
+
+
+@dataclasses.dataclass(frozen=True)
+class ListeningForce(Force):
+    """A torque that is given, at a port; it records where a step evaluates it."""
+
+    name: ClassVar[str] = "listening_force"
+
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m]."""
+        return _traced.tape(position, speed)
+
+
+@dataclasses.dataclass(frozen=True)
+class ListeningFriction(DryFriction):
+    """A friction level that is given, at a port; it records where a step evaluates it."""
+
+    name: ClassVar[str] = "listening_friction"
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar, *load: Scalar) -> Scalar:
+        """Level [N m]."""
+        return _traced.tape(position, speed)
+
+
+Listening = tuple[Mechanism, Solver, tuple[Effect, ...]]
+"""What is active, the integration rule, and what listens beside it."""
+
+
+class Heard(NamedTuple):
+    """Where a step evaluates laws at some ports, and how it answers to what is added there.
+
+    Attributes:
+        motion: Position [rad] and speed [rad/s] of the port at each of the J evaluations.
+        answer: Change of the state after the step per unit that is added there.
+    """
+
+    motion: Float[Array, "*batch N p J 2"]
+    answer: Float[Array, "*batch N p J n"]
+
+
+class RunAnswers(NamedTuple):
+    """A predictor run, and how its steps and readings answer to small changes.
+
+    Attributes:
+        run: States and the Jacobians of the steps.
+        voltage: What drives each step [V], each substep of it where it changes within the sample.
+        to_voltage: Change of the state after a step per volt.
+        to_reading: The same per unit that a sensor reads more.
+        readings: Change of the readings per unit of each state.
+        torques: What is heard at the ports; None where nothing listens.
+    """
+
+    run: LinearisedRun
+    voltage: Float[Array, "*batch N h"]
+    to_voltage: Float[Array, "*batch N h n"]
+    to_reading: Float[Array, "*batch N C n"]
+    readings: Float[Array, "*batch N C n"]
+    torques: Heard | None
+
+
+def is_heard(effect: Effect, structure: Mechanism, solver: Solver) -> bool:
+    """Whether the law of an inactive effect is of the form above, beside what is active.
+
+    Args:
+        effect: The inactive one.
+        structure: What is active.
+        solver: Integration rule.
+    """
+    if isinstance(effect, Actuation):
+        return True
+    if isinstance(effect, Sensing):
+        return not effect.order
+    steps = gear_steps(structure) * solver.substeps
+    if isinstance(effect, Linear | Gear) or not isinstance(solver, Exponential) or steps > 1:
+        return False
+    if isinstance(effect, Memory):  # its state is advanced once, between both evaluations of the step
+        rigid = not effects_of(structure, Gear)
+        return rigid and solver.order == 2 and effect.driven_by == "voltage" and not _has_load(structure)
+    return isinstance(effect, Force) or (isinstance(effect, DryFriction) and not effect.loaded)
+
+
+def _has_load(structure: Mechanism) -> bool:
+    """Whether friction depends on the torque through a port, for which a step evaluates torques once more."""
+    return any(e.loaded for _, e in effects_of(structure, DryFriction))
+
+
+def run_answers(
+    structure: Mechanism,
+    solver: Solver,
+    ports: tuple[str, ...],
+    parameters: RunParameters,
+    samples: RecordingSamples,
+) -> RunAnswers:
+    """A predictor run, with what the laws of inactive effects need to know of it.
+
+    Args:
+        structure: What is active; static.
+        solver: Integration rule; static.
+        ports: Where torques may be added; static.
+        parameters: Of this structure.
+        samples: The recording.
+    """
+    mechanism, v, c = prepared_run(
+        structure, solver, parameters.values, parameters.gates, samples.u, samples.Ts
+    )
+    x0, measured = samples.started_at(parameters.x0)
+    X = states(PredictorStep(structure, solver), x0, (v, *measured), (c, parameters.K))
+    n, C = X.shape[1], samples.y.shape[1]
+    listening = structure, solver, tuple(ListeningForce(p) for p in ports)
+    motion, answers = _answers(listening, parameters, samples, X, laws_alone=False)
+    h = answers.shape[1] - n - C - motion.shape[1]
+    A, to_voltage, to_measured, to_torque = jnp.split(answers, (n, n + h, n + h + C), axis=1)
+    heard = _by_port(motion, to_torque, 1, len(ports)) if ports else None
+    read = lambda x: read_outputs(mechanism, parameters.gates, x)  # noqa: E731
+    units = jnp.broadcast_to(jnp.eye(n, dtype=X.dtype)[:, :, None], (n, n, len(X)))
+    H = jax.vmap(lambda way: jax.jvp(read, (X.T,), (way,))[1])(units)
+    return RunAnswers(
+        LinearisedRun(X, A),
+        v.reshape(len(X), -1),
+        to_voltage,
+        -to_measured,
+        jnp.transpose(H, (2, 1, 0)),
+        heard,
+    )
+
+
+def friction_answers(
+    structure: Mechanism,
+    solver: Solver,
+    ports: tuple[str, ...],
+    parameters: RunParameters,
+    samples: RecordingSamples,
+    X: Float[Array, "N n"],
+) -> Heard:
+    """How a run through states X answers to friction levels at some ports; arguments as in `run_answers`.
+
+    Evaluations against positive and against negative motion alternate.
+    """
+    # One contact beside those that are active: others without a level change nothing but the effort.
+    heard: list[Heard] = []
+    for p in ports:
+        listening = structure, solver, (ListeningFriction(p),)
+        count = heard[0].motion.shape[2] if heard else None
+        found = _answers(listening, parameters, samples, X, laws_alone=True, count=count)
+        heard.append(_by_port(*found, 2, 1))
+    return jax.tree.map(lambda *each: jnp.concatenate(each, axis=1), *heard)
+
+
+def _by_port(motion: Float[Array, "N L 2"], answers: Float[Array, "N L n"], kinds: int, ports: int) -> Heard:
+    """Evaluations port by port: a step makes those of one kind in the order of the ports."""
+
+    def sorted_(a: Array) -> Array:
+        N, L, width = a.shape
+        rounds = a.reshape(N, L // (ports * kinds), ports, kinds, width)
+        return jnp.swapaxes(rounds, 1, 2).reshape(N, ports, L // ports, width)
+
+    return Heard(sorted_(motion), sorted_(answers))
+
+
+def _answers(
+    listening: Listening,
+    parameters: RunParameters,
+    samples: RecordingSamples,
+    X: Float[Array, "N n"],
+    laws_alone: bool,
+    count: int | None = None,
+) -> tuple[Float[Array, "N L 2"], Float[Array, "N _ n"]]:
+    """Motion at the L evaluations of listeners, and how the state after each step answers to small changes.
+
+    These are changes of the state before it, of the voltage, of what is measured and of what listeners give,
+    in this order, or of the last alone.
+
+    Args:
+        listening: The step.
+        parameters: Of its structure without the listeners.
+        samples: The recording.
+        X: States.
+        laws_alone: Whether only changes of what listeners give are asked for.
+        count: Number of evaluations L, where it is known.
+    """
+    structure, solver, listeners = listening
+    structure = dataclasses.replace(structure, effects=(*structure.effects, *listeners)).structure
+    gates = jnp.concatenate([parameters.gates, jnp.ones(len(listeners), parameters.gates.dtype)])
+    _, v, c = prepared_run(structure, solver, parameters.values, gates, samples.u, samples.Ts)
+    _, measured = samples.started_at(parameters.x0)
+    step, constants = PredictorStep(structure, solver), (c, parameters.K)
+
+    def heard(x: Array, v: Array, y: Array, rest: Any, added: Array | None) -> tuple[Array, list[Array]]:
+        tape = _Tape(added)
+        with _recorded(tape):
+            return step(x, (v, y, *rest), constants), tape.heard
+
+    def here(piece: Any) -> tuple[Array, Array]:
+        x, v, y, rest = piece
+        S = x.shape[-1]
+        evaluations = count or len(jax.eval_shape(lambda: heard(x, v, y, rest, None))[1])
+        none = jnp.zeros((evaluations, S), x.dtype)
+        moved = [none] if laws_alone else [x, v, y, none]
+        sizes = [a.size // S for a in moved]
+        units = jnp.split(jnp.eye(sum(sizes), dtype=x.dtype), np.cumsum(sizes)[:-1], axis=1)
+        ways = [
+            jnp.broadcast_to(unit.reshape(sum(sizes), *a.shape[:-1], 1), (sum(sizes), *a.shape))
+            for unit, a in zip(units, moved, strict=True)
+        ]
+
+        def f(*moved: Array) -> tuple[Array, Array]:
+            at = (x, v, y) if laws_alone else moved[:3]
+            end, motion = heard(at[0], at[1], at[2], rest, moved[-1])
+            return end, jnp.stack(motion) if motion else jnp.zeros((0, 2, S), x.dtype)
+
+        def along(*way: Array) -> tuple[Array, Array]:
+            (_, motion), (end, _) = jax.jvp(f, tuple(moved), way)
+            return motion, end
+
+        return jax.vmap(along, out_axes=(None, 0))(*ways)
+
+    y, *rest = measured
+    motion, answers = jax.lax.map(here, split_into_chunks((X, v, y, rest)))
+    return join_chunks(motion, len(X)), join_chunks(answers, len(X))
+
+
+class Laws(NamedTuple):
+    """Numbers of the laws of some inactive effects, for each effect those of its own S shapes.
+
+    Attributes:
+        values: Parameter values (S, P) of each effect.
+        along: D directions (S, D, P) in them; not used where an effect is switched on as a whole.
+    """
+
+    values: tuple[Float[Array, "_ _"], ...]
+    along: tuple[Float[Array, "_ _ _"], ...]
+
+
+def law_sensitivities(
+    effects: tuple[Effect, ...],
+    ports: tuple[str, ...],
+    laws: Laws,
+    samples: RecordingSamples,
+    answers: RunAnswers,
+    heard: Heard,
+) -> Float[Array, "D N C"]:
+    """Derivatives of the predicted outputs along laws at ports: torques, memories or friction levels.
+
+    Args:
+        effects: All of one kind, without values; static.
+        ports: Where something listens; static.
+        laws: Their numbers.
+        samples: The recording.
+        answers: From `run_answers`.
+        heard: Its torques; of friction what `friction_answers` gives.
+    """
+    v = answers.voltage[:, 0]
+    places = [ports.index(e.at) for e in effects]
+    memories = _memories(effects, places, laws, samples, v, heard)
+    forced = []
+    for p in range(len(ports)):
+        here = [i for i, place in enumerate(places) if place == p]
+        said = [_said(effects[i], heard.motion[:, p], v, laws.values[i], memories[i]) for i in here]
+        forced.append((heard.answer[:, p], jnp.concatenate(said, axis=2)) if here else None)
+    dy = _recursion(answers, [f for f in forced if f is not None])
+    found: list[Any] = [None] * len(effects)
+    for p, changes in zip(sorted(set(places)), dy, strict=True):
+        here = [i for i, place in enumerate(places) if place == p]
+        widths = [_basis(effects[i]) * len(laws.values[i]) for i in here]
+        for i, part in zip(here, jnp.split(changes, np.cumsum(widths)[:-1], axis=2), strict=True):
+            found[i] = _members(effects[i], laws.along[i], part)
+    return jnp.concatenate(found)
+
+
+def _basis(e: Effect) -> int:
+    """How many directions make up all of one shape: one per amplitude, or one where it is switched on."""
+    return max(len(e.amplitudes), 1)
+
+
+def _members(e: Effect, along: Float[Array, "S D P"], dy: Float[Array, "N C KS"]) -> Float[Array, "SD N C"]:
+    """Changes of the readings along the directions of each shape, from those along its amplitudes."""
+    parts = dy.reshape(*dy.shape[:2], _basis(e), -1)
+    if e.amplitudes:
+        share = along[:, :, np.array([list(e.values).index(name) for name in e.amplitudes])]
+    else:
+        share = jnp.ones((*along.shape[:2], 1), dy.dtype)
+    each = jnp.einsum("nckS,SDk->SDnc", parts, share)
+    return each.reshape(-1, *dy.shape[:2])
+
+
+def _said(
+    e: Effect,
+    motion: Float[Array, "N J 2"],
+    v: Float[Array, " N"],
+    values: Float[Array, "S P"],
+    z: Float[Array, "J N S"] | None,
+) -> Float[Array, "N J KS"]:
+    """What a law says more at each evaluation along its amplitudes, or at all where it is switched on."""
+
+    def at(j: int, values: list[Array], z: Array | None) -> Array:
+        law: Any = e.replace(**dict(zip(e.values, values, strict=True)))
+        position, speed = motion[:, j, 0], motion[:, j, 1]
+        if isinstance(e, DryFriction):
+            said = law.limit(position, speed, 1.0 - 2.0 * (j % 2))
+        elif isinstance(e, Memory):
+            said = law.force(z, position, speed, v)
+        else:
+            said = law.force(position, speed, v)
+        return jnp.broadcast_to(said, v.shape)
+
+    def slope(j: int, name: str | None, values: Array, z: Array | None) -> Array:
+        each = list(jnp.unstack(values))
+        if name is None:
+            return at(j, each, z)
+        k = list(e.values).index(name)
+        along = lambda a: at(j, [*each[:k], a, *each[k + 1 :]], z)  # noqa: E731
+        return jax.jvp(along, (each[k],), (jnp.ones_like(each[k]),))[1]
+
+    def shapes(j: int, name: str | None) -> Array:
+        own = None if z is None else z[j]
+        one = functools.partial(slope, j, name)
+        return jax.vmap(one, in_axes=(0, None if own is None else 1), out_axes=1)(values, own)
+
+    evaluations = range(motion.shape[1])
+    columns = [jnp.stack([shapes(j, name) for j in evaluations], axis=1) for name in e.amplitudes or (None,)]
+    return jnp.concatenate(columns, axis=2)
+
+
+def _with(e: Effect, values: Float[Array, " P"]) -> Any:
+    return e.replace(**dict(zip(e.values, jnp.unstack(values), strict=True)))
+
+
+def _memories(
+    effects: tuple[Any, ...],
+    places: list[int],
+    laws: Laws,
+    samples: RecordingSamples,
+    v: Float[Array, " N"],
+    heard: Heard,
+) -> list[Float[Array, "2 N S"] | None]:
+    """States of memories at both evaluations of each step, by shape; of other effects None."""
+    if not all(isinstance(e, Memory) for e in effects):
+        return [None] * len(effects)
+    # Motion is held in the middle of the step, which is linear in the states at both evaluations.
+    middle = jnp.mean(heard.motion, axis=2)
+    rest = [
+        jnp.full(len(values), e.initial(), v.dtype) for e, values in zip(effects, laws.values, strict=True)
+    ]
+    ends = jnp.zeros_like(v) if samples.window is None else _window_ends(samples.window, v)
+
+    def advance(z: list[Array], sample: Any) -> tuple[list[Array], tuple[list[Array], list[Array]]]:
+        motion, v, ends = sample
+        later = []
+        for e, p, values, own in zip(effects, places, laws.values, z, strict=True):
+            flow = lambda values, s, e=e, p=p: _with(e, values).flow(s, motion[p, 0], motion[p, 1], v)  # noqa: E731
+            each = jax.vmap(flow)
+            later.append(
+                exponential_euler(lambda s, each=each, values=values: each(values, s), own, samples.Ts)
+            )
+        return [jnp.where(ends > 0, r, s) for r, s in zip(rest, later, strict=True)], (z, later)
+
+    before, after = jax.lax.scan(advance, rest, (middle, v, ends))[1]
+    return [jnp.stack(pair) for pair in zip(before, after, strict=True)]
+
+
+def _window_ends(window: Integer[Array, " N"], v: Array) -> Array:
+    return (jnp.concatenate([window[1:], window[-1:]]) != window).astype(v.dtype)
+
+
+def signal_sensitivities(
+    structure: Mechanism,
+    solver: Solver,
+    values: Float[Array, "D P"],
+    gates: Float[Array, "D E"],
+    dvalues: Float[Array, "D P"],
+    dgates: Float[Array, "D E"],
+    samples: RecordingSamples,
+    answers: RunAnswers,
+) -> Float[Array, "D N C"]:
+    """Derivatives of the predicted outputs along effects on the voltage and on readings.
+
+    Args:
+        structure: With these effects, none of which has states; static.
+        solver: Integration rule; static.
+        values: Parameter values at which each direction is tried.
+        gates: Gates there.
+        dvalues: Directions in the values.
+        dgates: Directions in the gates.
+        samples: The recording.
+        answers: From `run_answers`.
+    """
+    X = answers.run.X
+
+    def voltage(values: Array, gates: Array) -> Array:
+        v = motor_voltage(structure.with_values(values), gates, samples.u, samples.Ts)
+        return solver.inputs(v).reshape(len(X), -1)
+
+    def reading(values: Array, gates: Array) -> Array:
+        return read_outputs(structure.with_values(values), gates, X.T).T
+
+    def slopes(f: Callable[[Array, Array], Array]) -> Array:
+        one = lambda *at: jax.jvp(f, at[:2], at[2:])[1]  # noqa: E731
+        return jax.vmap(one, out_axes=-1)(values, gates, dvalues, dgates)
+
+    dv, dy = slopes(voltage), slopes(reading)
+    answer = jnp.concatenate([answers.to_voltage, answers.to_reading], axis=1)
+    (later,) = _recursion(answers, [(answer, jnp.concatenate([dv, dy], axis=1))])
+    return jnp.moveaxis(later + dy, -1, 0)
+
+
+def _recursion(
+    answers: RunAnswers, forced: list[tuple[Float[Array, "N _ n"], Float[Array, "N _ _"]]]
+) -> list[Float[Array, "N C _"]]:
+    """Changes of the readings under forcings of the run; the directions last, for the vector units.
+
+    Args:
+        answers: Of the run.
+        forced: Answer of the state to some quantities, and what these are along some directions.
+    """
+
+    def body(states: list[Array], here: Any) -> tuple[list[Array], list[Array]]:
+        a, h, sources = here
+        later = [
+            jnp.sum(a[:, :, None] * dx[:, None], axis=0) + jnp.sum(g[:, :, None] * s[:, None], axis=0)
+            for dx, (g, s) in zip(states, sources, strict=True)
+        ]
+        return later, [jnp.sum(h[:, :, None] * dx[None], axis=1) for dx in states]
+
+    still = [jnp.zeros((answers.run.A.shape[1], s.shape[2]), s.dtype) for _, s in forced]
+    return jax.lax.scan(body, still, (answers.run.A, answers.readings, forced))[1]
