@@ -13,7 +13,9 @@ from rotflex_jax.discover.selection import (
     choose,
     describe,
     horizon_gains,
+    related,
     replaced_by,
+    undecided_laws,
     validate_from_best_states,
 )
 from rotflex_jax.discover.stepwise import refit_candidates, refit_near_predictions
@@ -123,18 +125,33 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
     data, current = state.problem.dataset.data, state.current
     for candidate in candidates:
         state.say("  " + describe(candidate, current))
+    _note_generalisations(state, candidates)
     winner, rivals = choose(candidates, current, data, state.problem.noise)
     if winner is None or winner.location is None:
         return False
     if more := _refit_replaced(state, winner, [c.location for c in candidates if c.location]):
         scored = [*scored, *(s for s, _ in more)]
-        winner, rivals = choose([*candidates, *(c for _, c in more)], current, data, state.problem.noise)
+        candidates = [*candidates, *(c for _, c in more)]
+        winner, rivals = choose(candidates, current, data, state.problem.noise)
         assert winner and winner.location
+    rivals = [*rivals, *undecided_laws(winner, candidates, current, data, state.problem.noise)]
     nats = max((s.nats for s in scored if s.location == winner.location), default=0.0)
     not_distinguished = tuple(r.location for r in rivals if r.location)
     added = AddedEffect(winner.location, nats, not_distinguished, horizon_gains(winner, current))
     state.add(winner, [added])
     return True
+
+
+def _note_generalisations(state: SearchState, candidates: Sequence[ValidatedHypothesis]) -> None:
+    """Notes generalisations of effects found before, refitted in this round, that no data decide against."""
+    s, h = state.problem.supermodel, state.current.hypothesis
+    for location in state.scores:
+        count = parameter_count(s, h, location)
+        known = dataclasses.replace(state.current, location=location, parameter_count=count)
+        general = [c for c in candidates if c.location and related(location, c.location)]
+        more = undecided_laws(known, general, known, state.problem.dataset.data, state.problem.noise)
+        rivals = state.rivals[location]
+        rivals += [c.location for c in more if c.location and c.location not in rivals]
 
 
 def _refit_replaced(

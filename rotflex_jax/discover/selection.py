@@ -123,8 +123,7 @@ def admissible(
     """
     nats, z = paired_gain(candidate.blocks, current.blocks)
     train, train_z = _training_gain(candidate, current)
-    measured = float(np.sum(data.seen)) * data.y.shape[-1]
-    needed = TRAIN_NATS + 0.5 * candidate.parameter_count * float(np.log(measured))
+    needed = _needed(candidate.parameter_count, data)
     # Likelihood is about the next samples, a user's free runs are about many: both must agree. Far from the
     # sensor noise, an effect that leaves free runs as they were is flexibility, not a discovery.
     far = bool(np.any(best_window_rmse(current) > 2 * noise))
@@ -192,6 +191,56 @@ def choose(
     return winner, [t for t in gains if _alike(winner, t, current, noise)]
 
 
+def undecided_laws(
+    winner: ValidatedHypothesis,
+    candidates: Sequence[ValidatedHypothesis],
+    current: ValidatedHypothesis,
+    data: StackedRecordings,
+    noise: Float[np.ndarray, " C"],
+) -> list[ValidatedHypothesis]:
+    """Special cases and generalisations of the winner that its errors do not decide against.
+
+    Where a model leaves errors far above the noise, what is missing besides suits one law of friction better
+    than another, and both the penalty for parameters and the test against the simpler law count chance as
+    noise alone would make it. A special case is undecided where it is like the winner as far as such a model
+    can tell, a generalisation where training and validation data both prefer it, though not beyond doubt.
+
+    Args:
+        winner: Effect that is going to be added, or the model that has it already, with its location.
+        candidates: What was refitted beside the same model.
+        current: The model without it.
+        data: Training recordings.
+        noise: Standard deviation of the sensor noise of each channel.
+    """
+    if not np.any(best_window_rmse(winner) > 2 * noise):
+        return []
+    special = [t for t in candidates if t is not winner and _contained(t, winner)]
+    general = [t for t in candidates if t is not winner and _contained(winner, t)]
+    return [
+        *(t for t in special if _alike(winner, t, current, noise)),
+        *(t for t in general if prefers(t, winner, data) and not free_runs_apart(winner, t)),
+    ]
+
+
+def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
+    """Whether training data prefer a generalisation after the penalty, and validation data prefer it at all.
+
+    Args:
+        rich: The generalisation.
+        simple: What it contains.
+        data: Training recordings.
+    """
+    more = rich.parameter_count - simple.parameter_count
+    gain = rich.log_likelihood - simple.log_likelihood
+    return gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
+
+
+def _needed(parameter_count: int, data: StackedRecordings) -> float:
+    """Gain on training data that so many more parameters have to bring [nat]."""
+    measured = float(np.sum(data.seen)) * data.y.shape[-1]
+    return TRAIN_NATS + 0.5 * parameter_count * float(np.log(measured))
+
+
 def replaced_by(
     winner: EffectLocation,
     before: Sequence[list[Score]],
@@ -252,7 +301,7 @@ def validate_from_best_states(
 
 def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
     """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
-    if _free_runs_apart(winner, rival):
+    if free_runs_apart(winner, rival):
         return True
     # Where runs validate each other, the blocks of training are the same samples once more.
     both = [(t.blocks,) if t.folds else (t.blocks, t.hypothesis.blocks) for t in (winner, rival)]
@@ -273,7 +322,7 @@ def _alike(
     """
     if not distinguished(winner, rival):
         return True
-    if _free_runs_apart(winner, rival) or not np.any(best_window_rmse(winner) > 2 * noise):
+    if free_runs_apart(winner, rival) or not np.any(best_window_rmse(winner) > 2 * noise):
         return False
     gains = [
         paired_gain(t.blocks, current.blocks)[0] + _training_gain(t, current)[0] for t in (winner, rival)
@@ -283,10 +332,17 @@ def _alike(
 
 def _related(a: ValidatedHypothesis, b: ValidatedHypothesis) -> bool:
     """Whether one of two effects is a special case of the other."""
-    return _contained(a, b) or _contained(b, a)
+    assert a.location and b.location
+    return related(a.location, b.location)
 
 
-def _free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
+def related(a: EffectLocation, b: EffectLocation) -> bool:
+    """Whether one of two effects is a special case of the other."""
+    return _is_in(a, b) or _is_in(b, a)
+
+
+def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
+    """Whether short free runs distinguish the winner from a rival that is worse."""
     return float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART
 
 
