@@ -22,6 +22,7 @@ from rotflex_jax.discover.selection import (
     paired_gain,
     runs_clearly_better,
     shares_of_gain,
+    undecided_laws,
 )
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
@@ -649,3 +650,33 @@ def test_a_rival_gains_something_on_either_side() -> None:
     for nothing in ({"held_out": 0.0, "train": 25.0}, {"held_out": 25.0, "train": 0.0}):
         none = trial(ARM, **GOOD | nothing | {"scatter": 0.0}, seed=2)
         assert choose([none, best], BASE, DATA, NOISE) == (best, [])
+
+
+def listed(winner: ValidatedHypothesis, *others: ValidatedHypothesis) -> list[ValidatedHypothesis]:
+    return undecided_laws(winner, [winner, *others], BASE, DATA, NOISE)
+
+
+def test_laws_of_one_friction_that_a_poor_model_does_not_decide_between() -> None:
+    """Two more parameters have to bring 8 + log(6000) nats in training, and some on validation."""
+    plain = trial(COULOMB, held_out=200.0, train=200.0, windows=5.0)
+    enough = 200.0 + 8.0 + np.log(6000)
+    rich = lambda **changes: trial(  # noqa: E731
+        STRIBECK, **{"held_out": 201.0, "train": enough * 1.01, "windows": 5.0, "numbers": 3} | changes
+    )
+    general = rich()
+    assert listed(plain, general) == [general]
+    for spoilt in ({"held_out": 199.0}, {"train": enough * 0.99}, {"windows": 5.0 * np.exp(0.11)}):
+        assert listed(plain, rich(**spoilt)) == [], spoilt
+    # An effect at another port is no law of the same friction, and near the noise the data have decided.
+    assert listed(plain, trial(ARM, held_out=201.0, train=400.0, windows=5.0)) == []
+    near = dataclasses.replace(plain, window_rmse=1.9 * NOISE)
+    assert listed(near, rich(windows=1.9)) == []
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.95, True), (0.85, False)])
+def test_a_special_case_with_nearly_all_of_the_gain_stands_beside_the_winner(
+    share: float, found: bool
+) -> None:
+    rich = trial(STRIBECK, held_out=1000.0, train=1000.0, windows=5.0, numbers=3)
+    plain = trial(COULOMB, held_out=1000.0 * share, train=1000.0 * share, windows=5.0)
+    assert (listed(rich, plain) == [plain]) is found

@@ -633,9 +633,8 @@ console.info("ranges: " + JSON.stringify(ranges));
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_browser_shows_the_page_without_complaint(discovery, tmp_path) -> None:
-    path = discovery.report(tmp_path)
-    page = path.read_text(encoding="utf-8")
+def test_a_browser_shows_the_page_without_complaint(page, tmp_path) -> None:
+    path = tmp_path / "report.html"
     path.write_text(page.replace("</body>", f"<script>{EXERCISE}</script></body>"), encoding="utf-8")
     shot = tmp_path / "shot.png"
     flags = [

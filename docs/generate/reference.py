@@ -45,7 +45,10 @@ ALSO = {
         "rotflex_jax.mechanism.assembly.EquationsOfMotion",
         "rotflex_jax.mechanism.smooth_rk4.SmoothConstants",
     ],
-    "rotflex_jax.effects.base": ["rotflex_jax.effects.base.Stamp"],
+    "rotflex_jax.effects.base": [
+        "rotflex_jax.effects.base.Stamp",
+        "rotflex_jax.effects.motor.PositionLoop",
+    ],
     "rotflex_jax.discover": [
         "rotflex_jax.discover.result.SearchResult",
         "rotflex_jax.discover.verdict.Verdict",
