@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import small_problem as sp
 
-from rotflex_jax.discover import selection
+from rotflex_jax.discover import forward_selection, selection, stepwise
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
 from rotflex_jax.discover.likelihood import in_blocks, levenberg_marquardt
 from rotflex_jax.discover.result import HorizonGain
@@ -649,3 +651,94 @@ def test_a_rival_gains_something_on_either_side() -> None:
     for nothing in ({"held_out": 0.0, "train": 25.0}, {"held_out": 25.0, "train": 0.0}):
         none = trial(ARM, **GOOD | nothing | {"scatter": 0.0}, seed=2)
         assert choose([none, best], BASE, DATA, NOISE) == (best, [])
+
+
+# -- laws between which a poor model does not decide ------------------------------------------------------
+
+LUGRE = EffectLocation("lugre", "hub")
+MORE_NEEDED = selection.TRAIN_NATS + np.log(2 * N)  # of two further parameters
+
+
+def undecided(windows: float = 5.0, special: dict | None = None, general: dict | None = None) -> list[str]:
+    """What is listed beside Stribeck friction, of Coulomb friction, LuGre's and friction elsewhere."""
+    lead = {"held_out": 1000.0, "train": 1000.0, "windows": windows}
+    winner = trial(STRIBECK, **lead, numbers=3)
+    others = [
+        trial(ARM, **lead),
+        trial(LUGRE, **lead | {"held_out": 1010.0, "train": 1100.0} | (general or {}), numbers=5),
+        trial(COULOMB, **lead | {"held_out": 950.0, "train": 950.0} | (special or {})),
+    ]
+    assert distinguished(winner, others[2])
+    found = selection.undecided_laws(winner, [*others, winner], BASE, DATA, NOISE)
+    of_known = selection.undecided_generalisations(winner, [*others, winner], DATA, NOISE)
+    assert of_known == [t for t in found if t.location == LUGRE]
+    return [t.location.effect for t in found if t.location]
+
+
+def test_a_poor_model_lists_a_special_case_and_a_generalisation() -> None:
+    assert undecided() == ["coulomb", "lugre"]
+    assert undecided(windows=1.5) == []
+
+
+@SIDES
+def test_a_poor_model_leaves_twice_the_noise(side: float) -> None:
+    assert undecided(windows=2.0 * side) == (["coulomb", "lugre"] if side > 1 else [])
+    assert undecided(windows=2.0) == []
+
+
+@SIDES
+def test_a_special_case_gains_nine_tenths_and_runs_a_tenth_worse_at_most(side: float) -> None:
+    assert ("coulomb" in undecided(special={"held_out": 800.0, "train": 1000.0 * side})) is (side > 1)
+    assert ("coulomb" in undecided(special={"windows": 5.0 * np.exp(0.1 * side)})) is (side < 1)
+
+
+@SIDES
+def test_a_generalisation_is_preferred_by_both_kinds_of_data_and_runs_a_tenth_worse_at_most(
+    side: float,
+) -> None:
+    assert ("lugre" in undecided(general={"train": 1000.0 + side * MORE_NEEDED})) is (side > 1)
+    assert ("lugre" in undecided(general={"held_out": 1000.0 + 10.0 * (side - 1.0)})) is (side > 1)
+    assert ("lugre" in undecided(general={"windows": 5.0 * np.exp(0.1 * side)})) is (side < 1)
+    # No better on validation data is not preferred, whatever training data say.
+    assert undecided(general={"held_out": 1000.0, "train": 5000.0}) == ["coulomb"]
+
+
+def test_generalisations_of_what_was_found_before_are_noted_once(monkeypatch) -> None:
+    """Nor is a special case beside it one of them, though nothing distinguishes the two models."""
+    monkeypatch.setattr(forward_selection, "parameter_count", lambda *_: 3)
+    beside = trial(None, 1000.0, 1000.0, 5.0)
+    same = trial(COULOMB, 1000.0, 1000.0, 5.0)
+    richer = trial(LUGRE, 1010.0, 1100.0, 5.0, numbers=5)
+    state: Any = SimpleNamespace(
+        problem=SimpleNamespace(supermodel=None, noise=NOISE, dataset=SimpleNamespace(data=DATA)),
+        current=beside,
+        scores={STRIBECK: 1.0, DRAG: 1.0},
+        rivals={STRIBECK: [ARM], DRAG: []},
+    )
+    for _ in range(2):
+        forward_selection._note_generalisations(state, [same, richer])
+    assert state.rivals == {STRIBECK: [ARM, LUGRE], DRAG: []}
+
+
+@pytest.mark.parametrize("windows", [1.9, 2.1])
+@pytest.mark.parametrize("found", [[STRIBECK], [STRIBECK, DRAG]], ids=["alone", "beside another"])
+def test_other_laws_of_one_friction_remain_only_in_a_poor_model(monkeypatch, windows, found) -> None:
+    """Put in its place, such a law is refused by free runs alone, another effect by the likelihood too."""
+    final = trial(None, 1000.0, 1000.0, windows)
+    in_place = {
+        LUGRE: trial(None, 900.0, 900.0, 1.09 * windows),
+        COULOMB: trial(None, 900.0, 900.0, 1.12 * windows),
+        ARM: trial(None, 900.0, 900.0, windows),
+        EffectLocation("dahl", "arm"): trial(None, 1000.0, 1000.0, windows),
+    }
+    candidates = dict.fromkeys(in_place, SimpleNamespace(probes=(((1.0,),),)))
+    problem: Any = SimpleNamespace(supermodel=SimpleNamespace(candidates=candidates), noise=NOISE)
+    monkeypatch.setattr(stepwise, "without", lambda s, h, location: h)
+    monkeypatch.setattr(stepwise, "with_effect", lambda s, h, start, share: start.location)
+    monkeypatch.setattr(stepwise, "refit", lambda problem, swapped: swapped)
+    monkeypatch.setattr(stepwise, "validate", lambda validation, h: in_place.get(h, final))
+    rivals = {STRIBECK: [*in_place, DRAG], DRAG: []}
+    left = stepwise.remaining_rivals(problem, None, None, rivals, found).alike[STRIBECK]  # pyright: ignore[reportArgumentType]
+    alone, poor = found == [STRIBECK], windows > 2
+    expected = [LUGRE] * poor + [COULOMB] * (poor and alone) + [ARM] * alone + [EffectLocation("dahl", "arm")]
+    assert left == expected + [DRAG] * alone

@@ -256,7 +256,7 @@ def fit(
     options = FitOptions(asked, local, first, window_seconds, max_steps)
     with double_precision():
         end = problem.solve([names.index(n) for n in local], process_noise, window_seconds)
-        if robust is not None:
+        if robust is not None and np.isfinite(end.cost):
             problem, end = problem.robust(end, robust)
             assert problem.bend is not None
             options = dataclasses.replace(options, bend=tuple(problem.bend.tolist()))

@@ -68,8 +68,9 @@ def _channel(
         above.plot(*thinned(t, run), color=colour, lw=1.1, label=label)
         below.plot(*thinned(t, measured - run), color=colour, lw=0.9)
     for ax, (low, high) in zip((above, below), _limits(measured), strict=True):
-        shown = ax.get_ylim()
-        ax.set_ylim(max(shown[0], low), min(shown[1], high))
+        bottom, top = ax.get_ylim()
+        outside = bottom > high or top < low
+        ax.set_ylim(*(low, high) if outside else (max(bottom, low), min(top, high)))
     above.margins(x=0)
     above.set_ylabel(f"{channel} [{read}]")
     below.set_ylabel(f"error [{read}]")
