@@ -661,7 +661,7 @@ MORE_NEEDED = selection.TRAIN_NATS + np.log(2 * N)  # of two further parameters
 
 def undecided(windows: float = 5.0, special: dict | None = None, general: dict | None = None) -> list[str]:
     """What is listed beside Stribeck friction, of Coulomb friction, LuGre's and friction elsewhere."""
-    lead = {"held_out": 1000.0, "train": 1000.0, "windows": windows}
+    lead: dict[str, Any] = {"held_out": 1000.0, "train": 1000.0, "windows": windows}
     winner = trial(STRIBECK, **lead, numbers=3)
     others = [
         trial(ARM, **lead),
@@ -678,6 +678,10 @@ def undecided(windows: float = 5.0, special: dict | None = None, general: dict |
 def test_a_poor_model_lists_a_special_case_and_a_generalisation() -> None:
     assert undecided() == ["coulomb", "lugre"]
     assert undecided(windows=1.5) == []
+    # Near the noise not even one that nothing distinguishes: the choice is for the simpler of two such laws.
+    winner, same = trial(STRIBECK, 200.0, 200.0, 1.5, numbers=3), trial(COULOMB, 200.0, 200.0, 1.5)
+    assert not distinguished(winner, same)
+    assert selection.undecided_laws(winner, [same, winner], BASE, DATA, NOISE) == []
 
 
 @SIDES

@@ -13,10 +13,10 @@ from rotflex_jax.mechanism import Exponential, Mechanism, Solver, kalman_gains, 
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.inactive_laws import (
     Laws,
-    friction_answers,
-    is_heard,
+    adds_to_step,
+    friction_responses,
     law_sensitivities,
-    run_answers,
+    run_responses,
 )
 from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
 from rotflex_jax.mechanism.simulate import PredictorStep, prepared_run, read_outputs, restarts
@@ -92,7 +92,7 @@ class Run:
 def test_slopes_are_those_of_the_model_with_the_effect(case: str) -> None:
     """At a contact of its own: another one without a level is no part of the model that a refit fits."""
     joint, solver, effect = CASES[case]
-    assert is_heard(effect, joint.structure, solver)
+    assert adds_to_step(effect, joint.structure, solver)
     run, values = Run.of(joint, solver), np.array(list(effect.values.values()))
     ways = np.array([[1.0 * (n == a) for n in effect.values] for a in effect.amplitudes])
     # The sum as well, which two directions make up.
@@ -105,14 +105,14 @@ def test_slopes_are_those_of_the_model_with_the_effect(case: str) -> None:
         numbers = RunParameters(jnp.asarray(joint.values), gates, jnp.asarray(run.x0), jnp.asarray(run.K))
         samples = RecordingSamples(*map(jnp.asarray, (run.u, run.y, run.seen, Ts, run.window)))
         structure, smooth = joint.structure, isinstance(effect, fx.Force | fx.Memory)
-        answers = run_answers(structure, solver, (effect.at,) if smooth else (), numbers, samples)
-        heard = answers.torques
-        if heard is None:
-            ports = ("arm", effect.at)  # another contact that listens changes nothing
-            found = friction_answers(structure, solver, ports, numbers, samples, answers.run.X)
-            heard = jax.tree.map(lambda a: a[:, 1:], found)
+        responses = run_responses(structure, solver, (effect.at,) if smooth else (), numbers, samples)
+        at_ports = responses.torques
+        if at_ports is None:
+            ports = ("arm", effect.at)  # another contact without a level changes nothing
+            found = friction_responses(structure, solver, ports, numbers, samples, responses.run.X)
+            at_ports = jax.tree.map(lambda a: a[:, 1:], found)
         laws = Laws((jnp.asarray(values[None]),), (jnp.asarray(ways[None]),))
-        return law_sensitivities((effect,), (effect.at,), laws, samples, answers, heard)
+        return law_sensitivities((effect,), (effect.at,), laws, samples, responses, at_ports)
 
     with double_precision():
         slope = jax.vmap(lambda way: jax.jvp(lambda p: run.outputs(effect, p), (values,), (way,))[1])
