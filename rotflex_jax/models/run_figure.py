@@ -16,7 +16,7 @@ from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.plotting import blank, styled, thinned
 from rotflex_jax.text.zoom import Line, LinePanel, LineView
 
-# A model that runs away must not hide what was measured: scales go no further than so many spans of it.
+# A model that diverges must not hide what was measured: scales go no further than so many spans of it.
 MOST_SPANS, MOST_ERROR_SPANS = 2.0, 3.0
 
 
