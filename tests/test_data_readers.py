@@ -227,6 +227,10 @@ def test_a_servo_log_with_a_gap_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text(json.dumps(run))
     with pytest.raises(InputError, match="without a gap"):
         load_bam_xl330(tmp_path / "run.json")
+    run["entries"] = [entry for entry in run["entries"] if not entry["torque_enable"]]
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    with pytest.raises(InputError, match="torque is off in the first sample"):
+        load_bam_xl330(tmp_path / "run.json")
     (tmp_path / "run.json").write_text("t,u\n0,1")
     with pytest.raises(InputError, match="cannot be read as a log"):
         load_bam_xl330(tmp_path / "run.json")

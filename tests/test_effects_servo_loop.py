@@ -237,3 +237,6 @@ def test_simulators_get_the_motion_and_the_certificate_names_the_rest():
     for text in ("current: the current at hub", "duty: the duty at hub", "integral of 3"):
         assert text in said
     assert exported.certificate.channels == ("theta",)
+    # What a sensor makes of a reading that is left out goes with it.
+    calibrated = pid(PARTS) + fx.SensorGain("current", 1.1)
+    assert rf.export.to_urdf(calibrated, Ts=TS).content == exported.content

@@ -13,10 +13,10 @@ from rotflex_jax.mechanism import Exponential, Mechanism, Solver, kalman_gains, 
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.inactive_laws import (
     Laws,
-    friction_answers,
-    is_heard,
+    adds_to_step,
+    friction_responses,
     law_sensitivities,
-    run_answers,
+    run_responses,
 )
 from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
 from rotflex_jax.mechanism.simulate import PredictorStep, prepared_run, read_outputs, restarts
@@ -27,11 +27,19 @@ Ts, N = 0.004, 150
 ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 JOINT = paper(joint_damping=1e-3)
 RUBBING = JOINT + fx.Coulomb("hub", 0.03) + fx.CubicSpring("joint", 4.0)
+LOADED = JOINT + fx.LoadFriction("hub", level=0.01, driving=0.2, driven=0.1, of="motor")
+SERVO = JOINT.without("motor", "hub") + fx.PidServo("hub", torque_constant=0.3, resistance=3.0, integral=4.0)
 CASES = {
     "a second contact": (RUBBING, Exponential(), fx.Stribeck("joint", 0.0, 0.0, 0.4)),
     "the same contact": (RUBBING, Exponential(passes=2), fx.CoulombAsymmetric("hub", 0.0, 0.0)),
     "a torque, order 4": (RUBBING, Exponential(order=4), fx.Gravity("arm", 0.0, 0.0)),
     "a memory": (RUBBING, Exponential(), fx.LuGre("joint", level=0.0, damping=0.0)),
+    "a torque beside friction by the motor's torque": (LOADED, Exponential(), fx.Gravity("arm", 0.0, 0.0)),
+    "a memory beside a servo whose current is read": (
+        SERVO + fx.CurrentMeter("hub") + fx.Coulomb("hub", 0.03),
+        Exponential(),
+        fx.LuGre("joint", level=0.0, damping=0.0),
+    ),
     "beside play": (JOINT + fx.Backlash("hub", 0.02), Exponential(), fx.Gravity("arm", 0.0, 0.0)),
 }
 
@@ -84,7 +92,7 @@ class Run:
 def test_slopes_are_those_of_the_model_with_the_effect(case: str) -> None:
     """At a contact of its own: another one without a level is no part of the model that a refit fits."""
     joint, solver, effect = CASES[case]
-    assert is_heard(effect, joint.structure, solver)
+    assert adds_to_step(effect, joint.structure, solver)
     run, values = Run.of(joint, solver), np.array(list(effect.values.values()))
     ways = np.array([[1.0 * (n == a) for n in effect.values] for a in effect.amplitudes])
     # The sum as well, which two directions make up.
@@ -97,14 +105,14 @@ def test_slopes_are_those_of_the_model_with_the_effect(case: str) -> None:
         numbers = RunParameters(jnp.asarray(joint.values), gates, jnp.asarray(run.x0), jnp.asarray(run.K))
         samples = RecordingSamples(*map(jnp.asarray, (run.u, run.y, run.seen, Ts, run.window)))
         structure, smooth = joint.structure, isinstance(effect, fx.Force | fx.Memory)
-        answers = run_answers(structure, solver, (effect.at,) if smooth else (), numbers, samples)
-        heard = answers.torques
-        if heard is None:
-            ports = ("arm", effect.at)  # another contact that listens changes nothing
-            found = friction_answers(structure, solver, ports, numbers, samples, answers.run.X)
-            heard = jax.tree.map(lambda a: a[:, 1:], found)
+        responses = run_responses(structure, solver, (effect.at,) if smooth else (), numbers, samples)
+        at_ports = responses.torques
+        if at_ports is None:
+            ports = ("arm", effect.at)  # another contact without a level changes nothing
+            found = friction_responses(structure, solver, ports, numbers, samples, responses.run.X)
+            at_ports = jax.tree.map(lambda a: a[:, 1:], found)
         laws = Laws((jnp.asarray(values[None]),), (jnp.asarray(ways[None]),))
-        return law_sensitivities((effect,), (effect.at,), laws, samples, answers, heard)
+        return law_sensitivities((effect,), (effect.at,), laws, samples, responses, at_ports)
 
     with double_precision():
         slope = jax.vmap(lambda way: jax.jvp(lambda p: run.outputs(effect, p), (values,), (way,))[1])

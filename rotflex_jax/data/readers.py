@@ -301,6 +301,11 @@ def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
         actuators, arXiv 2410.08650.
     """
     log = _bam_log(path)
+    if not log.on[0]:
+        raise InputError(
+            f"{log.file} must begin with the torque on, but its torque is off in the first sample; "
+            "take another run, or read it by load_bam_xl330_released."
+        )
     end = len(log.on) if log.on.all() else int(np.argmin(log.on))
     note = "" if end == len(log.on) else ", up to where the torque is off"
     return log.recording(slice(0, end), note, {})

@@ -23,13 +23,13 @@ from rotflex_jax.fit.problem import each_recording
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.inactive_laws import (
-    Heard,
     Laws,
-    RunAnswers,
-    friction_answers,
-    is_heard,
+    PortResponses,
+    RunResponses,
+    adds_to_step,
+    friction_responses,
     law_sensitivities,
-    run_answers,
+    run_responses,
     signal_sensitivities,
 )
 from rotflex_jax.mechanism.sensitivities import (
@@ -48,33 +48,33 @@ MOST_LINES = 2
 
 
 @persistent_jit(static=3, runs_rarely=True)
-def _run_answers(
+def _run_responses(
     structure: Mechanism,
     solver: Solver,
     ports: tuple[str, ...],
     parameter_set: ParameterSet,
     samples: ProgramSamples,
-) -> RunAnswers:
-    def one(values: Any, x0: Any, K: Any, *samples: Any) -> RunAnswers:
+) -> RunResponses:
+    def one(values: Any, x0: Any, K: Any, *samples: Any) -> RunResponses:
         numbers = RunParameters(values, parameter_set.gates, x0, K)
-        return run_answers(structure, solver, ports, numbers, RecordingSamples(*samples))
+        return run_responses(structure, solver, ports, numbers, RecordingSamples(*samples))
 
     p, (data, window, _) = parameter_set, samples
     return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
 
 
 @persistent_jit(static=3, runs_rarely=True)
-def _friction_answers(
+def _friction_responses(
     structure: Mechanism,
     solver: Solver,
     ports: tuple[str, ...],
     parameter_set: ParameterSet,
     samples: ProgramSamples,
     X: jax.Array,
-) -> Heard:
-    def one(values: Any, x0: Any, K: Any, X: Any, *samples: Any) -> Heard:
+) -> PortResponses:
+    def one(values: Any, x0: Any, K: Any, X: Any, *samples: Any) -> PortResponses:
         numbers = RunParameters(values, parameter_set.gates, x0, K)
-        return friction_answers(structure, solver, ports, numbers, RecordingSamples(*samples), X)
+        return friction_responses(structure, solver, ports, numbers, RecordingSamples(*samples), X)
 
     p, (data, window, _) = parameter_set, samples
     return each_recording(one, (0,) * 9)(p.values, p.x0, p.K, X, *data, window)
@@ -86,14 +86,14 @@ def _law_slopes(
     ports: tuple[str, ...],
     laws: Laws,
     samples: ProgramSamples,
-    answers: RunAnswers,
-    heard: Heard,
+    responses: RunResponses,
+    at_ports: PortResponses,
 ) -> jax.Array:
-    def one(answers: Any, heard: Any, *samples: Any) -> jax.Array:
-        return law_sensitivities(effects, ports, laws, RecordingSamples(*samples), answers, heard)
+    def one(responses: Any, at_ports: Any, *samples: Any) -> jax.Array:
+        return law_sensitivities(effects, ports, laws, RecordingSamples(*samples), responses, at_ports)
 
     data, window, _ = samples
-    J = each_recording(one, (0,) * 7, out_axes=1)(answers, heard, *data, window)
+    J = each_recording(one, (0,) * 7, out_axes=1)(responses, at_ports, *data, window)
     return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
 
 
@@ -105,15 +105,15 @@ def _signal_slopes(
     gates: jax.Array,
     directions: Directions,
     samples: ProgramSamples,
-    answers: RunAnswers,
+    responses: RunResponses,
 ) -> jax.Array:
-    def one(values: Any, dvalues: Any, answers: Any, *samples: Any) -> jax.Array:
+    def one(values: Any, dvalues: Any, responses: Any, *samples: Any) -> jax.Array:
         ways = (values, gates, dvalues, directions.gates)
-        return signal_sensitivities(structure, solver, *ways, RecordingSamples(*samples), answers)
+        return signal_sensitivities(structure, solver, *ways, RecordingSamples(*samples), responses)
 
     data, window, _ = samples
     axes = (1, 1, *(0,) * 6)
-    J = each_recording(one, axes, out_axes=1)(values, directions.values, answers, *data, window)
+    J = each_recording(one, axes, out_axes=1)(values, directions.values, responses, *data, window)
     return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
 
 
@@ -176,7 +176,7 @@ class Probe:
 def _packed(probes: Sequence[Probe]) -> list[list[Probe]]:
     """Probes that share a parameter set: as many as it has directions, of each candidate one shape only."""
     batches: list[list[Probe]] = []
-    # Those with most shapes need most batches, and the others find room in these.
+    # Those with most shapes need most batches, which the others fill.
     ordered = sorted(probes, key=lambda p: -len(p.candidate.probes))
     for _, group in itertools.groupby(ordered, key=lambda p: (p.candidate.location, p.shape)):
         own = list(group)
@@ -237,7 +237,7 @@ class Slopes(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Kinds:
-    """Candidates by how a run answers to them.
+    """Candidates by how a run responds to them.
 
     Attributes:
         laws: Laws at ports, by what they add; those of the hypothesis too, so that an effect that is found
@@ -259,7 +259,7 @@ class _Kinds:
             if c.threshold:
                 continue
             at_port = e.acts_on == "port"
-            if not is_heard(e, active.mechanism.structure, solver) or (at_port and c.line is not None):
+            if not adds_to_step(e, active.mechanism.structure, solver) or (at_port and c.line is not None):
                 found.others.extend([c] * absent)
             elif at_port:
                 kind = "friction" if e.dry_contact else e.state_part or "torque"
@@ -282,7 +282,7 @@ def candidate_sensitivities(
 ) -> list[Slopes]:
     """Slopes of innovations along candidates that are not active.
 
-    Programs have room for all candidates that are absent, so that a line that comes or goes compiles nothing.
+    Programs are made for all candidates that are absent, so that a line that comes or goes compiles nothing.
 
     Args:
         predictor: Runs hypotheses.
@@ -299,7 +299,7 @@ def candidate_sensitivities(
     kinds, asked = _Kinds.of(s, active, solver), {c.location: c for c in tried}
     with double_precision():
         inputs, samples = predictor.restrict(current, active), predictor.on_device(window)
-        answers = _run_answers(structure, solver, kinds.ports(friction=False), inputs, samples)
+        responses = _run_responses(structure, solver, kinds.ports(friction=False), inputs, samples)
     cut = lambda J, listed: np.asarray(J)[: len(listed), :, : window.shape[1]]  # noqa: E731
 
     def along_laws(kind: str) -> Slopes:
@@ -309,10 +309,12 @@ def candidate_sensitivities(
         listed = [p for group in own for p in group]
         effects = tuple(s.mechanism.structure.effects[c.effect] for c in family)
         with double_precision():
-            heard, laws = answers.torques, jax.tree.map(jnp.asarray, _laws(own))
+            at_ports, laws = responses.torques, jax.tree.map(jnp.asarray, _laws(own))
             if kind == "friction":
-                heard = _friction_answers(structure, solver, ports, inputs, samples, answers.run.X)
-            return Slopes(listed, cut(_law_slopes(effects, ports, laws, samples, answers, heard), listed))
+                at_ports = _friction_responses(structure, solver, ports, inputs, samples, responses.run.X)
+            return Slopes(
+                listed, cut(_law_slopes(effects, ports, laws, samples, responses, at_ports), listed)
+            )
 
     def along_signals() -> Slopes:
         model = s.with_family(current.gates, kinds.signals)
@@ -324,7 +326,7 @@ def candidate_sensitivities(
         along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
         with double_precision():
             values, gates = (jnp.array([getattr(p, what) for p in points]) for what in ("values", "gates"))
-            given = (values, gates, along, samples, answers)
+            given = (values, gates, along, samples, responses)
             return Slopes(listed, cut(_signal_slopes(model.mechanism.structure, solver, *given), listed))
 
     def along_others(family: Sequence[Candidate], listed: Sequence[Probe]) -> Slopes:
@@ -335,7 +337,7 @@ def candidate_sensitivities(
         inactive = tuple(model.effects.index(c.effect) for c in family)
         with double_precision():
             present = jnp.array([model.states.index(i) for i in active.states])
-            given = (inputs, present, answers.run, along, samples)
+            given = (inputs, present, responses.run, along, samples)
             return Slopes(
                 listed, cut(_inactive_slopes(model.mechanism.structure, solver, inactive, *given), listed)
             )

@@ -13,8 +13,8 @@ from rotflex_jax.discover.selection import (
     choose,
     describe,
     horizon_gains,
-    related,
     replaced_by,
+    undecided_generalisations,
     undecided_laws,
     validate_from_best_states,
 )
@@ -143,13 +143,12 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
 
 
 def _note_generalisations(state: SearchState, candidates: Sequence[ValidatedHypothesis]) -> None:
-    """Notes generalisations of effects found before, refitted in this round, that no data decide against."""
+    """Note generalisations of effects found before, refitted in this round, that no data decide against."""
     s, h = state.problem.supermodel, state.current.hypothesis
     for location in state.scores:
         count = parameter_count(s, h, location)
         known = dataclasses.replace(state.current, location=location, parameter_count=count)
-        general = [c for c in candidates if c.location and related(location, c.location)]
-        more = undecided_laws(known, general, known, state.problem.dataset.data, state.problem.noise)
+        more = undecided_generalisations(known, candidates, state.problem.dataset.data, state.problem.noise)
         rivals = state.rivals[location]
         rivals += [c.location for c in more if c.location and c.location not in rivals]
 

@@ -228,7 +228,8 @@ def _simplify(state: SearchState) -> None:
         state.in_place_of[one.effect] = one.simpler
         order = [one.effect if p == one.simpler else p for p in order if p not in one.replaced[1:]]
         state.merged = one.validated
-        rivals[one.effect] = [*rivals.get(one.simpler, []), *(one.replaced if one.same_count else ())]
+        before = [p for p in rivals.get(one.simpler, []) if p != one.effect]
+        rivals[one.effect] = [*before, *(one.replaced if one.same_count else ())]
     state.order, state.own, state.notes, state.rivals = order, assigned.own, notes, rivals
     state.final = correct_discretisation_bias(problem, final)
 

@@ -206,7 +206,7 @@ def undecided_laws(
     can tell, a generalisation where training and validation data both prefer it, though not beyond doubt.
 
     Args:
-        winner: Effect that is going to be added, or the model that has it already, with its location.
+        winner: Effect that is going to be added.
         candidates: What was refitted beside the same model.
         current: The model without it.
         data: Training recordings.
@@ -214,12 +214,21 @@ def undecided_laws(
     """
     if not np.any(best_window_rmse(winner) > 2 * noise):
         return []
-    special = [t for t in candidates if t is not winner and _contained(t, winner)]
-    general = [t for t in candidates if t is not winner and _contained(winner, t)]
-    return [
-        *(t for t in special if _alike(winner, t, current, noise)),
-        *(t for t in general if prefers(t, winner, data) and not free_runs_apart(winner, t)),
-    ]
+    special = [t for t in candidates if _contained(t, winner) and _alike(winner, t, current, noise)]
+    return [*special, *undecided_generalisations(winner, candidates, data, noise)]
+
+
+def undecided_generalisations(
+    known: ValidatedHypothesis,
+    candidates: Sequence[ValidatedHypothesis],
+    data: StackedRecordings,
+    noise: Float[np.ndarray, " C"],
+) -> list[ValidatedHypothesis]:
+    """The generalisations among `undecided_laws`; arguments as there, `known` has its effect already."""
+    if not np.any(best_window_rmse(known) > 2 * noise):
+        return []
+    general = [t for t in candidates if _contained(known, t)]
+    return [t for t in general if prefers(t, known, data) and not free_runs_apart(known, t)]
 
 
 def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:

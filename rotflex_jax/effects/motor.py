@@ -502,6 +502,10 @@ class Meter(Memory):
         """No torque [N m]."""
         return 0.0 * drive
 
+    def sentence(self) -> str:
+        """In words."""
+        return f"the reading of the {self.shows} follows the motor at the {self.at} within {self.time:.3g} s"
+
 
 @register
 @dataclasses.dataclass(frozen=True)
@@ -534,10 +538,6 @@ class CurrentMeter(Meter):
         """A motor that says its torque per current."""
         return ("motor whose current is known",)
 
-    def sentence(self) -> str:
-        """In words."""
-        return f"the reading of the current follows the motor at the {self.at} within {self.time:.3g} s"
-
 
 @register
 @dataclasses.dataclass(frozen=True)
@@ -566,7 +566,3 @@ class DutyMeter(Meter):
     def needs(cls) -> tuple[str, ...]:
         """A servo, whose firmware has a duty."""
         return ("servo",)
-
-    def sentence(self) -> str:
-        """In words."""
-        return f"the reading of the duty follows the servo at the {self.at} within {self.time:.3g} s"

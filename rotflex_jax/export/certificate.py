@@ -150,7 +150,8 @@ class Subject:
         others = {c: pair for (c, pair), q in zip(m.outputs, m.quantities, strict=True) if q.of_motion}
         if len(others) == len(m.outputs):
             return self
-        effects = tuple(e for e in m.effects if not (isinstance(e, Memory) and e.shows))
+        reads = lambda e: e.acts_on == "channel" and e.at not in others  # noqa: E731
+        effects = tuple(e for e in m.effects if not (reads(e) or (isinstance(e, Memory) and e.shows)))
         left_out = tuple(f"{c}: the {what} at {port}" for c, (port, what) in m.outputs if c not in others)
         names = {f"{e.at}.{e.name}.{n}" for e in effects for n in e.values}
         reduced = dataclasses.replace(m, effects=effects, outputs=others, trusted=m.trusted & names)

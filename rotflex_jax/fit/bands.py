@@ -324,10 +324,11 @@ def _unseen(
         A root of their covariance, without columns where nothing is spread.
     """
     X = model.simulate_states(recording)
+    if recording.continues is not None or not np.isfinite(X).all():
+        return np.zeros((len(start) - moving, 0))
     n = moving // 2
     speed = np.sqrt(np.mean(np.square(X[:, n:moving]), axis=0))
-    resting = bool(np.all(np.abs(start[n:moving]) < AT_REST * speed))
-    if resting or recording.continues is not None or not np.isfinite(X).all():
+    if np.all(np.abs(start[n:moving]) < AT_REST * speed):
         return np.zeros((len(start) - moving, 0))
     error = X[:, moving:] - start[moving:]
     size, axes = np.linalg.eigh(error.T @ error / len(X))

@@ -201,8 +201,8 @@ def fit(
             memories begin as a run over the whole recording leaves them, as in the errors over windows.
         robust: Errors beyond this many standard deviations count by their size and not by its square, 1.5 for
             instance, where the model is far off for some of the time and should be right for the rest. The
-            standard deviation is told by the median of the errors; `noise` and intervals are those of errors
-            that are bent so. None for squares throughout.
+            standard deviation follows from the median of the errors; `noise` and intervals are those of
+            errors that are bent so. None for squares throughout.
         max_steps: Most iterations of each minimisation, of which there are several.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
@@ -256,7 +256,7 @@ def fit(
     options = FitOptions(asked, local, first, window_seconds, max_steps)
     with double_precision():
         end = problem.solve([names.index(n) for n in local], process_noise, window_seconds)
-        if robust is not None:
+        if robust is not None and np.isfinite(end.cost):
             problem, end = problem.robust(end, robust)
             assert problem.bend is not None
             options = dataclasses.replace(options, bend=tuple(problem.bend.tolist()))

@@ -67,7 +67,7 @@ NEARBY_STARTS, NEARBY = 3, 0.3
 # Of two attempts whose costs differ by less, one that converged is better [nat].
 EQUAL_COST = 0.1
 
-# How often a robust fit tells anew which errors are large.
+# How often a robust fit determines anew which errors are large.
 ROBUST_REPETITIONS = 2
 
 # Standard deviation of a normal number, by the median of its size.
@@ -308,7 +308,7 @@ class GreyBoxProblem:
     def robust(self, end: FitAttempt, beyond: float) -> tuple["GreyBoxProblem", FitAttempt]:
         """The same problem with large errors bent, and its end.
 
-        What is large is told by the median of the errors, which large ones do not move, and told once more
+        What is large follows from the median of the errors, which large ones do not move, and once more
         where that fit ends. The fit begins where that by squares has ended, and where that has begun: large
         errors may have led it elsewhere.
 

@@ -1,11 +1,11 @@
-"""Sensitivities along laws that are inactive: what they would add to a step, and how the run answers.
+"""Sensitivities along laws that are inactive: what they would add to a step, and how the run responds.
 
 A torque, a friction level, a voltage or a reading that an inactive effect would add changes a step by
 
     b[k] = sum over j of G[k, j] s[k, j],
 
-where `s[k, j]` is what its law says at the j-th place of the step where laws are evaluated, and `G` is how
-the state after the step answers to a little more there. `G` belongs to the active model and is formed once
+where `s[k, j]` is the value of its law at the j-th place of the step where laws are evaluated, and `G` is how
+the state after the step responds to a little more there. `G` belongs to the active model and is formed once
 for all laws; each law is evaluated along the run for its own directions alone, without a step around it; and
 one recursion carries all directions side by side,
 
@@ -47,73 +47,73 @@ from rotflex_jax.mechanism.simulate import PredictorStep, Solver, prepared_run, 
 from rotflex_jax.mechanism.step import Exponential, exponential_euler
 
 
-class _Tape:
+class _Evaluations:
     """Where laws are evaluated while one step is traced, in order, and what is added at each place."""
 
     def __init__(self, added: Float[Array, "L *S"] | None = None) -> None:
-        self.added, self.heard = added, []
+        self.added, self.motion = added, []
 
     def __call__(self, *signals: Any) -> Array:
-        self.heard.append(jnp.stack(signals))
-        return jnp.zeros_like(signals[0]) if self.added is None else self.added[len(self.heard) - 1]
+        self.motion.append(jnp.stack(signals))
+        return jnp.zeros_like(signals[0]) if self.added is None else self.added[len(self.motion) - 1]
 
 
 class _Traced(threading.local):
-    tape = _Tape()
+    evaluations = _Evaluations()
 
 
 _traced = _Traced()
 
 
 @contextlib.contextmanager
-def _recorded(tape: _Tape) -> Iterator[None]:
-    _traced.tape = tape
+def _recorded(evaluations: _Evaluations) -> Iterator[None]:
+    _traced.evaluations = evaluations
     try:
         yield
     finally:
-        _traced.tape = _Tape()
+        _traced.evaluations = _Evaluations()
 
 
 @dataclasses.dataclass(frozen=True)
-class ListeningForce(Force):
+class AddedForce(Force):
     """A torque that is given, at a port; it records where a step evaluates it."""
 
-    name: ClassVar[str] = "listening_force"
+    name: ClassVar[str] = "added_force"
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
         """Torque [N m]."""
-        return _traced.tape(position, speed)
+        return _traced.evaluations(position, speed)
 
 
 @dataclasses.dataclass(frozen=True)
-class ListeningFriction(DryFriction):
+class AddedFriction(DryFriction):
     """A friction level that is given, at a port; it records where a step evaluates it."""
 
-    name: ClassVar[str] = "listening_friction"
+    name: ClassVar[str] = "added_friction"
 
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar, *load: Scalar) -> Scalar:
         """Level [N m]."""
-        return _traced.tape(position, speed)
+        return _traced.evaluations(position, speed)
 
 
-Listening = tuple[Mechanism, Solver, tuple[Effect, ...]]
-"""What is active, the integration rule, and what listens beside it."""
+Extended = tuple[Mechanism, Solver, tuple[Effect, ...]]
+"""What is active, the integration rule, and the effects beside it that record evaluations."""
 
 
-class Heard(NamedTuple):
-    """Where a step evaluates laws at some ports, and how it answers to what is added there.
+class PortResponses(NamedTuple):
+    """Where a step evaluates laws at some ports, and how it responds to what is added there.
 
     Attributes:
         motion: Position [rad] and speed [rad/s] of the port at each of the J evaluations.
-        answer: Change of the state after the step per unit that is added there.
+        response: Change of the state after the step per unit that is added there.
     """
 
     motion: Float[Array, "*batch N p J 2"]
-    answer: Float[Array, "*batch N p J n"]
+    response: Float[Array, "*batch N p J n"]
 
 
-class RunAnswers(NamedTuple):
-    """A predictor run, and how its steps and readings answer to small changes.
+class RunResponses(NamedTuple):
+    """A predictor run, and how its steps and readings respond to small changes.
 
     Attributes:
         run: States and the Jacobians of the steps.
@@ -121,7 +121,7 @@ class RunAnswers(NamedTuple):
         to_voltage: Change of the state after a step per volt.
         to_reading: The same per unit that a sensor reads more.
         readings: Change of the readings per unit of each state.
-        torques: What is heard at the ports; None where nothing listens.
+        torques: Evaluations of torques at the ports; None where no port is asked for.
     """
 
     run: LinearisedRun
@@ -129,10 +129,10 @@ class RunAnswers(NamedTuple):
     to_voltage: Float[Array, "*batch N h n"]
     to_reading: Float[Array, "*batch N C n"]
     readings: Float[Array, "*batch N C n"]
-    torques: Heard | None
+    torques: PortResponses | None
 
 
-def is_heard(effect: Effect, structure: Mechanism, solver: Solver) -> bool:
+def adds_to_step(effect: Effect, structure: Mechanism, solver: Solver) -> bool:
     """Whether the law of an inactive effect is of the form above, beside what is active.
 
     Args:
@@ -158,13 +158,13 @@ def _has_load(structure: Mechanism) -> bool:
     return any(e.loaded for _, e in effects_of(structure, DryFriction))
 
 
-def run_answers(
+def run_responses(
     structure: Mechanism,
     solver: Solver,
     ports: tuple[str, ...],
     parameters: RunParameters,
     samples: RecordingSamples,
-) -> RunAnswers:
+) -> RunResponses:
     """A predictor run, with what the laws of inactive effects need to know of it.
 
     Args:
@@ -180,47 +180,49 @@ def run_answers(
     x0, measured = samples.started_at(parameters.x0)
     X = states(PredictorStep(structure, solver), x0, (v, *measured), (c, parameters.K))
     n, C = X.shape[1], samples.y.shape[1]
-    listening = structure, solver, tuple(ListeningForce(p) for p in ports)
-    motion, answers = _answers(listening, parameters, samples, X, laws_alone=False)
-    h = answers.shape[1] - n - C - motion.shape[1]
-    A, to_voltage, to_measured, to_torque = jnp.split(answers, (n, n + h, n + h + C), axis=1)
-    heard = _by_port(motion, to_torque, 1, len(ports)) if ports else None
+    extended = structure, solver, tuple(AddedForce(p) for p in ports)
+    motion, responses = _responses(extended, parameters, samples, X, laws_alone=False)
+    h = responses.shape[1] - n - C - motion.shape[1]
+    A, to_voltage, to_measured, to_torque = jnp.split(responses, (n, n + h, n + h + C), axis=1)
+    at_ports = _by_port(motion, to_torque, 1, len(ports)) if ports else None
     read = lambda x: read_outputs(mechanism, parameters.gates, x)  # noqa: E731
     units = jnp.broadcast_to(jnp.eye(n, dtype=X.dtype)[:, :, None], (n, n, len(X)))
     H = jax.vmap(lambda way: jax.jvp(read, (X.T,), (way,))[1])(units)
-    return RunAnswers(
+    return RunResponses(
         LinearisedRun(X, A),
         v.reshape(len(X), -1),
         to_voltage,
         -to_measured,
         jnp.transpose(H, (2, 1, 0)),
-        heard,
+        at_ports,
     )
 
 
-def friction_answers(
+def friction_responses(
     structure: Mechanism,
     solver: Solver,
     ports: tuple[str, ...],
     parameters: RunParameters,
     samples: RecordingSamples,
     X: Float[Array, "N n"],
-) -> Heard:
-    """How a run through states X answers to friction levels at some ports; arguments as in `run_answers`.
+) -> PortResponses:
+    """How a run through states X responds to friction levels at some ports; arguments as in `run_responses`.
 
     Evaluations against positive and against negative motion alternate.
     """
     # One contact beside those that are active: others without a level change nothing but the effort.
-    heard: list[Heard] = []
+    at_ports: list[PortResponses] = []
     for p in ports:
-        listening = structure, solver, (ListeningFriction(p),)
-        count = heard[0].motion.shape[2] if heard else None
-        found = _answers(listening, parameters, samples, X, laws_alone=True, count=count)
-        heard.append(_by_port(*found, 2, 1))
-    return jax.tree.map(lambda *each: jnp.concatenate(each, axis=1), *heard)
+        extended = structure, solver, (AddedFriction(p),)
+        count = at_ports[0].motion.shape[2] if at_ports else None
+        found = _responses(extended, parameters, samples, X, laws_alone=True, count=count)
+        at_ports.append(_by_port(*found, 2, 1))
+    return jax.tree.map(lambda *each: jnp.concatenate(each, axis=1), *at_ports)
 
 
-def _by_port(motion: Float[Array, "N L 2"], answers: Float[Array, "N L n"], kinds: int, ports: int) -> Heard:
+def _by_port(
+    motion: Float[Array, "N L 2"], responses: Float[Array, "N L n"], kinds: int, ports: int
+) -> PortResponses:
     """Evaluations port by port: a step makes those of one kind in the order of the ports."""
 
     def sorted_(a: Array) -> Array:
@@ -228,46 +230,46 @@ def _by_port(motion: Float[Array, "N L 2"], answers: Float[Array, "N L n"], kind
         rounds = a.reshape(N, L // (ports * kinds), ports, kinds, width)
         return jnp.swapaxes(rounds, 1, 2).reshape(N, ports, L // ports, width)
 
-    return Heard(sorted_(motion), sorted_(answers))
+    return PortResponses(sorted_(motion), sorted_(responses))
 
 
-def _answers(
-    listening: Listening,
+def _responses(
+    extended: Extended,
     parameters: RunParameters,
     samples: RecordingSamples,
     X: Float[Array, "N n"],
     laws_alone: bool,
     count: int | None = None,
 ) -> tuple[Float[Array, "N L 2"], Float[Array, "N _ n"]]:
-    """Motion at the L evaluations of listeners, and how the state after each step answers to small changes.
+    """Motion at the L evaluations of added effects, and how the state after a step responds to changes.
 
-    These are changes of the state before it, of the voltage, of what is measured and of what listeners give,
-    in this order, or of the last alone.
+    These are changes of the state before it, of the voltage, of what is measured and of what the added
+    effects give, in this order, or of the last alone.
 
     Args:
-        listening: The step.
-        parameters: Of its structure without the listeners.
+        extended: The step.
+        parameters: Of its structure without the added effects.
         samples: The recording.
         X: States.
-        laws_alone: Whether only changes of what listeners give are asked for.
+        laws_alone: Whether only changes of what added effects give are asked for.
         count: Number of evaluations L, where it is known.
     """
-    structure, solver, listeners = listening
-    structure = dataclasses.replace(structure, effects=(*structure.effects, *listeners)).structure
-    gates = jnp.concatenate([parameters.gates, jnp.ones(len(listeners), parameters.gates.dtype)])
+    structure, solver, added_effects = extended
+    structure = dataclasses.replace(structure, effects=(*structure.effects, *added_effects)).structure
+    gates = jnp.concatenate([parameters.gates, jnp.ones(len(added_effects), parameters.gates.dtype)])
     _, v, c = prepared_run(structure, solver, parameters.values, gates, samples.u, samples.Ts)
     _, measured = samples.started_at(parameters.x0)
     step, constants = PredictorStep(structure, solver), (c, parameters.K)
 
-    def heard(x: Array, v: Array, y: Array, rest: Any, added: Array | None) -> tuple[Array, list[Array]]:
-        tape = _Tape(added)
-        with _recorded(tape):
-            return step(x, (v, y, *rest), constants), tape.heard
+    def evaluated(x: Array, v: Array, y: Array, rest: Any, added: Array | None) -> tuple[Array, list[Array]]:
+        record = _Evaluations(added)
+        with _recorded(record):
+            return step(x, (v, y, *rest), constants), record.motion
 
     def here(piece: Any) -> tuple[Array, Array]:
         x, v, y, rest = piece
         S = x.shape[-1]
-        evaluations = count or len(jax.eval_shape(lambda: heard(x, v, y, rest, None))[1])
+        evaluations = count or len(jax.eval_shape(lambda: evaluated(x, v, y, rest, None))[1])
         none = jnp.zeros((evaluations, S), x.dtype)
         moved = [none] if laws_alone else [x, v, y, none]
         sizes = [a.size // S for a in moved]
@@ -279,7 +281,7 @@ def _answers(
 
         def f(*moved: Array) -> tuple[Array, Array]:
             at = (x, v, y) if laws_alone else moved[:3]
-            end, motion = heard(at[0], at[1], at[2], rest, moved[-1])
+            end, motion = evaluated(at[0], at[1], at[2], rest, moved[-1])
             return end, jnp.stack(motion) if motion else jnp.zeros((0, 2, S), x.dtype)
 
         def along(*way: Array) -> tuple[Array, Array]:
@@ -289,8 +291,8 @@ def _answers(
         return jax.vmap(along, out_axes=(None, 0))(*ways)
 
     y, *rest = measured
-    motion, answers = jax.lax.map(here, split_into_chunks((X, v, y, rest)))
-    return join_chunks(motion, len(X)), join_chunks(answers, len(X))
+    motion, responses = jax.lax.map(here, split_into_chunks((X, v, y, rest)))
+    return join_chunks(motion, len(X)), join_chunks(responses, len(X))
 
 
 class Laws(NamedTuple):
@@ -310,28 +312,30 @@ def law_sensitivities(
     ports: tuple[str, ...],
     laws: Laws,
     samples: RecordingSamples,
-    answers: RunAnswers,
-    heard: Heard,
+    responses: RunResponses,
+    at_ports: PortResponses,
 ) -> Float[Array, "D N C"]:
     """Derivatives of the predicted outputs along laws at ports: torques, memories or friction levels.
 
     Args:
         effects: All of one kind, without values; static.
-        ports: Where something listens; static.
+        ports: Those of the evaluations; static.
         laws: Their numbers.
         samples: The recording.
-        answers: From `run_answers`.
-        heard: Its torques; of friction what `friction_answers` gives.
+        responses: From `run_responses`.
+        at_ports: Its torques; of friction what `friction_responses` gives.
     """
-    v = answers.voltage[:, 0]
+    v = responses.voltage[:, 0]
     places = [ports.index(e.at) for e in effects]
-    memories = _memories(effects, places, laws, samples, v, heard)
+    memories = _memories(effects, places, laws, samples, v, at_ports)
     forced = []
     for p in range(len(ports)):
         here = [i for i, place in enumerate(places) if place == p]
-        said = [_said(effects[i], heard.motion[:, p], v, laws.values[i], memories[i]) for i in here]
-        forced.append((heard.answer[:, p], jnp.concatenate(said, axis=2)) if here else None)
-    dy = _recursion(answers, [f for f in forced if f is not None])
+        added = [
+            _law_changes(effects[i], at_ports.motion[:, p], v, laws.values[i], memories[i]) for i in here
+        ]
+        forced.append((at_ports.response[:, p], jnp.concatenate(added, axis=2)) if here else None)
+    dy = _recursion(responses, [f for f in forced if f is not None])
     found: list[Any] = [None] * len(effects)
     for p, changes in zip(sorted(set(places)), dy, strict=True):
         here = [i for i, place in enumerate(places) if place == p]
@@ -357,25 +361,25 @@ def _members(e: Effect, along: Float[Array, "S D P"], dy: Float[Array, "N C KS"]
     return each.reshape(-1, *dy.shape[:2])
 
 
-def _said(
+def _law_changes(
     e: Effect,
     motion: Float[Array, "N J 2"],
     v: Float[Array, " N"],
     values: Float[Array, "S P"],
     z: Float[Array, "J N S"] | None,
 ) -> Float[Array, "N J KS"]:
-    """What a law says more at each evaluation along its amplitudes, or at all where it is switched on."""
+    """What a law changes at each evaluation along its amplitudes, or as a whole where it is switched on."""
 
     def at(j: int, values: list[Array], z: Array | None) -> Array:
         law: Any = e.replace(**dict(zip(e.values, values, strict=True)))
         position, speed = motion[:, j, 0], motion[:, j, 1]
         if isinstance(e, DryFriction):
-            said = law.limit(position, speed, 1.0 - 2.0 * (j % 2))
+            value = law.limit(position, speed, 1.0 - 2.0 * (j % 2))
         elif isinstance(e, Memory):
-            said = law.force(z, position, speed, v)
+            value = law.force(z, position, speed, v)
         else:
-            said = law.force(position, speed, v)
-        return jnp.broadcast_to(said, v.shape)
+            value = law.force(position, speed, v)
+        return jnp.broadcast_to(value, v.shape)
 
     def slope(j: int, name: str | None, values: Array, z: Array | None) -> Array:
         each = list(jnp.unstack(values))
@@ -405,13 +409,13 @@ def _memories(
     laws: Laws,
     samples: RecordingSamples,
     v: Float[Array, " N"],
-    heard: Heard,
+    at_ports: PortResponses,
 ) -> list[Float[Array, "2 N S"] | None]:
     """States of memories at both evaluations of each step, by shape; of other effects None."""
     if not all(isinstance(e, Memory) for e in effects):
         return [None] * len(effects)
     # Motion is held in the middle of the step, which is linear in the states at both evaluations.
-    middle = jnp.mean(heard.motion, axis=2)
+    middle = jnp.mean(at_ports.motion, axis=2)
     rest = [
         jnp.full(len(values), e.initial(), v.dtype) for e, values in zip(effects, laws.values, strict=True)
     ]
@@ -444,7 +448,7 @@ def signal_sensitivities(
     dvalues: Float[Array, "D P"],
     dgates: Float[Array, "D E"],
     samples: RecordingSamples,
-    answers: RunAnswers,
+    responses: RunResponses,
 ) -> Float[Array, "D N C"]:
     """Derivatives of the predicted outputs along effects on the voltage and on readings.
 
@@ -456,9 +460,9 @@ def signal_sensitivities(
         dvalues: Directions in the values.
         dgates: Directions in the gates.
         samples: The recording.
-        answers: From `run_answers`.
+        responses: From `run_responses`.
     """
-    X = answers.run.X
+    X = responses.run.X
 
     def voltage(values: Array, gates: Array) -> Array:
         v = motor_voltage(structure.with_values(values), gates, samples.u, samples.Ts)
@@ -472,18 +476,18 @@ def signal_sensitivities(
         return jax.vmap(one, out_axes=-1)(values, gates, dvalues, dgates)
 
     dv, dy = slopes(voltage), slopes(reading)
-    answer = jnp.concatenate([answers.to_voltage, answers.to_reading], axis=1)
-    (later,) = _recursion(answers, [(answer, jnp.concatenate([dv, dy], axis=1))])
+    response = jnp.concatenate([responses.to_voltage, responses.to_reading], axis=1)
+    (later,) = _recursion(responses, [(response, jnp.concatenate([dv, dy], axis=1))])
     return jnp.moveaxis(later + dy, -1, 0)
 
 
 def _recursion(
-    answers: RunAnswers, forced: list[tuple[Float[Array, "N _ n"], Float[Array, "N _ _"]]]
+    responses: RunResponses, forced: list[tuple[Float[Array, "N _ n"], Float[Array, "N _ _"]]]
 ) -> list[Float[Array, "N C _"]]:
     """Changes of the readings under forcings of the run; the directions last, for the vector units.
 
     Args:
-        answers: Of the run.
+        responses: Of the run.
         forced: Answer of the state to some quantities, and what these are along some directions.
     """
 
@@ -495,5 +499,5 @@ def _recursion(
         ]
         return later, [jnp.sum(h[:, :, None] * dx[None], axis=1) for dx in states]
 
-    still = [jnp.zeros((answers.run.A.shape[1], s.shape[2]), s.dtype) for _, s in forced]
-    return jax.lax.scan(body, still, (answers.run.A, answers.readings, forced))[1]
+    still = [jnp.zeros((responses.run.A.shape[1], s.shape[2]), s.dtype) for _, s in forced]
+    return jax.lax.scan(body, still, (responses.run.A, responses.readings, forced))[1]

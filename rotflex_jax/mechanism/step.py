@@ -208,15 +208,17 @@ def motor_beyond_linear(
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = jnp.zeros(x.shape[1:], x.dtype)
-    for i, e in effects_of(mechanism, Force):
-        if isinstance(e, Linear) and e.motor and e.at == at:
+    memories = _states_of_memories(mechanism, z)
+    for i, e in effects_of(mechanism, Linear):
+        if isinstance(e, Force | Memory) and e.motor and e.at == at:
             k = layout.torque_ports.index(at)
-            total = total + gates[i] * _force(e, position[k], speed[k], v)
-    for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
-        if isinstance(e, Linear) and e.motor and e.at == at:
-            k = layout.torque_ports.index(at)
-            total = total + gates[i] * _force(e, z[m], position[k], speed[k], v)
+            total = total + gates[i] * _force(e, *memories.get(i, ()), position[k], speed[k], v)
     return total
+
+
+def _states_of_memories(mechanism: Mechanism, z: Float[Array, "z *S"]) -> dict[int, tuple[Array]]:
+    """Index of each memory among the effects -> its state."""
+    return {i: (z[m],) for m, (i, _) in enumerate(effects_of(mechanism, Memory))}
 
 
 def motor_duty(
@@ -230,11 +232,10 @@ def motor_duty(
     layout = Layout.of(mechanism.structure)
     position, speed = (motion[layout.torque_ports.index(at)] for motion in port_motion(layout, x))
     given: Callable[..., Any] = lambda e, *signals: e.duty(*signals)  # noqa: E731
-    memories = {i: z[m] for m, (i, _) in enumerate(effects_of(mechanism, Memory))}
+    memories = _states_of_memories(mechanism, z)
     for i, e in effects_of(mechanism, Linear):
         if e.at == at and e.has_duty:
-            integral = (memories[i],) if i in memories else ()
-            return evaluate_effect(e, given, position, speed, v, *integral)
+            return evaluate_effect(e, given, position, speed, v, *memories.get(i, ()))
     return jnp.zeros_like(v)
 
 

@@ -16,7 +16,7 @@ from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.plotting import blank, styled, thinned
 from rotflex_jax.text.zoom import Line, LinePanel, LineView
 
-# A model that runs away must not hide what was measured: scales go no further than so many spans of it.
+# A model that diverges must not hide what was measured: scales go no further than so many spans of it.
 MOST_SPANS, MOST_ERROR_SPANS = 2.0, 3.0
 
 
@@ -68,8 +68,9 @@ def _channel(
         above.plot(*thinned(t, run), color=colour, lw=1.1, label=label)
         below.plot(*thinned(t, measured - run), color=colour, lw=0.9)
     for ax, (low, high) in zip((above, below), _limits(measured), strict=True):
-        shown = ax.get_ylim()
-        ax.set_ylim(max(shown[0], low), min(shown[1], high))
+        bottom, top = ax.get_ylim()
+        outside = bottom > high or top < low
+        ax.set_ylim(*(low, high) if outside else (max(bottom, low), min(top, high)))
     above.margins(x=0)
     above.set_ylabel(f"{channel} [{read}]")
     below.set_ylabel(f"error [{read}]")

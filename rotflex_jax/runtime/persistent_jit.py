@@ -219,7 +219,9 @@ def make_ahead(function: Callable[..., Any], *arguments: Any) -> None:
     start_with_fast_loops()
     # A new thread has none of the settings of a context.
     if not _plain() and all(getattr(jax.config, s) is None for s in _SETTINGS[1:]):
-        _ahead().submit(_try, function, arguments)
+        # While the interpreter ends nothing more is taken: the main thread may end before the one that calls.
+        with contextlib.suppress(RuntimeError):
+            _ahead().submit(_try, function, arguments)
 
 
 def _try(function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:

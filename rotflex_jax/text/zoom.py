@@ -44,7 +44,7 @@ class LinePanel:
         lines: What is drawn.
         height: Of the panel [px].
         band: Half width of a grey band around zero; none at 0.
-        limits: What the scale never goes beyond, such as a model that runs away; anything where None.
+        limits: What the scale never goes beyond, such as a run that diverges; anything where None.
     """
 
     label: str
@@ -228,7 +228,7 @@ def extremes(values: Float[np.ndarray, " N"], group: int) -> Float[np.ndarray, "
 
 def encoded(values: Float[np.ndarray, " N"]) -> str:
     """Numbers as 32 bit, low byte first, in base 64."""
-    with np.errstate(over="ignore"):  # what runs away is a gap
+    with np.errstate(over="ignore"):  # what diverges is a gap
         return base64.b64encode(np.asarray(values).astype("<f4").tobytes()).decode("ascii")
 
 

@@ -199,7 +199,8 @@
       const range = (u, low, high) => {
         if (low == null) return [-1, 1];
         const [least, most] = panel.limits || [low, high];
-        const kept = [Math.max(low, least), Math.min(high, most)];
+        const outside = low > most || high < least;
+        const kept = outside ? [least, most] : [Math.max(low, least), Math.min(high, most)];
         return uPlot.rangeNum(kept[0], kept[1], 0.06, false);
       };
       const under = (u) => {
