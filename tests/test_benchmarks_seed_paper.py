@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import expm, toeplitz
 
 import B2_seed_paper as script
+import quoted
 from seed_paper import memory, orthonormal, page, settling, steps
 from seed_paper.blocks import REFERENCE, Block, mean_and_spread
 from seed_paper.learning import first_below
@@ -103,4 +104,4 @@ def test_stored_results_are_those_of_the_script() -> None:
         titles = {b["title"] for b in table["blocks"]}
         assert set(REFERENCE[section]) <= titles
         assert not any(b["unexplained"] for b in table["blocks"])
-    assert (RESULTS / "B2.md").read_text() == page.page(stored)
+    assert (RESULTS / "B2.md").read_text() == quoted.renewed_page(RESULTS / "B2.md", page.page(stored))

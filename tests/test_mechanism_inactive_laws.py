@@ -12,7 +12,7 @@ from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver, kalman_gains, simulate
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.inactive_laws import (
-    Laws,
+    InactiveLaws,
     adds_to_step,
     friction_responses,
     law_sensitivities,
@@ -111,7 +111,7 @@ def test_slopes_are_those_of_the_model_with_the_effect(case: str) -> None:
             ports = ("arm", effect.at)  # another contact without a level changes nothing
             found = friction_responses(structure, solver, ports, numbers, samples, responses.run.X)
             at_ports = jax.tree.map(lambda a: a[:, 1:], found)
-        laws = Laws((jnp.asarray(values[None]),), (jnp.asarray(ways[None]),))
+        laws = InactiveLaws((jnp.asarray(values[None]),), (jnp.asarray(ways[None]),))
         return law_sensitivities((effect,), (effect.at,), laws, samples, responses, at_ports)
 
     with double_precision():

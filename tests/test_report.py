@@ -515,10 +515,13 @@ def test_a_file_is_not_taken_for_a_folder(discovery, undrawn, tmp_path) -> None:
 
 
 def test_a_folder_that_cannot_be_written_is_told(discovery, undrawn, tmp_path, monkeypatch) -> None:
-    def refuse(*args, **kwargs) -> None:
-        raise PermissionError(13, "Permission denied")
+    def refuse(file: Path, *args, **kwargs):
+        if file.is_relative_to(tmp_path):  # of the file that is written beside the target
+            raise PermissionError(13, "Permission denied")
+        return opened(file, *args, **kwargs)
 
-    monkeypatch.setattr(Path, "open", refuse)  # of the file that is written beside the target
+    opened = Path.open
+    monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(InputError, match="Permission denied"):
         write_report(discovery, tmp_path)
 

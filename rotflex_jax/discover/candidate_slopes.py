@@ -23,7 +23,7 @@ from rotflex_jax.fit.problem import each_recording
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.inactive_laws import (
-    Laws,
+    InactiveLaws,
     PortResponses,
     RunResponses,
     adds_to_step,
@@ -84,7 +84,7 @@ def _friction_responses(
 def _law_slopes(
     effects: tuple[Effect, ...],
     ports: tuple[str, ...],
-    laws: Laws,
+    laws: InactiveLaws,
     samples: ProgramSamples,
     responses: RunResponses,
     at_ports: PortResponses,
@@ -212,7 +212,7 @@ def _directions(current: ParameterSet, probes: Sequence[Probe], count: int) -> D
     return d
 
 
-def _laws(own: Sequence[Sequence[Probe]]) -> Laws:
+def _laws(own: Sequence[Sequence[Probe]]) -> InactiveLaws:
     """Numbers of the laws of some candidates; where all shapes have as many members, these share a shape."""
     values, along = [], []
     for probes in own:
@@ -220,7 +220,7 @@ def _laws(own: Sequence[Sequence[Probe]]) -> Laws:
         members = counts.pop() if len(counts) == 1 else 1
         values.append(np.array([p.values for p in probes[::members]]))
         along.append(np.array([p.along for p in probes]).reshape(len(values[-1]), members, -1))
-    return Laws(tuple(values), tuple(along))
+    return InactiveLaws(tuple(values), tuple(along))
 
 
 class Slopes(NamedTuple):

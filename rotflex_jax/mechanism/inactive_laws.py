@@ -295,7 +295,7 @@ def _responses(
     return join_chunks(motion, len(X)), join_chunks(responses, len(X))
 
 
-class Laws(NamedTuple):
+class InactiveLaws(NamedTuple):
     """Numbers of the laws of some inactive effects, for each effect those of its own S shapes.
 
     Attributes:
@@ -310,7 +310,7 @@ class Laws(NamedTuple):
 def law_sensitivities(
     effects: tuple[Effect, ...],
     ports: tuple[str, ...],
-    laws: Laws,
+    laws: InactiveLaws,
     samples: RecordingSamples,
     responses: RunResponses,
     at_ports: PortResponses,
@@ -406,7 +406,7 @@ def _with(e: Effect, values: Float[Array, " P"]) -> Any:
 def _memories(
     effects: tuple[Any, ...],
     places: list[int],
-    laws: Laws,
+    laws: InactiveLaws,
     samples: RecordingSamples,
     v: Float[Array, " N"],
     at_ports: PortResponses,
