@@ -20,7 +20,6 @@ import datetime
 import json
 import os
 import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -38,7 +37,7 @@ import jax
 import numba
 
 import rotflex_jax as rf
-from origin import begin, part
+from origin import begin, git, part
 
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
@@ -74,9 +73,8 @@ from rotflex_jax.text.files import write_file
 
 def machine() -> dict[str, Any]:
     """Where the numbers come from."""
-    git = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True)
     return {
-        "commit": git.stdout.strip(),
+        "commit": git("rev-parse", "--short", "HEAD"),
         "processor": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),

@@ -742,7 +742,7 @@ def test_other_laws_of_one_friction_remain_only_in_a_poor_model(monkeypatch, win
     monkeypatch.setattr(stepwise, "refit", lambda problem, swapped: swapped)
     monkeypatch.setattr(stepwise, "validate", lambda validation, h: in_place.get(h, final))
     rivals = {STRIBECK: [*in_place, DRAG], DRAG: []}
-    left = stepwise.remaining_rivals(problem, None, None, rivals, found).alike[STRIBECK]  # pyright: ignore[reportArgumentType]
+    left = stepwise.remaining_rivals(problem, None, final, rivals, found).alike[STRIBECK]  # pyright: ignore[reportArgumentType]
     alone, poor = found == [STRIBECK], windows > 2
     expected = [LUGRE] * poor + [COULOMB] * (poor and alone) + [ARM] * alone + [EffectLocation("dahl", "arm")]
     assert left == expected + [DRAG] * alone

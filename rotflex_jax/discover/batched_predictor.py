@@ -78,6 +78,10 @@ class Directions(NamedTuple):
     x0: Float[Any, "D m"]
     gates: Float[Any, "D E"]
 
+    def restrict(self, model: ReducedModel) -> "Directions":
+        """Those of a reduced model."""
+        return Directions(self.values[..., model.parameters], self.x0, self.gates[:, model.effects])
+
 
 @persistent_jit(static=2)
 def _innovations(
@@ -211,8 +215,7 @@ class BatchedPredictor:
 
         def run(job: tuple[ReducedModel, list[int]]) -> tuple[np.ndarray, np.ndarray]:
             model, (i,) = job
-            d = directions[i]
-            along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
+            along = directions[i].restrict(model)
             with double_precision():
                 structure, inputs = model.mechanism.structure, self.restrict(parameter_sets[i], model)
                 e, J = _slopes(structure, self.solver, inputs, along, self.on_device(window))

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, ProgramSamples
 from rotflex_jax.discover.supermodel import Candidate, ReducedModel, SuperModel
 from rotflex_jax.effects.base import Effect
+from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.fit.problem import each_recording
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver
 from rotflex_jax.mechanism.assembly import Layout, rest_state
@@ -80,6 +81,11 @@ def _friction_responses(
     return each_recording(one, (0,) * 9)(p.values, p.x0, p.K, X, *data, window)
 
 
+def _of_innovations(J: jax.Array, data: StackedRecordings) -> jax.Array:
+    """Slopes of innovations from those of predictions; zero where no sample counts."""
+    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+
+
 @persistent_jit(static=2)
 def _law_slopes(
     effects: tuple[Effect, ...],
@@ -94,7 +100,7 @@ def _law_slopes(
 
     data, window, _ = samples
     J = each_recording(one, (0,) * 7, out_axes=1)(responses, at_ports, *data, window)
-    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+    return _of_innovations(J, data)
 
 
 @persistent_jit(static=2)
@@ -114,7 +120,7 @@ def _signal_slopes(
     data, window, _ = samples
     axes = (1, 1, *(0,) * 6)
     J = each_recording(one, axes, out_axes=1)(values, directions.values, responses, *data, window)
-    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+    return _of_innovations(J, data)
 
 
 @persistent_jit(static=3)
@@ -138,7 +144,7 @@ def _inactive_slopes(
     J = each_recording(one, in_axes=(0, 0, 0, 0, 1, 0, 0, 0, 0, 0), out_axes=1)(
         parameter_set.values, parameter_set.x0, parameter_set.K, run, directions.values, *data, window
     )
-    return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
+    return _of_innovations(J, data)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -322,8 +328,7 @@ def candidate_sensitivities(
         count = sum(len(g) * (1 if c.line is None else MOST_LINES) for c in kinds.signals for g in c.probes)
         points = [predictor.restrict(_with_probes(current, [p]), model) for p in listed]
         points += [predictor.restrict(current, model)] * (count - len(points))
-        d = _directions(current, listed, count)
-        along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
+        along = _directions(current, listed, count).restrict(model)
         with double_precision():
             values, gates = (jnp.array([getattr(p, what) for p in points]) for what in ("values", "gates"))
             given = (values, gates, along, samples, responses)
@@ -331,8 +336,7 @@ def candidate_sensitivities(
 
     def along_others(family: Sequence[Candidate], listed: Sequence[Probe]) -> Slopes:
         model = s.with_family(current.gates, family)
-        d = _directions(current, listed, max(len(listed), PROBES_PER_BATCH))
-        along = Directions(d.values[..., model.parameters], d.x0, d.gates[:, model.effects])
+        along = _directions(current, listed, max(len(listed), PROBES_PER_BATCH)).restrict(model)
         inputs = predictor.restrict(_with_probes(current, listed), model)
         inactive = tuple(model.effects.index(c.effect) for c in family)
         with double_precision():

@@ -162,18 +162,25 @@ def pairs_passed_by(
         What was fitted and validated, and the pairs that validation data do not distinguish from the model
         found, or prefer.
     """
-    calibrations = horizons.prediction.problem.supermodel.calibrations
-    effects = frozenset(found.hypothesis.locations) - set(calibrations)
-    fitted = {frozenset(v.hypothesis.locations) - set(calibrations) for v in known}
+    s = horizons.prediction.problem.supermodel
+    effects = s.without_calibrations(found.hypothesis.locations)
+    fitted = {s.without_calibrations(v.hypothesis.locations) for v in known}
     passed = (pair for pair in pairs if not effects >= set(pair[0].locations))
     others = [pair for pair in passed if frozenset(pair[0].locations) not in fitted]
     if len(effects) < 2 or not others:
         return [], []
     say("pairs of the start that were not found: " + ", ".join(_named(a.locations) for a, _ in others))
     tried = validated_pairs(horizons, beside, others, is_plausible)
-    for pair, v in tried.items():
-        say(f"  {_named(pair)}: " + describe(v, found).removeprefix("None: "))
+    _say_gains(tried, found, say)
     return list(tried.values()), [p for p, v in tried.items() if not distinguished(found, v)]
+
+
+def _say_gains(
+    tried: dict[Pair, ValidatedHypothesis], over: ValidatedHypothesis, say: Callable[[str], None]
+) -> None:
+    """A line of progress for each pair: what it gains over a model."""
+    for pair, v in tried.items():
+        say(f"  {_named(pair)}: " + describe(v, over).removeprefix("None: "))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,9 +224,7 @@ def find_pair(
     problem = horizons.prediction.problem
     data, noise, s = problem.dataset.data, problem.noise, problem.supermodel
     tried = validated_pairs(horizons, current, pairs, is_plausible)
-    for pair, v in tried.items():
-        line = describe(v, current).removeprefix("None: ")
-        say(f"  {_named(pair)}: {line}")
+    _say_gains(tried, current, say)
     able = {p: v for p, v in tried.items() if admissible(v, current, data, noise)}
     everyone = list(tried.values())
     if not able:

@@ -216,12 +216,12 @@ def _simplify(state: SearchState) -> None:
     reported = state.reported
     problem, validation = reported.problem, reported.validation
     assigned = assign_calibrations(problem, validation, state.at(reported, state.current).hypothesis, order)
-    final, order, notes = assigned.final, assigned.order, assigned.notes
+    final, order, notes = assigned.final.hypothesis, assigned.order, assigned.notes
     found = [p for p in order if p in state.scores]
-    rivals, swapped = remaining_rivals(problem, validation, final, state.rivals, found)
+    rivals, swapped = remaining_rivals(problem, validation, assigned.final, state.rivals, found)
     state.machine = [p for p in order if p not in state.scores]
     state.alternatives = [*swapped, *(_left_out(state, needed) if reported is horizons.prediction else ())]
-    if one := merge_effects(problem, validation, final, order):
+    if one := merge_effects(problem, validation, assigned.final, order):
         final, notes = one.final, (*notes, one.note)
         state.scores[one.effect] = state.scores[one.simpler]
         state.gains[one.effect] = state.gains[one.simpler]
@@ -252,12 +252,12 @@ def _check_pairs(state: SearchState) -> None:
 
 def _left_out(state: SearchState, needed: Eliminated) -> list[ValidatedHypothesis]:
     """The final model without each effect, on validation data; only those that no round has fitted."""
-    s = state.problem.supermodel
+    effects = state.problem.supermodel.without_calibrations
     if state.validation.folds:  # a fit for each recording, for a comparison that decides nothing
         return []
-    known = {frozenset(v.hypothesis.locations) - set(s.calibrations) for v in state.tried}
+    known = {effects(v.hypothesis.locations) for v in state.tried}
     return [
         validate(state.validation, h, state.current)
         for h in needed.without
-        if frozenset(h.locations) - set(s.calibrations) not in known
+        if effects(h.locations) not in known
     ]

@@ -282,7 +282,7 @@ class RemainingRivals(NamedTuple):
 def remaining_rivals(
     problem: LikelihoodProblem,
     validation: ValidationSet,
-    final: Hypothesis,
+    final: ValidatedHypothesis,
     rivals: dict[EffectLocation, list[EffectLocation]],
     found: list[EffectLocation],
 ) -> RemainingRivals:
@@ -292,10 +292,7 @@ def remaining_rivals(
     was itself found in another round is no rival. Nor is another law of the same friction where the final
     model explains its recordings: they have decided between the two.
     """
-    if not any(rivals[p] for p in found):
-        return RemainingRivals({p: [] for p in found}, [])
-    s, best = problem.supermodel, validate(validation, final)
-    far = bool(np.any(best.window_rmse > 2 * problem.noise))
+    s, far = problem.supermodel, bool(np.any(final.window_rmse > 2 * problem.noise))
     remaining = {p: [r for r in rivals[p] if r not in found and (far or not related(p, r))] for p in found}
     # One that is refitted at its line has passed already beside the models of its round.
     pairs = [(p, r) for p in found for r in remaining[p] if not CATALOG[r.effect].line]
@@ -304,12 +301,12 @@ def remaining_rivals(
     swapped = []
     for p, r in pairs:
         start = CandidateStart(r, np.array(s.candidates[r].probes[0]).max(axis=0))
-        swapped.append(with_effect(s, without(s, final, p), start, 0.4))
+        swapped.append(with_effect(s, without(s, final.hypothesis, p), start, 0.4))
     validated = [validate(validation, h) for h in refit(problem, swapped)]
     alike = {
         (p, r)
         for (p, r), t in zip(pairs, validated, strict=True)
-        if (not free_runs_apart(best, t) if related(p, r) else not distinguished(best, t))
+        if (not free_runs_apart(final, t) if related(p, r) else not distinguished(final, t))
     }
     left = {p: [r for r in remaining[p] if (p, r) in alike or CATALOG[r.effect].line] for p in found}
     return RemainingRivals(left, validated)
@@ -382,7 +379,7 @@ def titled(location: EffectLocation) -> str:
 def merge_effects(
     problem: LikelihoodProblem,
     validation: ValidationSet,
-    final: Hypothesis,
+    final: ValidatedHypothesis,
     order: Sequence[EffectLocation],
 ) -> MergedEffects | None:
     """The one effect that does without the machine's calibrations what the final model does with them.
@@ -398,7 +395,7 @@ def merge_effects(
         final: The final model.
         order: Its effects and the calibrations that belong to the machine.
     """
-    s = problem.supermodel
+    s, h = problem.supermodel, final.hypothesis
     calibrations = [p for p in order if p in s.calibrations]
     pairs = [
         (simple, rich)
@@ -413,8 +410,8 @@ def merge_effects(
         return None
     starts = []
     for simple, rich in pairs:
-        bare = final
-        level = max(final.mean_values(s)[s.parameter_indices(simple)])
+        bare = h
+        level = max(h.mean_values(s)[s.parameter_indices(simple)])
         for location in (simple, *calibrations):
             bare = without(s, bare, location)
         c = s.candidates[rich]
@@ -422,15 +419,15 @@ def merge_effects(
         starts.append(with_effect(s, bare, CandidateStart(rich, values), 1.0))
     fitted = refit(problem, starts, alternations=1)
     (simple, rich), one = max(zip(pairs, fitted, strict=True), key=lambda pair: pair[1].log_likelihood)
-    before = len(s.parameter_indices(simple)) + len(final.x0) * len(calibrations)
+    before = len(s.parameter_indices(simple)) + len(h.x0) * len(calibrations)
     saved = before - len(s.parameter_indices(rich))
     allowed = MERGE_LOSS_NATS + 0.5 * saved * np.log(problem.measured_values)
-    if saved < 0 or one.log_likelihood < final.log_likelihood - allowed or not is_physical(s, one, rich):
+    if saved < 0 or one.log_likelihood < h.log_likelihood - allowed or not is_physical(s, one, rich):
         return None
     kept = [rich if p == simple else p for p in order if p not in calibrations]
     validated = validate(validation, one)
     errors = validation.short_run_errors(validated.with_trained_calibrations(s), kept)
-    several = validation.short_run_errors(validate(validation, final).with_trained_calibrations(s), order)
+    several = validation.short_run_errors(final.with_trained_calibrations(s), order)
     if float(np.mean(np.log(errors / several))) > WINDOWS_BETTER:
         return None
     return MergedEffects(one, rich, simple, (simple, *calibrations), saved == 0, validated)
@@ -441,13 +438,13 @@ class AssignedCalibrations:
     """Where the calibrations of a final model belong.
 
     Attributes:
-        final: The final model.
+        final: The final model, on validation data.
         order: Effects and calibrations of the machine, in order.
         own: Calibrations that belong to the training recordings alone.
         notes: A remark for the reader where calibrations were left out altogether.
     """
 
-    final: Hypothesis
+    final: ValidatedHypothesis
     order: list[EffectLocation]
     own: list[EffectLocation]
     notes: tuple[str, ...]
@@ -462,12 +459,12 @@ def assign_calibrations(
     order, own = _split_calibrations(validation, validated, order)
     bare = _better_without(problem, validation, validated, order)
     if bare is None:
-        return AssignedCalibrations(final, order, own, ())
+        return AssignedCalibrations(validated, order, own, ())
     note = (
         f"The training data ask for {' and '.join(map(titled, calibrations))}, but runs over "
         "validation data are better with a model fitted without; left out."
     )
-    return AssignedCalibrations(bare, [p for p in order if p in bare.locations], [], (note,))
+    return AssignedCalibrations(bare, [p for p in order if p in bare.hypothesis.locations], [], (note,))
 
 
 def _split_calibrations(
@@ -493,7 +490,7 @@ def _better_without(
     validation: ValidationSet,
     final: ValidatedHypothesis,
     order: Sequence[EffectLocation],
-) -> Hypothesis | None:
+) -> ValidatedHypothesis | None:
     """The final model fitted without calibrations, where that runs better on the validation recordings.
 
     Training recordings may ask for offsets that the validation recordings do not share; parameters fitted
@@ -505,11 +502,11 @@ def _better_without(
         return None
     for location in calibrations:
         bare = without(s, bare, location)
-    bare = refit(problem, [bare])[0]
+    alone = validate(validation, refit(problem, [bare])[0])
     with_them = validation.short_run_errors(final.with_trained_calibrations(s), order)
     locations = [p for p in order if p in bare.locations]
-    alone = validation.short_run_errors(validate(validation, bare).with_trained_calibrations(s), locations)
-    return bare if runs_clearly_better(alone, with_them) else None
+    without_them = validation.short_run_errors(alone.with_trained_calibrations(s), locations)
+    return alone if runs_clearly_better(without_them, with_them) else None
 
 
 def calibration_notes(

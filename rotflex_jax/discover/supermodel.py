@@ -258,6 +258,10 @@ class SuperModel:
         names = self.mechanism.parameter_names
         return [names.index(n) for n in self.baseline.free_names]
 
+    def without_calibrations(self, locations: Iterable[EffectLocation]) -> frozenset[EffectLocation]:
+        """The effects among some that a search may find."""
+        return frozenset(locations) - set(self.calibrations)
+
     def gates(self, switched_on: Iterable[EffectLocation]) -> Float[np.ndarray, " E"]:
         """One where an effect is on: those of the baseline and those named."""
         on = set(switched_on)

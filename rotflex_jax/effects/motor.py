@@ -300,12 +300,20 @@ class PositionLoop(Linear):
             braking = braking + self._torque_per_duty * self.derivative
         return Stamp(stiffness=stiffness, drive=stiffness, damping=braking)
 
+    def _error(self, position: Scalar, speed: Scalar, goal: Scalar) -> Scalar:
+        """Goal less the angle, which the firmware has half a period late [rad]."""
+        return goal - position + self.period / 2 * speed
+
+    def _counted(self, error: Scalar) -> Scalar:
+        """What the firmware takes for an error, beyond its dead band [rad]."""
+        return error if self.dead_band is None else error - _within(error, self.dead_band)
+
     def _wanted(self, position: Scalar, speed: Scalar, goal: Scalar) -> tuple[Scalar, Scalar]:
         """Duty by P and D gain before the limit: as the linear loop has it, and with the dead band."""
-        error = goal - position + self.period / 2 * speed
+        error = self._error(position, speed, goal)
         linear = wanted = self.gain * self.gain_scale * error
         if self.dead_band is not None:
-            wanted = self.gain * self.gain_scale * (error - _within(error, self.dead_band))
+            wanted = self.gain * self.gain_scale * self._counted(error)
         if self.derivative is not None:
             linear, wanted = linear - self.derivative * speed, wanted - self.derivative * speed
         return linear, wanted
@@ -466,9 +474,7 @@ class PidServo(PositionLoop, Memory):
 
     def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Time derivative of the duty of the I gain [1/s]; `drive` is the goal [rad]."""
-        error = drive - position + self.period / 2 * speed
-        if self.dead_band is not None:
-            error = error - _within(error, self.dead_band)
+        error = self._counted(self._error(position, speed, drive))
         wanted = self._wanted(position, speed, drive)[1] + z
         rate = self.integral * error - self.anti_windup * (wanted - _within(wanted, self.limit))
         return rate if self.enabled is None else self.enabled * rate

@@ -19,7 +19,7 @@ import contextlib
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -371,7 +371,7 @@ def _law_changes(
     """What a law changes at each evaluation along its amplitudes, or as a whole where it is switched on."""
 
     def at(j: int, values: list[Array], z: Array | None) -> Array:
-        law: Any = e.replace(**dict(zip(e.values, values, strict=True)))
+        law = _with(e, values)
         position, speed = motion[:, j, 0], motion[:, j, 1]
         if isinstance(e, DryFriction):
             value = law.limit(position, speed, 1.0 - 2.0 * (j % 2))
@@ -399,8 +399,8 @@ def _law_changes(
     return jnp.concatenate(columns, axis=2)
 
 
-def _with(e: Effect, values: Float[Array, " P"]) -> Any:
-    return e.replace(**dict(zip(e.values, jnp.unstack(values), strict=True)))
+def _with(e: Effect, values: Sequence[Array]) -> Any:
+    return e.replace(**dict(zip(e.values, values, strict=True)))
 
 
 def _memories(
@@ -425,7 +425,8 @@ def _memories(
         motion, v, ends = sample
         later = []
         for e, p, values, own in zip(effects, places, laws.values, z, strict=True):
-            flow = lambda values, s, e=e, p=p: _with(e, values).flow(s, motion[p, 0], motion[p, 1], v)  # noqa: E731
+            law = lambda values, e=e: _with(e, jnp.unstack(values))  # noqa: E731
+            flow = lambda values, s, law=law, p=p: law(values).flow(s, motion[p, 0], motion[p, 1], v)  # noqa: E731
             each = jax.vmap(flow)
             later.append(
                 exponential_euler(lambda s, each=each, values=values: each(values, s), own, samples.Ts)
@@ -488,7 +489,7 @@ def _recursion(
 
     Args:
         responses: Of the run.
-        forced: Answer of the state to some quantities, and what these are along some directions.
+        forced: Response of the state to some quantities, and what these are along some directions.
     """
 
     def body(states: list[Array], here: Any) -> tuple[list[Array], list[Array]]:
