@@ -2,6 +2,7 @@
 
     python benchmarks/B10_servo.py
     python benchmarks/B10_servo.py --only "gain 200" --parts models fits
+    python benchmarks/B10_servo.py --parts "so101 search" --joints Elbow
     python benchmarks/B10_servo.py --fresh --rollouts 100000
 
 An XL-330 lifts a pendulum at four gains in three motions. Every motion and every gain is left out once: M1
@@ -42,7 +43,7 @@ from origin import begin, git, part
 rf.enable_fast_loops()
 rf.enable_compilation_cache()
 
-from servo.arm import arm
+from servo.arm import JOINTS, arm
 from servo.evolved import evolved
 from servo.figure import draw
 from servo.friction_models import MODELS
@@ -106,6 +107,9 @@ def main() -> None:
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--rollouts", type=int, default=20_000, help="Free runs of each evolution.")
     parser.add_argument("--workers", type=int, default=1, help="Processes that share the joints of the arm.")
+    parser.add_argument(
+        "--joints", nargs="*", choices=JOINTS, default=["Elbow"], help="Joints that are searched."
+    )
     parser.add_argument("--fresh", action="store_true", help="Run again what the results have already.")
     parser.add_argument("--out", type=Path, default=RESULTS / "B10.json")
     given = parser.parse_args()
@@ -143,12 +147,16 @@ def main() -> None:
         found["released"] = released()
         part(found, "released")
         keep()
-    if "so101" in given.parts:
-        if given.fresh:
+    if {"so101", "so101 search"} & set(given.parts):
+        if given.fresh and "so101" in given.parts:
             found["so101"] = []
             part(found, "so101")
-        search = "so101 search" in given.parts
-        arm(say, given.rollouts // 5, found.setdefault("so101", []), keep, search, given.workers)
+        search = given.joints if "so101 search" in given.parts else ()
+        rows_of_arm = found.setdefault("so101", [])
+        for row in rows_of_arm:
+            if given.fresh and row["joint"] in search:
+                row.pop("search", None)
+        arm(say, given.rollouts // 5, rows_of_arm, keep, made["code"], search, given.workers)
     keep()
     if given.out.parent == RESULTS:
         draw(found["summary"], FIGURE)

@@ -556,6 +556,10 @@ NAMED["next_ratio_mode"] = functools.partial(_next_ratio, "second mode or sensor
 # -- servos -------------------------------------------------------------------------------------------------
 
 
+WITH_SLOPES = 3.5
+"""Processor time of a free run with its derivatives by some seven parameters, in runs without."""
+
+
 @named
 def servo_rollouts() -> str:
     """Free runs of the evolution of the grey box over those of its fit."""
@@ -566,10 +570,10 @@ def servo_rollouts() -> str:
 
 @named
 def servo_robust_ratio() -> str:
-    """Free runs of the evolution of M4 over those of the robust fit, one with derivatives counted as 3.5."""
+    """Free runs of the evolution of M4 over those of the robust fit, counted as so many."""
     summary = results("B10.json")["summary"]
     took = [summary[n]["rollouts"] for n in ("M4", "motor friction, delay, robust")]
-    return f"{took[0] / (3.5 * took[1]):.0f}"
+    return f"{took[0] / (WITH_SLOPES * took[1]):.0f}"
 
 
 @named
@@ -591,6 +595,13 @@ def _arm_others(name: str) -> str:
     return f"{statistics.mean(errors[name] for row in rows for errors in row['others'].values()):.2f}"
 
 
+def _arm_all(name: str) -> str:
+    """The same over `step_response` too, all motions that no fit used [deg]."""
+    rows = results("B10.json")["so101"]
+    away = [e for row in rows for e in (row[name], *(errors[name] for errors in row["others"].values()))]
+    return f"{statistics.mean(away):.2f}"
+
+
 ARM = (
     "no friction",
     "Coulomb",
@@ -602,17 +613,24 @@ ARM = (
     "M4",
     "M5",
     "M6",
+    "parameters of M1",
 )
 for _k, _model in enumerate(ARM):
     NAMED[f"servo_arm_runs_{_k}"] = functools.partial(_arm_runs, _model)
     NAMED[f"servo_arm_others_{_k}"] = functools.partial(_arm_others, _model)
+    NAMED[f"servo_arm_all_{_k}"] = functools.partial(_arm_all, _model)
 
 
-@named
-def servo_arm_ratio() -> str:
-    """Free runs of the evolution of the grey box of the SO-101 over those of its fit."""
-    took = [statistics.median(r["takes"][n]["rollouts"] for r in results("B10.json")["so101"]) for n in ARM]
-    return f"{took[ARM.index('Coulomb, delay, CMA-ES')] / took[ARM.index('Coulomb')]:.0f}"
+def _arm_ratio(evolved: str, fitted: str, cost: float = 1.0) -> str:
+    """Free runs of an evolution at the SO-101 over those of a fit of some cost each; medians of joints."""
+    rows = results("B10.json")["so101"]
+    took = [statistics.median(r["takes"][n]["rollouts"] for r in rows) for n in (evolved, fitted)]
+    return f"{took[0] / (cost * took[1]):.0f}"
+
+
+NAMED["servo_arm_ratio"] = functools.partial(_arm_ratio, "Coulomb, delay, CMA-ES", "Coulomb")
+NAMED["servo_arm_ratio_M1"] = functools.partial(_arm_ratio, "M1", "parameters of M1")
+NAMED["servo_arm_ratio_M1_equal"] = functools.partial(_arm_ratio, "M1", "parameters of M1", WITH_SLOPES)
 
 
 # -- speed --------------------------------------------------------------------------------------------------

@@ -89,7 +89,7 @@ def test_a_timetable_of_version_7_3_is_refused_with_its_cure(tmp_path):
     pytest.importorskip("h5py")
     pd = pytest.importorskip("pandas")
     path = timetable(tmp_path / "run.mat", pd.to_timedelta(2 * K, unit="ms"), "v7.3")
-    refused(path, r"log \(timetable\): save a timetable or a timeseries with -v7", **PARTS)
+    refused(path, r"log \(timetable\): save a timetable, timeseries or Dataset with -v7", **PARTS)
 
 
 def test_a_damaged_timetable_is_left_out_and_named(tmp_path):
@@ -160,6 +160,54 @@ def test_timeseries_of_other_times_are_brought_together_on_request(tmp_path):
 def test_a_timeseries_without_its_step_is_left_out_and_named(tmp_path):
     path = timeseries(tmp_path / "run.mat", {n: (T, x) for n, x in SIGNALS.items()}, units="fortnights")
     refused(path, r"objects that only MATLAB reads .* \(timeseries\): save")
+
+
+def dataset(path: Path, names=tuple(SIGNALS), deep: bool = False, within: bool = False) -> Path:
+    """A file with a Simulink Dataset as another implementation of MATLAB's objects writes it.
+
+    Args:
+        path: Of the file.
+        names: Of the signals.
+        deep: Whether the signals stand in an object of the Dataset's own.
+        within: Whether the Dataset stands in an object with the outputs of a simulation.
+    """
+    matio = pytest.importorskip("matio")
+    from matio.utils import MatlabOpaque
+
+    kind = "Simulink.SimulationData"
+
+    def signal(name: str, x: np.ndarray) -> MatlabOpaque:
+        values = MatlabOpaque({"Data_": x[:, None], "Time_": T[:, None], "Name": "unnamed"}, "timeseries")
+        where = MatlabOpaque({"Path": f"loop/{name}"}, f"{kind}.BlockPath")
+        return MatlabOpaque({"Name": name, "Values": values, "BlockPath": where}, f"{kind}.Signal")
+
+    cells = np.empty((len(names), 1), dtype=object)
+    for k, (name, x) in enumerate(zip(names, SIGNALS.values(), strict=True)):
+        cells[k, 0] = signal(name, x)
+    elements = {"Elements": cells}
+    if deep:
+        elements = {"Storage_": MatlabOpaque(elements, f"{kind}.Storage.RamDatasetStorage")}
+    found = MatlabOpaque({"Name": "logsout", **elements}, f"{kind}.Dataset")
+    variables = {"log": found}
+    if within:
+        variables = {"out": MatlabOpaque(variables, "Simulink.SimulationOutput")}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        matio.save_to_mat(str(path), variables, version="v7")
+    return path
+
+
+@pytest.mark.parametrize(("deep", "within"), [(False, False), (True, False), (True, True)])
+def test_a_dataset_of_simulink_is_read_by_the_names_of_its_signals(tmp_path, deep, within):
+    path = dataset(tmp_path / "run.mat", deep=deep, within=within)
+    start = "out" if within else "log"
+    exact(load(path, input=f"{start}.voltage.Data", outputs=(f"{start}.theta.Data", f"{start}.alpha.Data")))
+    refused(path, rf"{start}\.voltage\.Data", input="volts", outputs=("theta", "alpha"))
+
+
+def test_a_dataset_with_two_signals_of_one_name_is_left_out_and_named(tmp_path):
+    path = dataset(tmp_path / "run.mat", names=("voltage", "theta", "theta"))
+    refused(path, r"objects that only MATLAB reads .* log \(Simulink\.SimulationData\.Dataset\): save")
 
 
 # -- JSON ------------------------------------------------------------------------------------------------

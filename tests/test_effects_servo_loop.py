@@ -240,3 +240,15 @@ def test_simulators_get_the_motion_and_the_certificate_names_the_rest():
     # What a sensor makes of a reading that is left out goes with it.
     calibrated = pid(PARTS) + fx.SensorGain("current", 1.1)
     assert rf.export.to_urdf(calibrated, Ts=TS).content == exported.content
+
+
+def test_a_search_scores_errors_of_a_current_sensor() -> None:
+    """What it looks at beside a model has the meter that the output needs."""
+    servo = rf.joints.servo("sts3215", gain=16, sensors="theta+current")
+    rng, parts = np.random.default_rng(0), []
+    for _ in range(2):
+        u = np.repeat(rng.uniform(-0.5, 0.5, 12), 50)
+        y = rf.simulate(servo, u, 0.01) * [1.0, 1.2] + 1e-3 * rng.standard_normal((len(u), 2))
+        parts.append(Recording(u, y, 0.01, channels=("theta", "current"), units=("rad", "A")))
+    found = rf.discover(servo, *parts, candidates=[(fx.SensorGain, "current")], rounds=1)
+    assert [(r.effect, r.port) for r in found.ranking] == [("sensor_gain", "current")]

@@ -53,6 +53,7 @@ def test_counts_are_named_as_counts_and_the_cure_works(run, tmp_path) -> None:  
     status, out, _ = run("check", file, "--counts", COUNTS)
     assert status == 0
     assert "0.0879" in out  # the step of the encoder [deg]
+    assert run("check", file, "--counts-per-turn", COUNTS)[1] == out
     # Degrees would scale the angles wrongly, and lead to a wrong answer far above the noise.
     status, _, err = run("check", file, "--degrees")
     assert status == 2

@@ -58,6 +58,7 @@ Counts = Annotated[
     list[str] | None,
     typer.Option(
         "--counts",
+        "--counts-per-turn",
         metavar="NUMBER",
         help="Angles in the files are encoder counts, so many a turn; CHANNEL=NUMBER for one of them.",
     ),

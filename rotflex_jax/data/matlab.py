@@ -1,8 +1,9 @@
-"""MATLAB files up to version 7.2: arrays, timetables, timeseries and tables.
+"""MATLAB files up to version 7.2: arrays, timetables, timeseries, tables and what Simulink has logged.
 
 MATLAB keeps the insides of objects apart from the variables, in a part of the file without a name: names,
 then for each object the numbers of its class and of its properties, then the values. Of those objects,
-timetables, timeseries and tables are signals; durations and dates are their times.
+timetables, timeseries and tables are signals; durations and dates are their times. A Simulink Dataset is an
+object that holds others, each with a name and, at some depth, a timeseries or timetable.
 
 SciPy's reader trusts the sizes and types that it finds, and a damaged file can end the interpreter; here
 each is compared with the bytes that are there before it is used.
@@ -15,7 +16,7 @@ import itertools
 import math
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,7 +39,7 @@ _MOST_RECORDS = 100_000
 
 @dataclass(frozen=True)
 class MatlabObject:
-    """Stands for an object whose insides only MATLAB knows, such as a Simulink Dataset.
+    """Stands for an object whose insides only MATLAB knows, such as iddata.
 
     Args:
         kind: its class.
@@ -141,17 +142,57 @@ class StoredObjects:
         values = data[:, 0] if data.shape[1] == 1 else data
         return Timetable({"Time": SECONDS[about.get("Units", "seconds")] * t, "Data": values})
 
+    def kind(self, reference: Any) -> str:
+        """Class of an object with the package it belongs to."""
+        package, name = self.of_class[4 * int(np.asarray(reference)[-1]) :][:2]
+        return f"{self.names[package - 1]}.{self.names[name - 1]}" if package else self.names[name - 1]
+
+    def logged(self, value: Any, name: str = "", seen: tuple[int, ...] = ()) -> dict[str, Any]:
+        """Timeseries and timetables at any depth of an object, by the names of the objects that hold them.
+
+        In which property a version of Simulink keeps its signals does not matter.
+
+        Args:
+            value: reference to the object, or cells or a structure of references.
+            name: of what holds it.
+            seen: numbers of the objects on the way there.
+
+        Raises:
+            ValueError: objects lead back to themselves or are too deep, or two signals have one name.
+        """
+        number = referred(value)
+        if number is None:
+            parts = value.values() if isinstance(value, dict) else value
+            cells = isinstance(value, np.ndarray) and value.dtype == object
+            nested = cells or isinstance(value, dict | list)
+            return _joined(self.logged(part, name, seen) for part in parts) if nested else {}
+        if number in seen or len(seen) > DEEPEST_NESTING:
+            raise ValueError("objects hold each other")
+        if (kind := self.kind(value)) in self.signals:
+            return {name: self.signals[kind](value)}
+        inside = self.properties(value)
+        own = inside.get("Name")
+        name = own if isinstance(own, str) and own else name
+        return _joined(self.logged(part, name, (*seen, number)) for part in inside.values())
+
+    @property
+    def signals(self) -> dict[str, Callable[[Any], Any]]:
+        """What reads each class with times and values."""
+        return {"timetable": self.timetable, "timeseries": self.timeseries}
+
     def opened(self, value: Any) -> Any:
-        """A value with timetables, timeseries and tables in it as columns; other objects stay as they are."""
+        """A value with the signals of objects in it as columns; objects without any stay as they are."""
         if isinstance(value, dict):
             return {name: self.opened(part) for name, part in value.items()}
         if isinstance(value, list):
             return [self.opened(part) for part in value]
-        read = {"timetable": self.timetable, "timeseries": self.timeseries, "table": self.table}
-        if not isinstance(value, MatlabObject) or value.kind not in read:
+        read = self.signals | {"table": self.table}
+        if not isinstance(value, MatlabObject) or not (
+            value.kind in read or value.kind.startswith("Simulink.")
+        ):
             return value
         try:
-            return read[value.kind](value.content)
+            return read.get(value.kind, self.logged)(value.content) or value
         except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError):
             return (
                 value  # of a version that is not known, or damaged: an error names it where it is asked for
@@ -188,6 +229,16 @@ def _records(numbers: list[int]) -> list[list[tuple[int, int, int]]]:
             raise ValueError("an object has properties beyond the end")
         found.append([(part[k], part[k + 1], part[k + 2]) for k in range(0, len(part), 3)])
         at = end + end % 2
+    return found
+
+
+def _joined(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Signals of several objects."""
+    found: dict[str, Any] = {}
+    for part in parts:
+        if twice := found.keys() & part.keys():
+            raise ValueError(f"two signals have the name {min(twice)!r}")
+        found |= part
     return found
 
 

@@ -101,7 +101,7 @@ class Table:
         names = ", ".join(short) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
         if objects:
-            cure = "save a timetable or a timeseries with -v7, and of others .Time and .Data"
+            cure = "save a timetable, timeseries or Dataset with -v7, and of others the arrays"
             then += f"; objects that only MATLAB reads are left out, {objects}: {cure}"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
 
