@@ -248,7 +248,7 @@ class _Kinds:
     Attributes:
         laws: Laws at ports, by what they add; those of the hypothesis too, so that an effect that is found
             compiles nothing for the others.
-        signals: What changes the voltage or a reading, of those that are absent.
+        signals: What changes the voltage or a reading; those of the hypothesis too.
         others: The rest of those that are absent.
     """
 
@@ -271,7 +271,7 @@ class _Kinds:
                 kind = "friction" if e.dry_contact else e.state_part or "torque"
                 found.laws.setdefault(kind, []).append(c)
             else:
-                found.signals.extend([c] * absent)
+                found.signals.append(c)
         return found
 
     def ports(self, friction: bool) -> tuple[str, ...]:
@@ -297,6 +297,7 @@ def candidate_sensitivities(
         window: Window of each sample.
     """
     s, solver = predictor.supermodel, predictor.solver
+    of_signals = dataclasses.replace(solver, passes=None) if isinstance(solver, Exponential) else solver
     active = s.active(current.gates)
     structure = active.mechanism.structure
     if isinstance(solver, Exponential) and solver.passes is not None:
@@ -323,7 +324,10 @@ def candidate_sensitivities(
             )
 
     def along_signals() -> Slopes:
-        model = s.with_family(current.gates, kinds.signals)
+        every = s.with_family(current.gates, kinds.signals).effects
+        effects, given = s.mechanism.effects, len(s.baseline.effects)
+        # Of laws at ports those of the user's model alone, which all hypotheses share.
+        model = s.only(i for i in every if i < given or effects[i].acts_on != "port")
         listed = [p for c in kinds.signals if c.location in asked for p in Probe.of(asked[c.location])]
         count = sum(len(g) * (1 if c.line is None else MOST_LINES) for c in kinds.signals for g in c.probes)
         points = [predictor.restrict(_with_probes(current, [p]), model) for p in listed]
@@ -331,8 +335,10 @@ def candidate_sensitivities(
         along = _directions(current, listed, count).restrict(model)
         with double_precision():
             values, gates = (jnp.array([getattr(p, what) for p in points]) for what in ("values", "gates"))
-            given = (values, gates, along, samples, responses)
-            return Slopes(listed, cut(_signal_slopes(model.mechanism.structure, solver, *given), listed))
+            own = [active.states.index(i) for i in model.states]
+            run = responses.run._replace(X=jnp.asarray(np.asarray(responses.run.X)[..., own]))
+            given = (values, gates, along, samples, responses._replace(run=run, torques=None))
+            return Slopes(listed, cut(_signal_slopes(model.mechanism.structure, of_signals, *given), listed))
 
     def along_others(family: Sequence[Candidate], listed: Sequence[Probe]) -> Slopes:
         model = s.with_family(current.gates, family)

@@ -219,15 +219,22 @@ class SuperModel:
         return list(found.values())
 
     def _reduce(self, left_out: frozenset[int]) -> ReducedModel:
-        kept = [i for i in range(len(self.mechanism.effects)) if i not in left_out]
+        return self.only(i for i in range(len(self.mechanism.effects)) if i not in left_out)
+
+    def only(self, kept: Iterable[int]) -> ReducedModel:
+        """The super-model with some effects alone; their numbers in order."""
+        kept = tuple(kept)
         effects = tuple(self.mechanism.effects[i] for i in kept)
-        mechanism = dataclasses.replace(self.mechanism, effects=effects)
+        trusted = frozenset(
+            n for n in self.mechanism.trusted if n.rpartition(".")[0] in {f"{e.at}.{e.name}" for e in effects}
+        )
+        mechanism = dataclasses.replace(self.mechanism, effects=effects, trusted=trusted)
         names = {n: k for k, n in enumerate(self.mechanism.parameter_names)}
         rows = own_states(self.mechanism)
         moving = range(2 * len(self.mechanism.coordinates))
         return ReducedModel(
             mechanism,
-            tuple(kept),
+            kept,
             tuple(names[n] for n in mechanism.parameter_names),
             tuple(sorted([*moving, *(row for i in kept for row in rows.get(i, ()))])),
         )

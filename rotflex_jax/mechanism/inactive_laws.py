@@ -43,7 +43,14 @@ from rotflex_jax.mechanism.gear import gear_steps
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
 from rotflex_jax.mechanism.sensitivities import LinearisedRun, RecordingSamples, RunParameters
-from rotflex_jax.mechanism.simulate import PredictorStep, Solver, prepared_run, read_outputs
+from rotflex_jax.mechanism.simulate import (
+    PredictorStep,
+    Solver,
+    prepared_run,
+    read_outputs,
+    sensor_readings,
+    true_outputs,
+)
 from rotflex_jax.mechanism.step import Exponential, exponential_euler
 
 
@@ -96,6 +103,9 @@ class AddedFriction(DryFriction):
         return _traced.evaluations(position, speed)
 
 
+# Evaluations of friction levels in a step with torques: both directions, at its stages and twice at its end.
+FRICTION_EVALUATIONS = 6
+
 Extended = tuple[Mechanism, Solver, tuple[Effect, ...]]
 """What is active, the integration rule, and the effects beside it that record evaluations."""
 
@@ -117,6 +127,7 @@ class RunResponses(NamedTuple):
 
     Attributes:
         run: States and the Jacobians of the steps.
+        ideal: Readings of ideal sensors.
         voltage: What drives each step [V], each substep of it where it changes within the sample.
         to_voltage: Change of the state after a step per volt.
         to_reading: The same per unit that a sensor reads more.
@@ -125,6 +136,7 @@ class RunResponses(NamedTuple):
     """
 
     run: LinearisedRun
+    ideal: Float[Array, "*batch N C"]
     voltage: Float[Array, "*batch N h"]
     to_voltage: Float[Array, "*batch N h n"]
     to_reading: Float[Array, "*batch N C n"]
@@ -190,6 +202,7 @@ def run_responses(
     H = jax.vmap(lambda way: jax.jvp(read, (X.T,), (way,))[1])(units)
     return RunResponses(
         LinearisedRun(X, A),
+        true_outputs(structure, X.T).T,
         v.reshape(len(X), -1),
         to_voltage,
         -to_measured,
@@ -217,7 +230,11 @@ def friction_responses(
         count = at_ports[0].motion.shape[2] if at_ports else None
         found = _responses(extended, parameters, samples, X, laws_alone=True, count=count)
         at_ports.append(_by_port(*found, 2, 1))
-    return jax.tree.map(lambda *each: jnp.concatenate(each, axis=1), *at_ports)
+    motion, response = jax.tree.map(lambda *each: jnp.concatenate(each, axis=1), *at_ports)
+    # A step without torques has fewer evaluations; filled up, all structures share the program of laws.
+    more = max(FRICTION_EVALUATIONS - motion.shape[2], 0)
+    motion = jnp.concatenate([motion, *[motion[:, :, :2]] * (more // 2)], axis=2)
+    return PortResponses(motion, jnp.pad(response, ((0, 0), (0, 0), (0, more), (0, 0))))
 
 
 def _by_port(
@@ -453,24 +470,27 @@ def signal_sensitivities(
 ) -> Float[Array, "D N C"]:
     """Derivatives of the predicted outputs along effects on the voltage and on readings.
 
+    What else is in the model enters by the responses alone, so that one program serves all models.
+
     Args:
-        structure: With these effects, none of which has states; static.
+        structure: All effects on the voltage and on readings; static. Those that the directions
+            move have no states.
         solver: Integration rule; static.
         values: Parameter values at which each direction is tried.
         gates: Gates there.
         dvalues: Directions in the values.
         dgates: Directions in the gates.
         samples: The recording.
-        responses: From `run_responses`.
+        responses: From `run_responses`, the states of the run those of this structure.
     """
-    X = responses.run.X
+    N, x, ideal = len(responses.ideal), responses.run.X.T, responses.ideal.T
 
     def voltage(values: Array, gates: Array) -> Array:
         v = motor_voltage(structure.with_values(values), gates, samples.u, samples.Ts)
-        return solver.inputs(v).reshape(len(X), -1)
+        return solver.inputs(v).reshape(N, -1)
 
     def reading(values: Array, gates: Array) -> Array:
-        return read_outputs(structure.with_values(values), gates, X.T).T
+        return sensor_readings(structure.with_values(values), gates, ideal, x).T
 
     def slopes(f: Callable[[Array, Array], Array]) -> Array:
         one = lambda *at: jax.jvp(f, at[:2], at[2:])[1]  # noqa: E731

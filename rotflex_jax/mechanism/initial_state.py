@@ -1,16 +1,15 @@
 """The state at the start of a recording from its first samples, by least squares through the simulator."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from rotflex_jax.mechanism.assembly import Layout, rest_state
+from rotflex_jax.mechanism.assembly import Layout, motor_voltage, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.simulate import Solver, free_run
+from rotflex_jax.mechanism.scan import states
+from rotflex_jax.mechanism.simulate import FreeStep, Solver, read_outputs
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_compiled
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -81,12 +80,18 @@ def _fitted_states(
     """
     m = guess.shape[1]
     increments = jnp.concatenate([jnp.zeros((1, m)), DIFFERENCE * jnp.eye(m)])
-    runs = jax.vmap(functools.partial(free_run, structure, solver), in_axes=(None, None, 0, None, None))
+    # Formed once, outside of the minimisation, whose loop would have to be traced with them.
+    mechanism, constants = structure.with_values(values), solver.prepare(structure, values, gates, Ts)
 
     def fitted(guess: Array, hidden: Array, u: Array, y: Array) -> Array:
+        v = solver.inputs(motor_voltage(mechanism, gates, u, Ts))
+
+        def run(x0: Array) -> Array:
+            return read_outputs(mechanism, gates, states(FreeStep(structure, solver), x0, v, constants).T).T
+
         def linearise(x: Array) -> NormalEquations:
             starts = jnp.concatenate([x[None] + increments, jnp.tile(hidden[None], (m + 1, 1))], axis=1)
-            e = (runs(values, gates, starts, u, Ts)[1] - y[None]).reshape(m + 1, -1)
+            e = (jax.vmap(run)(starts) - y[None]).reshape(m + 1, -1)
             return NormalEquations.of((e[1:] - e[:1]).T / DIFFERENCE, e[0])
 
         return minimise_compiled(linearise, guess, RULES, max_steps=MAX_EVALUATIONS)[0]
