@@ -51,7 +51,7 @@ def test_a_baseline_that_does_not_move_hides_no_friction() -> None:
     inertia = "hub.inertia.inertia"
     assert values(found.baseline.model)[inertia] > 100 * values(model)[inertia]
     assert [note for note in found.notes if inertia in note and "rest" in note]
-    assert found.verdict == "found"
+    assert found.verdict == "found" and found.final_fit is None
     assert [(r.effect, r.port) for r in found.rounds if r.effect != "voltage_offset"] == [("coulomb", "hub")]
     m = values(found.model)
     assert m["hub.coulomb.level"] == pytest.approx(LEVEL, rel=0.02)

@@ -109,7 +109,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
             errors={
                 name: {
                     stage: errors(model, [recording])
-                    for stage, model in (("baseline", result.baseline.model), ("final", result.model))
+                    for stage, model in (("baseline", result.baseline.model), ("final", result.final.model))
                 }
                 for name, recording in (("validation", w.validation), ("test", w.test))
             },

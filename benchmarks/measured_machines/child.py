@@ -62,12 +62,15 @@ def row(
         "reported": {
             "baseline": reported(told["baseline"]),
             "final": reported((told["rounds"] or [told["baseline"]])[-1]),
+            # The last one fitted to all that had a say, where the search has done that.
+            "fitted to all": reported(told["final_fit"]) if told["final_fit"] else None,
         },
         "simulated": {
             "baseline": errors(result.baseline.model, way.test),
-            "final": errors(result.model, way.test),
+            "final": errors(result.final.model, way.test),
+            "fitted to all": errors(result.model, way.test) if result.final_fit else None,
         },
-        "each_test": [errors(result.model, [r]) for r in way.test] if len(way.test) > 1 else None,
+        "each_test": [errors(result.final.model, [r]) for r in way.test] if len(way.test) > 1 else None,
         "seconds": {
             part: sum(r.N * r.Ts for r in getattr(way, part)) for part in ("train", "validation", "test")
         },

@@ -157,8 +157,8 @@ def estimate_line(name: str, estimate: Any) -> str:
 
 def print_discovery(result: Any) -> None:
     """Verdict, rounds, errors on validation and test data, and where the model failed."""
-    from rotflex_jax.discover.tables import error_lists, status_sentence
-    from rotflex_jax.effects.labels import effect_label, with_titles
+    from rotflex_jax.discover.tables import error_lists, final_fit_sentence, status_sentence
+    from rotflex_jax.effects.labels import with_titles
 
     console = output()
     units = {name: unit_of(result.validation[0], name) for name in result.baseline.held_out_rmse}
@@ -174,17 +174,18 @@ def print_discovery(result: Any) -> None:
         console.print(f"  {status_sentence(added)}", markup=False)
     if result.probabilities:
         console.print(f"\n{result.probabilities.sentence}", markup=False)
-    names = ["baseline", *(f"+ {effect_label(added.effect, added.port)}" for added in result.rounds)]
     floor, seconds = ("noise floor of the sensor", result.noise_floor), digits(result.baseline.window_seconds)
     for title, note, errors in error_lists(result):
         console.print(f"\n{title}", style="bold", markup=False)
         console.print(note, markup=False)
         for heading, each in (
-            ("RMS error of one free run over all of it", [e.whole for e in errors]),
-            (f"The same, restarted every {seconds} s", [e.windows for e in errors]),
+            ("RMS error of one free run over all of it", [(name, e.whole) for name, e in errors.items()]),
+            (f"The same, restarted every {seconds} s", [(name, e.windows) for name, e in errors.items()]),
         ):
             console.print(f"\n{heading}")
-            console.print(error_table([*zip(names, each, strict=True), floor], units))
+            console.print(error_table([*each, floor], units))
+    if told := final_fit_sentence(result):
+        console.print(f"\n{told}", markup=False)
     if result.where:
         console.print("\nWhere the baseline failed", style="bold")
         for place in result.where:

@@ -21,6 +21,7 @@ from rotflex_jax.discover.tables import (
     channel_headings,
     channel_units,
     error_rows,
+    final_fit_sentence,
     noise_row,
     outcomes,
     stage_labels,
@@ -48,6 +49,9 @@ LISTED_CANDIDATES = 8
 class Discovery(SearchResult):
     """What a search found, with its report, the torques that are missing, and the next experiment."""
 
+    def __str__(self) -> str:
+        return "\n".join(part for part in (super().__str__(), final_fit_sentence(self)) if part)
+
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
         """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
         groups = (self.train, self.validation) if self.validation != self.train else (self.train,)
@@ -65,10 +69,10 @@ class Discovery(SearchResult):
             at: Port of the torque.
             progress: Called with a line of text at each stage.
         """
-        seconds, m = self.baseline.window_seconds, self.model.mechanism
+        seconds, m = self.baseline.window_seconds, self.final.model.mechanism  # saw no validation recording
         for effect in [e for e in m.effects if e.line]:  # its phase is that of one recording
             m = m.without(effect.name, effect.at)
-        model = Model(m, self.model.solver)
+        model = Model(m, self.final.model.solver)
         return learn_torque(model, self.train, self.validation, at, window_seconds=seconds, progress=progress)
 
     def identifiability(self) -> Identifiability | None:
@@ -109,9 +113,9 @@ class Discovery(SearchResult):
         return Explanation(latent, torque, remaining_failures(self), tests, self.identifiability())
 
     def save(self, path: str | Path) -> Path:
-        """Write the final model as JSON, with its estimates; `Model.load` reads the model."""
+        """Write the model to use as JSON, with its estimates; `Model.load` reads the model."""
         seen = self.train[0]
-        return save(Saved(self.model, self.final.estimates, Ts=seen.Ts, n_init=seen.n_init), path)
+        return save(Saved(self.model, self.estimates, Ts=seen.Ts, n_init=seen.n_init), path)
 
     def prediction_bands(
         self,
@@ -227,5 +231,5 @@ class Discovery(SearchResult):
             ),
             folded("Where the baseline failed", bullets(sentence(w.statement) for w in self.where)),
             folded("Ranking before any was added", table(("candidate", "", "score [nat]"), ranked, words=2)),
-            bullets(self.notes),
+            bullets([*([told] if (told := final_fit_sentence(self)) else []), *self.notes]),
         )

@@ -13,6 +13,7 @@ from rotflex_jax.discover.verdict import NEAR_FLOOR as NEAR_FLOOR, Assessment, V
 from rotflex_jax.effects.labels import effect_phrase, with_titles
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.fit.plausibility import Remark
+from rotflex_jax.fit.result import Fit
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
@@ -156,6 +157,49 @@ class Stage:
                 windows = name.removesuffix(suffix) + "_windows" + suffix
                 out[name] = plain(errors.whole)
                 out[windows] = {"seconds": self.window_seconds, **plain(errors.windows)}
+        return out
+
+
+@dataclasses.dataclass(frozen=True)
+class FinalFit:
+    """The final model of a search that ends unexplained, fitted once more to all that had a say in it.
+
+    The fit is to free runs over windows, from what the first samples of each show.
+
+    Attributes:
+        fit: To the training and validation recordings together, with what each has for itself.
+        model: The model of it, with nothing that belongs to one recording.
+        trained: Errors on validation recordings, with their own offsets where these are calibrated, of the
+            structure fitted in the same way to training recordings alone.
+        searched: The same errors of the final model as the search has fitted it.
+        test: Errors on recordings that had no say, if there are any.
+        test_calibrated: The same with each recording's own offsets.
+    """
+
+    fit: Fit
+    model: Model
+    trained: RunErrors
+    searched: RunErrors
+    test: RunErrors | None = None
+    test_calibrated: RunErrors | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        out: dict[str, Any] = {
+            "window_seconds": self.fit.options.window_seconds,
+            "status": self.fit.status,
+            "parameters": {e.name: {**e.to_dict(), "free": e.free} for e in self.fit.parameters},
+        }
+        for name, suffix, errors in (
+            ("held_out_rmse_of_training_fit", "", self.trained),
+            ("held_out_rmse_of_search", "", self.searched),
+            ("test_rmse", "", self.test),
+            ("test_rmse", "_calibrated", self.test_calibrated),
+        ):
+            if errors is not None:
+                out[name + suffix] = plain(errors.whole)
+                seconds = {"seconds": self.fit.options.window_seconds}
+                out[f"{name}_windows{suffix}"] = seconds | plain(errors.windows)
         return out
 
 
@@ -352,6 +396,8 @@ class SearchResult:
         probabilities: Of sets of effects and of effects; None for results made by hand.
         conditional: Parameters whose intervals from predictions and from free runs exclude each other: the
             model is incomplete, and its intervals hold only under it.
+        final_fit: Of a search that ends unexplained, the final model fitted to training and validation
+            recordings.
     """
 
     verdict: Verdict
@@ -370,11 +416,23 @@ class SearchResult:
     remarks: tuple[Remark, ...] = ()
     probabilities: Probabilities | None = None
     conditional: tuple[ConditionalInterval, ...] = ()
+    final_fit: FinalFit | None = None
 
     @property
     def model(self) -> Model:
-        """The model after the last round."""
-        return self.final.model
+        """The model to use: that after the last round, or its final fit where there is one.
+
+        Errors of the stages are those of `final.model`, which was fitted to the training recordings alone.
+        """
+        return self.final_fit.model if self.final_fit else self.final.model
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """Parameters of `model` with intervals."""
+        if self.final_fit is None:
+            return self.final.estimates
+        names = self.model.mechanism.parameter_names
+        return tuple(e for e in self.final_fit.fit.parameters if e.name in names)
 
     @property
     def final(self) -> Stage:
@@ -394,7 +452,10 @@ class SearchResult:
         return assess(*errors, self.noise_floor, self.final.process_noise_nats, samples)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types, schema 1."""
+        """Plain JSON types, schema 1.
+
+        `parameters` are those of the last stage; those of the model to use are in `final_fit`, if any.
+        """
         first = self.validation[0]
         return {
             "schema": 1,
@@ -415,6 +476,7 @@ class SearchResult:
             "remarks": [r.to_dict() for r in self.remarks],
             "probabilities": self.probabilities.to_dict() if self.probabilities else None,
             "conditional_intervals": [c.to_dict() for c in self.conditional],
+            "final_fit": self.final_fit.to_dict() if self.final_fit else None,
             "elapsed_s": self.elapsed_s,
         }
 

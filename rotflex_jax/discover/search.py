@@ -76,7 +76,8 @@ def discover(
             samples for the errors reported, and size and phase of a periodic disturbance, which are fitted to
             the whole of each. They also help to estimate the noise of the sensors, and the
             model that was chosen is fitted to them once, to see whether its parameters are the same there.
-            Without any, every training recording validates what was fitted to the others.
+            Where the search ends unexplained, `Discovery.model` is fitted to them as well. Without any, every
+            training recording validates what was fitted to the others.
         test: Recordings that have no say in anything; the errors on them are reported beside.
         candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
             answer to those of the flexible joint (`mechanism.roles`).

@@ -18,6 +18,7 @@ from rotflex_jax.discover.evaluation import (
     paired_estimates,
     process_noise_gain,
 )
+from rotflex_jax.discover.final_fit import fit_to_all
 from rotflex_jax.discover.hypothesis import Hypothesis, without
 from rotflex_jax.discover.input_reading import smooth_note
 from rotflex_jax.discover.likelihood import choose_process_noise, refit
@@ -25,6 +26,7 @@ from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
 from rotflex_jax.discover.result import (
     ConditionalInterval,
+    FinalFit,
     Ranked,
     Round,
     Stage,
@@ -53,6 +55,7 @@ class EvaluatedModels:
         rounds: What was added, in order.
         where: When the error of the baseline is large.
         test: Recordings that had no say.
+        final_fit: The final model fitted to all that had a say; None where it explains its recordings.
     """
 
     stages: tuple[Stage, ...]
@@ -62,6 +65,7 @@ class EvaluatedModels:
     rounds: tuple[Round, ...]
     where: tuple[Where, ...]
     test: tuple[Recording, ...]
+    final_fit: FinalFit | None
 
 
 def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedModels:
@@ -100,6 +104,7 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
         rounds=_rounds(state, stages, pairs, remarks, {} if explained else stand_ins(state)),
         where=locate(longest, residual, channels, noise, model.mechanism, window_seconds=seconds),
         test=evaluation.recordings,
+        final_fit=None if explained else fit_to_all(state, stages[-1], validated[-1], evaluation),
     )
 
 
@@ -148,6 +153,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             state, assess_stages(baseline, final, state.noise_floor, held_back).misfit
         ),
         conditional=conditional,
+        final_fit=evaluated.final_fit,
     )
 
 

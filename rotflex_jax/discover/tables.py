@@ -2,6 +2,7 @@
 
 import dataclasses
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,6 +60,10 @@ class ParameterRow:
     given: str = ""
 
 
+FITTED_TO_ALL = "the last, fitted to all recordings that had a say"
+"""Label of the final fit."""
+
+
 def stage_labels(discovery: SearchResult) -> tuple[str, ...]:
     """A short name for each stage."""
     added = (f"+ {effect_label(r.effect, r.port)}" for r in discovery.rounds)
@@ -80,39 +85,85 @@ class ErrorTable:
     rows: tuple[ErrorRow, ...]
 
 
-def error_lists(discovery: SearchResult) -> list[tuple[str, str, list[RunErrors]]]:
-    """Errors of every stage on validation and on test data, with and without own offsets.
+class NamedErrors(NamedTuple):
+    """Errors of several models on some recordings.
 
-    Returns:
-        Which recordings, what say they had, and the errors; what there is.
+    Attributes:
+        title: Which recordings, and with which offsets.
+        note: What say they had.
+        errors: Label of a model -> its errors.
     """
-    stages = discovery.stages
+
+    title: str
+    note: str
+    errors: dict[str, RunErrors]
+
+
+def error_lists(discovery: SearchResult) -> list[NamedErrors]:
+    """Errors of every stage on validation and on test data, with and without own offsets; what there is.
+
+    The fit to all that had a say has errors on test data alone.
+    """
+    stages, labels, last = discovery.stages, stage_labels(discovery), discovery.final_fit
     own = f", each recording with the offsets of its own first {stages[0].calibrate_seconds:g} s"
     chose, no_say = "These recordings chose the model.", "No choice rests on these recordings."
     if not discovery.test:
         chose += " Recordings that had no say (test=) would show its error without favour."
+    tested = (last.test, last.test_calibrated) if last else (None, None)
     listed = [
-        ("Validation data", chose, [RunErrors(s.held_out_rmse, s.held_out_rmse_windows) for s in stages]),
-        ("Validation data" + own, chose, [s.calibrated for s in stages]),
-        ("Test data", no_say, [s.test for s in stages]),
-        ("Test data" + own, no_say, [s.test_calibrated for s in stages]),
+        (
+            "Validation data",
+            chose,
+            [RunErrors(s.held_out_rmse, s.held_out_rmse_windows) for s in stages],
+            None,
+        ),
+        ("Validation data" + own, chose, [s.calibrated for s in stages], None),
+        ("Test data", no_say, [s.test for s in stages], tested[0]),
+        ("Test data" + own, no_say, [s.test_calibrated for s in stages], tested[1]),
     ]
-    known = [(title, note, [e for e in errors if e is not None]) for title, note, errors in listed]
-    return [(title, note, errors) for title, note, errors in known if errors]
+    found = []
+    for title, note, of_stages, of_fit in listed:
+        errors = {label: e for label, e in zip(labels, of_stages, strict=True) if e is not None}
+        if errors:
+            found.append(NamedErrors(title, note, errors | ({FITTED_TO_ALL: of_fit} if of_fit else {})))
+    return found
 
 
 def error_tables(discovery: SearchResult) -> tuple[ErrorTable, ...]:
     """The same as tables for people."""
-    by_channel, labels = channel_units(discovery), stage_labels(discovery)
+    by_channel = channel_units(discovery)
 
     def cells(errors: dict[str, float]) -> tuple[ErrorCell, ...]:
         return tuple(_cell(errors[c], unit, discovery.noise_floor.get(c)) for c, unit in by_channel.items())
 
-    def rows(errors: list[RunErrors]) -> tuple[ErrorRow, ...]:
-        pairs = zip(labels, errors, strict=True)
-        return tuple(ErrorRow(label, cells(e.windows), cells(e.whole)) for label, e in pairs)
+    def rows(errors: dict[str, RunErrors]) -> tuple[ErrorRow, ...]:
+        return tuple(ErrorRow(label, cells(e.windows), cells(e.whole)) for label, e in errors.items())
 
     return tuple(ErrorTable(title, note, rows(errors)) for title, note, errors in error_lists(discovery))
+
+
+def final_fit_sentence(discovery: SearchResult) -> str:
+    """How the model to use was fitted, and how well that does; empty where it is that of the last round."""
+    found = discovery.final_fit
+    if found is None:
+        return ""
+    used = (
+        "all recordings" if discovery.validation == discovery.train else "training and validation recordings"
+    )
+    before, after = found.searched.windows, found.trained.windows
+    shown = []
+    for channel, unit in channel_units(discovery).items():
+        (old, read), (new, _) = (readable(errors[channel], unit) for errors in (before, after))
+        shown.append(f"{channel} {plain_number(new)} {read} (of the search: {plain_number(old)})")
+    seconds, calibrated = found.fit.options.window_seconds, discovery.final.calibrate_seconds
+    own = f", each with the offsets of its own first {calibrated:g} s" if calibrated else ""
+    ending = "" if found.fit.status == "converged" else f" The fit {found.fit.status}."
+    remarks = "".join(f" {remark.sentence}." for remark in found.fit.remarks)
+    return (
+        f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
+        f"measured first states. The same fit to other recordings alone has errors over {seconds:g} s on "
+        f"validation data of {', '.join(shown)}{own}.{ending}{remarks}"
+    )
 
 
 def error_rows(discovery: SearchResult) -> tuple[ErrorRow, ...]:
@@ -149,8 +200,13 @@ def channel_headings(discovery: SearchResult) -> tuple[str, ...]:
 
 
 def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
-    """Parameters of the final model, then those of earlier stages that it lacks; held ones last."""
+    """Parameters of the final model, then those of earlier stages that it lacks; held ones last.
+
+    The final fit is one stage more, where there is one.
+    """
     stages = [{e.name: e for e in s.estimates} for s in discovery.stages]
+    if discovery.final_fit:
+        stages.append({e.name: e for e in discovery.estimates})
     names = list(dict.fromkeys(n for s in reversed(stages) for n in s))
     meanings = _meanings(discovery.stages)
     rows = []

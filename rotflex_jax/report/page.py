@@ -11,10 +11,12 @@ from rotflex_jax.discover.explanation import Explanation, LatentTorqueComparison
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.result import Ranked, SearchResult, Where
 from rotflex_jax.discover.tables import (
+    FITTED_TO_ALL,
     Outcome,
     channel_headings,
     channel_units,
     error_tables,
+    final_fit_sentence,
     next_steps,
     noise_row,
     outcomes,
@@ -28,7 +30,7 @@ from rotflex_jax.latent import LatentTorque
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures import pictures
-from rotflex_jax.text.colours import stage_colours
+from rotflex_jax.text.colours import INK, stage_colours
 from rotflex_jax.text.markup import as_json, fill_template, write_files
 from rotflex_jax.text.numbers import (
     equation,
@@ -47,6 +49,9 @@ REPORTED_PACKAGES = ("rotflex_jax", "jax", "equinox", "optimistix", "numpy", "sc
 def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]:
     """What the template fills in; plain text that the template escapes."""
     labels, colours = stage_labels(discovery), stage_colours(len(discovery.stages))
+    models = list(zip(labels, colours, strict=True))
+    if discovery.final_fit:
+        models.append((FITTED_TO_ALL, INK))
     latent, learned, remaining = explanation.latent, explanation.learned, explanation.remaining
     return {
         "tone": tone(discovery),
@@ -59,7 +64,8 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "probable": discovery.probabilities,
         "notes": discovery.notes,
         "steps": next_steps(discovery),
-        "stages": list(zip(labels, colours, strict=True)),
+        "stages": models,
+        "final_fit": final_fit_sentence(discovery),
         "error_tables": error_tables(discovery),
         "headings": channel_headings(discovery),
         "noise": noise_row(discovery),

@@ -39,7 +39,7 @@ def summary_table(discovery: SearchResult) -> Table:
 
 
 def parameter_table(discovery: SearchResult) -> Table:
-    """Parameters of the final model with 95 % intervals, for `rich.print`.
+    """Parameters of the last stage, or of its final fit, with 95 % intervals, for `rich.print`.
 
     Args:
         discovery: What was found.

@@ -1,0 +1,228 @@
+"""The last fit of a search that ends unexplained: the structure that was chosen, to all that had a say.
+
+A search fits its models to training recordings alone, so that validation data can compare them. Once these
+have chosen, they are as good to learn from as the others: friction differs with the amplitude of the motion
+and from run to run, and half of the recordings show half of that.
+
+Parameters of an incomplete model depend on what they are fitted to. Those of the search suit predictions, or
+free runs that each have a first state of their own, which may hide a drift of the model. Whoever uses a model
+starts it from a measured state. So this fit is to free runs over windows from what their first samples show,
+unless validation data speak against that clearly, tried on the training recordings alone. Validation data
+also decide whether recordings have offsets that the search could do without.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from rotflex_jax.discover.evaluation import (
+    Evaluation,
+    errors_as_trained,
+    errors_with_own_calibration,
+    free_runs,
+)
+from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
+from rotflex_jax.discover.result import FinalFit, RunErrors, Stage
+from rotflex_jax.discover.search_state import SearchState
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
+from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.errors import InputError
+from rotflex_jax.fit.greybox import fit
+from rotflex_jax.fit.result import Fit
+from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Transform
+from rotflex_jax.recording import Recording
+
+# Errors of a fit from measured first states over those of the search, both fitted to training recordings,
+# up to which the former is taken: logarithm of their ratio on validation data, mean over channels.
+MOST_WORSE = 0.2
+# Where runs validate each other, at most so many fits, each without a share of them, say how well a way does.
+MOST_FOLDS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class _Structure:
+    """What is fitted.
+
+    Attributes:
+        model: The final model, with the calibrations of its recordings.
+        local: Parameters that each recording has for itself.
+        own: Calibrations that are not carried over to other recordings.
+        on: What is on in the model that a user gets.
+        hypothesis: The same as the search has it.
+        supermodel: What it is a hypothesis of.
+        window_seconds: Length of free runs [s].
+    """
+
+    model: Model
+    local: tuple[str, ...]
+    own: tuple[EffectLocation, ...]
+    on: tuple[EffectLocation, ...]
+    hypothesis: Hypothesis
+    supermodel: SuperModel
+    window_seconds: float
+
+    @classmethod
+    def of(cls, state: SearchState, h: Hypothesis, window_seconds: float) -> "_Structure":
+        """That of a hypothesis."""
+        s = state.problem.supermodel
+        model = Model(s.clean(h.mean_values(s), h.locations), state.model.solver)
+        free = model.mechanism.free_names
+        local = [s.mechanism.parameter_names[i] for i in h.local]
+        own = tuple(p for p in h.locations if p in s.calibrations and p not in state.order)
+        local = tuple(n for n in local if n in free)
+        return cls(model, local, own, tuple(state.order), h, s, window_seconds)
+
+    def fitted(self, recordings: Sequence[Recording]) -> Fit:
+        """The structure fitted to free runs of recordings, from where the search has ended."""
+        how = {"first": "measured", "window_seconds": self.window_seconds}
+        return fit(self.model, list(recordings), local=self.local, **how)
+
+    def as_hypothesis(self, found: Fit) -> Hypothesis:
+        """A fit in the terms of the search, what recordings have for themselves at its mean."""
+        s, m = self.supermodel, found.model.mechanism
+        rows = [s.mechanism.parameter_names.index(n) for n in m.parameter_names]
+        z = self.hypothesis.z.copy()
+        z[rows] = Transform.of(m.parameter_specifications).unconstrain(m.values)
+        local_z = np.tile(z[list(self.hypothesis.local)], (len(self.hypothesis.x0), 1))
+        return dataclasses.replace(self.hypothesis, z=z, local_z=local_z)
+
+    def validated(self, h: Hypothesis, folds: Sequence[Hypothesis] = ()) -> ValidatedHypothesis:
+        """A hypothesis, or one for each recording, as errors are evaluated; nothing is adapted."""
+        return ValidatedHypothesis(h, np.zeros(0), h, np.zeros(0), folds=tuple(folds))
+
+    def carried(self, found: Fit) -> Model:
+        """The model of a fit without what belongs to the recordings that were fitted."""
+        m = found.model.mechanism
+        for location in self.own:
+            m = m.without(*location)
+        return dataclasses.replace(found.model, mechanism=m)
+
+
+def fit_to_all(
+    state: SearchState, stage: Stage, final: ValidatedHypothesis, evaluation: Evaluation
+) -> FinalFit | None:
+    """The final model fitted once more, to training and validation recordings together.
+
+    Args:
+        state: What was found.
+        stage: The final model as it is reported.
+        final: The same as a hypothesis.
+        evaluation: The recordings that errors are reported on.
+
+    Returns:
+        The fit; None where validation data speak against it, where it does worse on them than the model that
+        has not seen them, or with a periodic disturbance, whose phase no other recording shares.
+    """
+    if state.problem.supermodel.phased.intersection(final.hypothesis.local):
+        return None
+    state.say("fitting what was chosen to all recordings that had a say")
+    try:
+        return _fitted_to_all(state, stage, final.hypothesis, evaluation)
+    except InputError:  # some recordings cannot be fitted alone: no reason to lose what was found
+        return None
+
+
+def _fitted_to_all(
+    state: SearchState, stage: Stage, h: Hypothesis, evaluation: Evaluation
+) -> FinalFit | None:
+    train, validation = state.problem.dataset.recordings, state.validation
+    held_back = () if validation.folds else validation.problem.dataset.recordings
+    searched = stage.calibrated or RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
+    tried = []
+    for given in (h, with_all_calibrations(state.problem.supermodel, h)):
+        if not tried or given.locations != h.locations:
+            structure = _Structure.of(state, given, validation.window_seconds)
+            fits = _without_each(structure, train) if validation.folds else [structure.fitted(train)]
+            tried.append((structure, fits, _on_validation(structure, fits, evaluation)))
+    structure, fits, trained = min(tried, key=lambda each: log_error_ratio(each[2], searched))
+    if log_error_ratio(trained, searched) > MOST_WORSE:
+        return None
+    structure = _with_offsets_of_the_machine(structure, fits, evaluation)
+    found = structure.fitted((*train, *held_back))
+    # A fit to recordings that does worse on them than one that has not seen them has failed; without their
+    # offsets it may be a little worse by chance.
+    every, bare = [found] * len(fits), RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
+    failed = log_error_ratio(_as_carried(structure, every, evaluation), bare) > MOST_WORSE
+    if failed or log_error_ratio(_on_validation(structure, every, evaluation), searched) > 0:
+        return None
+    return _reported(structure, found, evaluation, trained, searched)
+
+
+def _with_offsets_of_the_machine(
+    structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation
+) -> _Structure:
+    """The structure that carries over what makes runs of other recordings better with its fitted value."""
+    for location in structure.own:
+        left = tuple(p for p in structure.own if p != location)
+        more = dataclasses.replace(structure, own=left, on=(*structure.on, location))
+        errors = (_as_carried(each, fits, evaluation) for each in (more, structure))
+        if log_error_ratio(*errors) < 0:
+            structure = more
+    return structure
+
+
+def log_error_ratio(a: RunErrors, b: RunErrors) -> float:
+    """Logarithm of errors `a` over windows by errors `b`, mean over channels.
+
+    Infinite where runs of `a` diverge, minus infinity where those of `b` alone do.
+    """
+    before, after = (np.array([x.windows[c] for c in b.windows]) for x in (b, a))
+    if not np.isfinite(after).all():
+        return np.inf
+    if not np.isfinite(before).all():
+        return -np.inf
+    least = np.finfo(float).tiny
+    return float(np.mean(np.log(np.maximum(after, least) / np.maximum(before, least))))
+
+
+def _without_each(structure: _Structure, train: Sequence[Recording]) -> list[Fit]:
+    """For each training recording a fit to others; of many, every third one is left out at a time."""
+    folds, each = min(len(train), MOST_FOLDS), range(len(train))
+    fits = [structure.fitted([train[k] for k in each if k % folds != fold]) for fold in range(folds)]
+    return [fits[k % folds] for k in each]
+
+
+def _on_validation(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> RunErrors:
+    """Errors on the validation recordings of one fit, or of one for each, with own offsets if these count."""
+    validation, seconds = evaluation.validation, evaluation.calibrate_seconds
+    if not seconds:
+        return _as_carried(structure, fits, evaluation)
+    each = [structure.as_hypothesis(found) for found in fits]
+    found = structure.validated(each[0], each if validation.folds else ())
+    return errors_with_own_calibration(validation, found, structure.on, seconds)
+
+
+def _as_carried(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> RunErrors:
+    """The same with what the fits carry over, and nothing of the recordings' own."""
+    validation, each = evaluation.validation, [structure.as_hypothesis(found) for found in fits]
+    if not validation.folds:
+        return errors_as_trained(validation, each[0], structure.on)
+    return free_runs(validation, [validation.model_of(h, structure.on, 0) for h in each]).errors
+
+
+def _reported(
+    structure: _Structure,
+    found: Fit,
+    evaluation: Evaluation,
+    trained: RunErrors,
+    searched: RunErrors,
+) -> FinalFit:
+    """A fit with its errors on recordings that had no say."""
+    test = calibrated = None
+    seconds = evaluation.calibrate_seconds
+    if evaluation.test:
+        h = structure.as_hypothesis(found)
+        test = errors_as_trained(evaluation.test, h, structure.on)
+        if seconds:
+            validated = structure.validated(h)
+            calibrated = errors_with_own_calibration(evaluation.test, validated, structure.on, seconds)
+    return FinalFit(
+        fit=found,
+        model=structure.carried(found),
+        trained=trained,
+        searched=searched,
+        test=test,
+        test_calibrated=calibrated,
+    )

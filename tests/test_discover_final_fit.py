@@ -1,0 +1,216 @@
+"""The model of a search that ends unexplained is fitted once more, to all recordings that had a say."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rotflex_jax as rf
+from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
+from rotflex_jax.discover.result import RunErrors
+from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
+from rotflex_jax.effects import Coulomb
+from rotflex_jax.recording.recording import digest_of_recordings
+
+MODULE = sys.modules[log_error_ratio.__module__]
+INERTIA, DRIVE, DAMPING = 0.0075, 48.4 * 0.0107 / 3.29, (48.4 * 0.0107) ** 2 / 3.29
+LEVEL, OFFSET, CANDIDATES = "hub.coulomb.level", "input.voltage_offset.offset", [(Coulomb, "hub")]
+
+
+def run(level: float, offset: float, seed: int, N: int = 3000, Ts: float = 0.002, fine: int = 20):
+    """An arm without a spring under a noisy voltage.
+
+        J w' = c (u + offset) - b w - friction
+
+    in explicit steps of 0.1 ms; the friction holds, and has another level in each run. The encoder has steps
+    of 0.5 mrad.
+    """
+    rng, h = np.random.default_rng(seed), Ts / fine
+    u = np.repeat(rng.normal(0.0, 1.5, N // 50), 50)
+    y, q, w = np.empty((N, 1)), 0.0, 0.0
+    for k in range(N):
+        y[k] = round((q + 1e-4 * rng.standard_normal()) / 5e-4) * 5e-4
+        drive = DRIVE * (u[k] + offset)
+        for _ in range(fine):
+            if w == 0.0 and abs(drive) <= level:
+                break
+            direction = np.sign(w if w else drive)
+            after = w + h * (drive - DAMPING * w - level * direction) / INERTIA
+            w = 0.0 if after * w < 0 else after
+            q += h * w
+    return rf.Recording(u, y, Ts, channels=("theta",), n_init=50)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """To fit, to choose by, and one whose friction lies between that of the two."""
+    return run(0.05, 0.0, 0), run(0.075, 0.0, 1), run(0.07, 0.0, 2)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return rf.joints.rotary_arm(flexible=False)
+
+
+@pytest.fixture(scope="module")
+def found(runs, arm):
+    train, validation, test = runs
+    return rf.discover(arm, train, validation, test=test, candidates=CANDIDATES, rounds=1)
+
+
+def level_of(model: rf.Model) -> float:
+    return float(dict(zip(model.mechanism.parameter_names, model.mechanism.values, strict=True))[LEVEL])
+
+
+def short_runs_miss(model: rf.Model, r: rf.Recording) -> float:
+    """Error over windows, written out: the first samples of each window do not count."""
+    e, window = (model.simulate_windows(r, 2.0) - r.y)[:, 0], round(2.0 / r.Ts)
+    counted = [part[r.n_init :] for part in np.split(e, range(window, r.N, window))]
+    return float(np.sqrt(np.mean(np.concatenate(counted) ** 2)))
+
+
+def test_it_has_learnt_from_both(found, runs):
+    last, (_, _, test) = found.final_fit, runs
+    assert found.verdict == "unexplained" and last is not None
+    assert found.model is last.model
+    assert level_of(found.final.model) == pytest.approx(0.05, rel=0.05)
+    assert 0.055 < level_of(found.model) < 0.08
+    assert short_runs_miss(found.model, test) < 0.6 * short_runs_miss(found.final.model, test)
+
+
+def test_its_errors_are_those_of_its_model(found, runs):
+    last, (train, validation, test) = found.final_fit, runs
+    assert last.test.windows["theta"] == pytest.approx(short_runs_miss(last.model, test), rel=1e-6)
+    whole = rf.metrics.rmse(test, last.model.simulate(test))["theta"]
+    assert last.test.whole["theta"] == pytest.approx(whole, rel=1e-6)
+    # It is the fit that a user makes, tried first on data that have not seen what they validate.
+    structure, local = found.final.model.mechanism, []
+    if last.fit.local:
+        structure, local = structure + rf.effects.VoltageOffset("input"), [OFFSET]
+    how = {"first": "measured", "window_seconds": 2.0, "local": local}
+    assert level_of(rf.fit(structure, [train, validation], **how).model) == pytest.approx(
+        level_of(found.model), rel=0.02
+    )
+    alone = rf.fit(structure, train, **how).model
+    assert last.trained.windows["theta"] == pytest.approx(short_runs_miss(alone, validation), rel=0.2)
+
+
+def test_offsets_stay_with_their_recordings(arm, monkeypatch):
+    monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
+    given = run(0.06, 0.03, 0), run(0.06, -0.03, 1)
+    found = rf.discover(arm + Coulomb("hub", level=0.02), *given, candidates=[], rounds=0)
+    last = found.final_fit
+    assert [e.value for e in last.fit.local[OFFSET]] == pytest.approx([0.03, -0.03], abs=0.003)
+    assert OFFSET not in last.model.mechanism.parameter_names
+    assert OFFSET not in [e.name for e in found.estimates]
+    assert level_of(last.model) == pytest.approx(0.06, rel=0.02)
+
+
+def test_an_offset_of_the_machine_is_carried_over(arm, monkeypatch):
+    """One that all recordings have, and that the search has left to them."""
+    monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
+    given = run(0.06, 0.04, 0), run(0.06, 0.04, 1)
+    found = rf.discover(arm + Coulomb("hub", level=0.02), *given, candidates=[], rounds=0)
+    value = dict(zip(found.model.mechanism.parameter_names, found.model.mechanism.values, strict=True))
+    assert value[OFFSET] == pytest.approx(0.04, abs=0.003)
+
+
+def test_data_may_speak_against_it(runs, arm, monkeypatch):
+    monkeypatch.setattr(MODULE, "MOST_WORSE", -np.inf)
+    train, validation, _ = runs
+    found = rf.discover(arm, train, validation, candidates=CANDIDATES, rounds=0)
+    assert found.verdict == "unexplained" and found.final_fit is None
+    assert found.model is found.final.model and found.to_dict()["final_fit"] is None
+    assert final_fit_sentence(found) == ""
+
+
+def test_it_is_saved_and_told(found, tmp_path: Path):
+    read = rf.Model.load(found.save(tmp_path / "model.json"))
+    np.testing.assert_array_equal(read.mechanism.values, found.model.mechanism.values)
+    told = json.loads(json.dumps(found.to_dict()))["final_fit"]
+    assert told["parameters"][LEVEL]["value"] == level_of(found.model)
+    assert told["test_rmse_windows"]["theta"] == found.final_fit.test.windows["theta"]
+    by_title = {errors.title: errors.errors for errors in error_lists(found)}
+    assert FITTED_TO_ALL in by_title["Test data"] and FITTED_TO_ALL not in by_title["Validation data"]
+    assert "measured first states" in final_fit_sentence(found)
+    assert str(found).endswith(final_fit_sentence(found))
+    row = next(r for r in parameter_rows(found) if r.name == LEVEL)
+    assert len(row.stages) == len(found.stages) + 1
+    page = found.report(tmp_path / "report", learned=False).read_text()
+    assert FITTED_TO_ALL in page and "training and validation recordings together" in page
+
+
+def test_runs_that_validate_each_other(runs, arm):
+    """The search has fitted all of them already, but with fitted first states."""
+    found = rf.discover(arm, list(runs), candidates=CANDIDATES, rounds=1)
+    last = found.final_fit
+    assert found.verdict == "unexplained" and last is not None
+    assert 0.05 < level_of(found.model) < 0.08
+    # A fit without a run misses it by the difference of its friction, the fit to all by less.
+    seen = np.sqrt(np.mean([short_runs_miss(found.model, r) ** 2 for r in runs]))
+    assert last.trained.windows["theta"] > seen
+
+
+@pytest.mark.parametrize(("share", "taken"), [(0.98, True), (1.02, False)])
+def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, taken):
+    """Errors of the way, tried on the training recording, just below and just above the limit."""
+    train, validation, _ = runs
+    search = lambda: rf.discover(  # noqa: E731
+        arm, train, validation, candidates=CANDIDATES, rounds=0, calibrate_seconds=0.0
+    )
+    theirs = search().final.held_out_rmse_windows["theta"]
+    alone, errors = digest_of_recordings([train]), MODULE._on_validation
+
+    def on_validation(structure, fits, evaluation):
+        worse = np.exp(share * MOST_WORSE) if fits[0].data == alone else 0.9
+        return errors(structure, fits, evaluation)._replace(windows={"theta": float(worse * theirs)})
+
+    monkeypatch.setattr(MODULE, "_on_validation", on_validation)
+    assert (search().final_fit is not None) == taken
+
+
+def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
+    train, validation, _ = runs
+    fitted = MODULE._Structure.fitted
+
+    def lost(structure, recordings):
+        found = fitted(structure, recordings)
+        if len(recordings) < 2:
+            return found
+        m = found.model.mechanism.with_values({"hub.inertia.inertia": 1.0})
+        return dataclasses.replace(found, model=rf.Model(m, found.model.solver))
+
+    monkeypatch.setattr(MODULE._Structure, "fitted", lost)
+    found = rf.discover(arm, train, validation, candidates=CANDIDATES, rounds=0)
+    assert found.verdict == "unexplained" and found.final_fit is None
+
+
+def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
+    def refuse(structure, recordings):
+        raise rf.InputError("One channel does not move.")
+
+    monkeypatch.setattr(MODULE._Structure, "fitted", refuse)
+    train, validation, _ = runs
+    found = rf.discover(arm, train, validation, candidates=CANDIDATES, rounds=0)
+    assert found.verdict == "unexplained" and found.final_fit is None
+
+
+def test_of_many_runs_each_third_is_left_out():
+    class Structure:
+        def fitted(self, recordings):
+            return tuple(recordings)
+
+    fits = MODULE._without_each(Structure(), list(range(5)))
+    assert fits == [(1, 2, 4), (0, 2, 3), (0, 1, 3, 4), (1, 2, 4), (0, 2, 3)]
+
+
+def test_the_ratio_of_errors_weighs_channels_alike():
+    a, b = ({"theta": 2.0, "alpha": 0.3}, {"theta": 1.0, "alpha": 0.3})
+    assert log_error_ratio(RunErrors({}, a), RunErrors({}, b)) == pytest.approx(0.5 * np.log(2))
+    assert log_error_ratio(RunErrors({}, a | {"alpha": np.nan}), RunErrors({}, b)) == np.inf
+    assert log_error_ratio(RunErrors({}, a), RunErrors({}, b | {"alpha": np.inf})) == -np.inf
+    assert log_error_ratio(RunErrors({}, a), RunErrors({}, b | {"alpha": 0.0})) > MOST_WORSE
+    assert 0 < MOST_WORSE < np.log(2)
