@@ -383,3 +383,25 @@ def test_single_precision_stays_single():
     single, double = (simulate(joint, u.astype(kind), Ts) for kind in (np.float32, np.float64))
     assert (single.dtype, double.dtype) == (np.float32, np.float64)
     np.testing.assert_allclose(single, double, atol=1e-4)
+
+
+def joined_shapes(jaxpr):
+    """Shapes of what is put together of pieces, in programs inside too."""
+    for e in jaxpr.eqns:
+        if "jaxpr" in e.params:
+            yield from joined_shapes(e.params["jaxpr"].jaxpr)
+        if e.primitive.name in ("concatenate", "stack"):
+            yield e.outvars[0].aval.shape
+
+
+@pytest.mark.parametrize("effects", [(fx.LuGre("hub"),), (fx.BoucWen("joint"), fx.Dahl("hub"))])
+def test_the_step_has_one_form_for_all_states(effects):
+    """Pieces put together are a branch in the compiled loop over states and directions: four times slower."""
+    mechanism, solver, D = functools.reduce(lambda m, e: m + e, effects, paper()), Exponential(), 8
+    structure, n = mechanism.structure, len(rest_state(mechanism.structure, float))
+    c = solver.prepare(
+        structure, *map(jnp.asarray, (mechanism.values, np.ones(len(mechanism.effects)), 0.002))
+    )
+    traced = jax.make_jaxpr(lambda x: solver.advance(structure, x, jnp.ones(D), c))(jnp.ones((n, D)))
+    joined = list(joined_shapes(traced.jaxpr))
+    assert joined and (n, D) not in joined

@@ -256,7 +256,7 @@ def elastic_step(
     if layout.contacts:
         # A port that friction holds does not give way: the teeth meet a larger inertia.
         linear = push(first)
-        response = advance(x, a.flight, linear[: len(a.line)]) - in_flight - linear
+        response = advance(x, a.flight, linear) - in_flight - linear
         pushed = linear[k + 1]
         moves = jnp.abs(pushed) > 0
         share = 1 + jnp.where(moves, response[k + 1], 0.0) / jnp.where(moves, pushed, 1.0)

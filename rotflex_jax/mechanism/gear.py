@@ -134,7 +134,7 @@ def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tu
     return ordered, -ports[:, -1]
 
 
-Advance = Callable[[Float[Array, "n *S"], Constants, Float[Array, "m *S"] | None], Float[Array, "n *S"]]
+Advance = Callable[[Float[Array, "n *S"], Constants, Float[Array, "n *S"] | None], Float[Array, "n *S"]]
 
 
 def geared_step(
@@ -146,8 +146,8 @@ def geared_step(
         mechanism: With (traced) parameter values.
         x: State, or states side by side.
         c: Constants with `gear`.
-        advance: State and constants to the state after the step; its last argument is added to the linear
-            states at the end of the step.
+        advance: State and constants to the state after the step; its last argument, zero for memories, is
+            added to the linear states at the end of the step.
     """
     layout, a = Layout.of(mechanism.structure), c.gear
     k, gap = layout.rotor, a.gap
@@ -167,7 +167,7 @@ def geared_step(
     moments = jnp.where(separation.separates[None], separation.moments, moments)
     push = matvec(a.moments, moments)
     push = jnp.concatenate([push, jnp.zeros_like(x[len(push) :])])
-    response = advance(x, a.flight, push[: len(a.line)]) - in_flight - push
+    response = advance(x, a.flight, push) - in_flight - push
     end = in_flight + push + jnp.where(impacts[None], delayed(impact.t, response, layout), response)
     rests = impacts & impact.rests
     # Friction and other torques have responded to the torque of the teeth.

@@ -18,8 +18,8 @@ from jaxtyping import Array
 _BY_PLACE = {
     "abs", "add", "add_any", "and", "atan2", "clamp", "convert_element_type", "copy", "cos", "cosh",
     "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "log",
-    "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow", "rsqrt", "select_n",
-    "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
+    "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow", "reduce_precision",
+    "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
 }
 # fmt: on
 

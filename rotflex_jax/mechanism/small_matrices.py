@@ -45,6 +45,15 @@ def sparse_matvec(rows: tuple[tuple[float, ...], ...], x: Shaped[Array, "m *S"])
     return jnp.stack(found) if found else jnp.zeros((0, *x.shape[1:]), x.dtype)
 
 
+def computed_once(a: Shaped[Array, "*S"]) -> Shaped[Array, "*S"]:
+    """The same array, which the compiler stores: what is cheap it would compute again for each use of it.
+
+    A reduction to the precision that the array has is what it neither removes nor repeats.
+    """
+    kept = jnp.finfo(a.dtype)
+    return jax.lax.reduce_precision(a, kept.nexp, kept.nmant)
+
+
 def evaluate_effect(e: Effect, function: Callable[..., Any], *signals: Shaped[Array, "*S"]) -> Any:
     """`function(effect, *signals)`; for each state separately where each has parameter values of its own."""
     values = e.values

@@ -24,6 +24,7 @@ from rotflex_jax.mechanism.gear import gear_constants, gear_steps, geared_step
 from rotflex_jax.mechanism.intersample import Intersample, substep_voltages
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import (
+    computed_once,
     evaluate_effect,
     expand_axes,
     matvec,
@@ -164,7 +165,7 @@ def transmitted_torques(
     """
     if rows is None:
         return None
-    load = matvec(rows.state, x) + scaled_vector(rows.voltage, v)
+    load = matvec(rows.state, x[: rows.state.shape[1]]) + scaled_vector(rows.voltage, v)
     if not has_smooth_torques(mechanism):
         return load
     layout = Layout.of(mechanism.structure)
@@ -320,7 +321,7 @@ def torques(
         k = layout.torque_ports.index(e.at)
         drive = memory_drive(mechanism, e, x, z, v, gates)
         total[k] = total[k] + gate[i] * _force(e, memory[m], position[k], speed[k], drive)
-    return jnp.stack(total)
+    return computed_once(jnp.stack(total))
 
 
 def memory_rates(
@@ -418,7 +419,10 @@ class Exponential:
         h = Ts / (self.substeps * gear_steps(structure))
         c = constants(structure, values, gates, h, halves=self.order == 4)
         c = c._replace(load=load_rows(structure.with_values(values), gates))
-        return c._replace(gear=gear_constants(structure, values, gates, c))
+        gear, number = gear_constants(structure, values, gates, c), len(effects_of(structure, Memory))
+        if gear is not None:
+            gear = gear._replace(flight=_with_rows_of_memories(gear.flight, number))
+        return _with_rows_of_memories(c, number)._replace(gear=gear)
 
     def advance(
         self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*hS"], c: Constants
@@ -457,35 +461,49 @@ def _advance_smooth(
     solver: Exponential,
     extra: Array | None = None,
 ) -> Array:
-    """The step under one set of equations; `extra` is added to the linear states at its end."""
+    """The step under one set of equations; `extra`, zero for memories, is added to the state at its end."""
     layout = Layout.of(mechanism.structure)
-    L, z = x[: layout.linear], x[layout.linear :]
-    start = matvec(c.E, L) + scaled_vector(c.input, v)
+    z = x[layout.linear :]
+    start = matvec(c.E, x[: layout.linear]) + scaled_vector(c.input, v)
     start = start if extra is None else start + extra
     if not layout.torque_ports:
         return start
     if not has_smooth_torques(mechanism):
-        return _with_dry_friction(mechanism, L, start, z, v, c, solver.passes)
-    f0 = torques(mechanism, L, z, v, c.gates)
+        return _with_dry_friction(mechanism, x, start, z, v, c, solver.passes)
+    f0 = torques(mechanism, x, z, v, c.gates)
     guess = start + matvec(c.hold, f0)
-    brake = _predicted_friction(mechanism, L, guess, z, v, c) if layout.contacts else None
+    brake = _predicted_friction(mechanism, x, guess, z, v, c) if layout.contacts else None
     end = guess if brake is None else guess + matvec(c.hold, brake)
-    z1 = advance_memories(mechanism, z, (L + end) / 2, v, c.gates, c.h)
+    z1 = advance_memories(mechanism, z, (x + end) / 2, v, c.gates, c.h)
     if solver.order == 2:
         final = guess + matvec(c.ramp, torques(mechanism, end, z1, v, c.gates) - f0)
     else:
         own = end if extra is None else end - extra
-        final = guess + _fourth_order(mechanism, L, z, z1, v, f0, brake, own, c)
-    final = _with_dry_friction(mechanism, L, final, z1, v, c, solver.passes)
-    return jnp.concatenate([final, z1]) if z.shape[0] else final
+        final = guess + _fourth_order(mechanism, x, z, z1, v, f0, brake, own, c)
+    final = _with_dry_friction(mechanism, x, final, z1, v, c, solver.passes)
+    # Not a concatenation, which in the compiled loop over the entries is a branch: vector units take none.
+    row = expand_axes(jnp.arange(len(x)), x)
+    for k, memory in enumerate(jnp.unstack(z1), layout.linear):
+        final = jnp.where(row == k, memory[None], final)
+    return final
 
 
-def _fourth_order(mechanism, L, z, z1, v, f0, brake, end, c):  # noqa: ANN001, ANN202 - as in `_advance_smooth`
+def _with_rows_of_memories(c: Constants, number: int) -> Constants:
+    """Constants whose responses are those of the whole state: zero for its memories."""
+    if not number:
+        return c
+    names = ("E", "input", "hold", "ramp", "rise", "push", "half_E", "half_input", "half_hold")
+    arrays = {name: a for name in names if (a := getattr(c, name)) is not None}
+    padded = {name: jnp.pad(a, ((0, number), *[(0, 0)] * (a.ndim - 1))) for name, a in arrays.items()}
+    return c._replace(**padded)
+
+
+def _fourth_order(mechanism, x, z, z1, v, f0, brake, end, c):  # noqa: ANN001, ANN202 - as in `_advance_smooth`
     """Correction of the state for torques that change from `f0`, ETDRK4; `end` is the state without it."""
     held = (lambda f: f) if brake is None else lambda f: f + brake
-    half = matvec(c.half_E, L) + scaled_vector(c.half_input, v)
+    half = matvec(c.half_E, x[: c.half_E.shape[1]]) + scaled_vector(c.half_input, v)
     a = half + matvec(c.half_hold, held(f0))
-    zh = advance_memories(mechanism, z, (L + a) / 2, v, c.gates, c.h / 2)
+    zh = advance_memories(mechanism, z, (x + a) / 2, v, c.gates, c.h / 2)
     fa = torques(mechanism, a, zh, v, c.gates)
     b = half + matvec(c.half_hold, held(fa))
     fb = torques(mechanism, b, zh, v, c.gates)
