@@ -247,3 +247,16 @@ def test_the_deflection_is_the_parabola_through_seven_samples() -> None:
     expected = np.clip(np.searchsorted(found.edges, smooth, side="right") - 1, 0, len(found.edges) - 2)
     np.testing.assert_array_equal(found.bins[far], expected[far])
     assert far.sum() > 350
+
+
+@pytest.mark.parametrize("Ts", [0.01, 0.002])
+def test_a_speed_is_smoothed_over_the_half_width_to_each_side(Ts: float) -> None:
+    """A jump between two samples is seen by the windows that hold both."""
+    y = np.where(np.arange(400) < 200, 0.0, 1.0) - 0.01 * np.arange(400)
+    jump = Recording(record(400, Ts).u, y[:, None], Ts, channels=("theta",), accept=("short",))
+    speed, error, unit = localise._speed(jump, "theta", 0.0, None)
+    half = half_width(jump)
+    np.testing.assert_array_equal(
+        np.flatnonzero(np.abs(speed + 0.01 / Ts) > 1e-9), np.arange(200 - half, 200 + half)
+    )
+    assert error == 0.0 and unit == "rad/s"

@@ -746,3 +746,24 @@ def test_other_laws_of_one_friction_remain_only_in_a_poor_model(monkeypatch, win
     alone, poor = found == [STRIBECK], windows > 2
     expected = [LUGRE] * poor + [COULOMB] * (poor and alone) + [ARM] * alone + [EffectLocation("dahl", "arm")]
     assert left == expected + [DRAG] * alone
+
+
+@pytest.mark.parametrize(
+    ("location", "held_out", "asked"),
+    [(STRIBECK, 60.0, True), (STRIBECK, 40.0, False), (DRAG, 60.0, False), (ARM, 60.0, False)],
+)
+def test_first_states_come_from_a_generalisation_that_does_better(
+    monkeypatch, location, held_out, asked
+) -> None:
+    simple, other, from_other = trial(COULOMB, held_out=50.0), trial(location, held_out=held_out), []
+
+    def validate_again(validation, hypothesis, start, inner):
+        from_other.append(start)
+        return trial(None, held_out=55.0)
+
+    monkeypatch.setattr(selection, "validate", validate_again)
+    first, second = selection.validate_from_best_states(None, [simple, other])
+    assert (from_other == [other]) == asked and second is other
+    assert first.location == COULOMB and first.log_likelihood == pytest.approx(
+        (trial(None, held_out=55.0) if asked else simple).log_likelihood
+    )

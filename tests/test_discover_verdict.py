@@ -204,3 +204,13 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
     # Random torques gain per value of each channel; without a floor there is one.
     ended_at = [assess({}, {}, floor, 6.0, 3).torque_nats for floor in ({}, {"a": 1.0}, {"a": 1.0, "b": 1.0})]
     assert ended_at == [2.0, 2.0, 1.0]
+
+
+def test_the_misfit_is_what_is_left_over_what_the_verdict_allows() -> None:
+    """Squares of errors, nats as they are; one where both are allowed, infinite where one is unknown."""
+
+    def misfit(theta: float, nats: float) -> float:
+        return Assessment({}, {"theta": theta * NEAR_FLOOR, "alpha": 0.5}, nats * NATS_PER_SAMPLE).misfit
+
+    assert misfit(3.0, 2.0) == pytest.approx(9.0) and misfit(0.9, 2.0) == pytest.approx(2.0)
+    assert misfit(0.9, 0.9) == 1.0 and misfit(NAN, 0.0) == np.inf

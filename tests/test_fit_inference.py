@@ -274,3 +274,11 @@ def test_what_lies_beyond_one_small_value_is_noise() -> None:
     r = np.array([e[k:] @ e[: len(e) - k] for k in range(5)]) / (e @ e)
     assert r[1] > 0.1 > 0.05 > r[2] and r[3] > 0.1 and abs(r[4]) < 0.05
     assert correlation_length(e[:, None]) == 4  # twice the two samples that it lasts
+
+
+def test_one_residual_more_than_parameters_has_the_textbook_variance() -> None:
+    """`s^2 inv(J'J)` with `s^2 = e'e / (n - 4)`, here of five residuals of one size."""
+    e = 0.3 * np.array([1.0, -1.0, 1.0, -1.0, 1.0])
+    J = np.linalg.svd(e[:, None])[0][:, 1:]  # orthonormal, and orthogonal to the residuals
+    variance = robust_covariance(J[:, None], e[:, None], np.zeros(5, int))
+    np.testing.assert_allclose(variance, e @ e * np.eye(4), atol=1e-12)

@@ -440,3 +440,10 @@ def test_sentences_tell_the_numbers_that_decided() -> None:
     assert "stands at its limit, -0.5 and 0.75 V" in said(u=clipped)
     short = Recording(u=U[:40], y=y[:40], Ts=TS, accept=quality.ACCEPTABLE)
     assert "at least 50 samples, but has 40" in " ".join(f.message for f in short.findings)
+
+
+def test_swapped_columns_are_found_in_a_recording() -> None:
+    hub, arm = slow(0.3, 1.0, 0.1), 0.1 * slow(0.3, 1.0, -0.2)
+    for y, found in (((hub, arm), False), ((arm, hub), True)):
+        r = Recording(np.cos(50 * TURN), np.column_stack(y), 0.01)
+        assert any(f.kind == "swapped" and f.channel == "alpha" for f in r.findings) == found
