@@ -154,6 +154,22 @@ def test_runs_that_validate_each_other(runs, arm):
     assert last.trained.windows["theta"] > seen
 
 
+def test_what_recordings_know_is_theirs(arm, monkeypatch):
+    """An inertia that each recording knows: the fit and its errors have that of each."""
+    inertia, given = "hub.inertia.inertia", []
+    for seed, (level, J) in enumerate(((0.05, 0.0075), (0.075, 0.012), (0.07, 0.02))):
+        monkeypatch.setitem(globals(), "INERTIA", J)
+        r = run(level, 0.0, seed)
+        given.append(dataclasses.replace(r, constants={inertia: J}))
+    train, validation, test = given
+    last = rf.discover(
+        arm.trust(inertia), train, validation, test=test, candidates=CANDIDATES, rounds=1
+    ).final_fit
+    missed = short_runs_miss(last.model, test)
+    assert last.test.windows["theta"] == pytest.approx(missed, rel=1e-6)
+    assert missed < 0.5 * short_runs_miss(last.model, dataclasses.replace(test, constants={inertia: 0.0075}))
+
+
 @pytest.mark.parametrize(("share", "taken"), [(0.98, True), (1.02, False)])
 def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, taken):
     """Errors of the way, tried on the training recording, just below and just above the limit."""
