@@ -748,3 +748,16 @@ def mutants_fresh() -> str:
     """How many of a second sample were noticed when they were drawn."""
     rows = results("mutants_fresh.json")["mutants"].values()
     return f"{sum(r['first'] for r in rows)} of {len(rows)}"
+
+
+@named
+def mutants_fresh_same() -> str:
+    """How many of the others of that sample change nothing."""
+    return str(sum("equivalent" in r for r in results("mutants_fresh.json")["mutants"].values()))
+
+
+@named
+def mutants_fresh_share() -> str:
+    """Share of those that change something which was noticed when it was drawn [%]."""
+    rows = [r for r in results("mutants_fresh.json")["mutants"].values() if "equivalent" not in r]
+    return f"{100 * sum(r['first'] for r in rows) / len(rows):.0f}"
