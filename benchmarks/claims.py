@@ -12,6 +12,8 @@ from typing import Any
 
 import scipy.stats
 
+from arena.probability import classes, usable
+from rotflex_jax.arena.scores import calibration_error
 from rotflex_jax.parameters import HALF_WIDTH_95
 from speed.table import waiting
 
@@ -710,6 +712,25 @@ def waiting_for_searches() -> str:
     """The table of waiting."""
     found = results("B7.json").get("waiting")
     return "\n".join(["", *waiting(found["waiting"]), ""]) if found else "\nNot measured yet.\n"
+
+
+# -- probabilities of sets ----------------------------------------------------------------------------------
+
+
+def _with_probabilities() -> list[dict[str, Any]]:
+    return usable(results("B0.json")["records"].values())
+
+
+@named
+def calibrated_machines() -> str:
+    """Machines of the arena with effects of the catalogue, or with none, whose sets have probabilities."""
+    return str(len(_with_probabilities()))
+
+
+@named
+def calibrated_sets() -> str:
+    """Expected calibration error of the most probable sets of these machines."""
+    return f"{calibration_error([classes(row)[0] for row in _with_probabilities()]):.3f}"
 
 
 # -- mutants ------------------------------------------------------------------------------------------------
