@@ -78,7 +78,7 @@ nitpick_ignore_regex = [
     ("py:class", r"'[A-Za-z0-9_*. -]*'?|[A-Z]( [A-Z])*"),  # sizes of arrays
     ("py:class", r"_Buffer|_SupportsArray|_NestedSequence"),  # what NumPy takes for an array
     # Small types of results, told where they are used.
-    ("py:class", r"rotflex_jax\.discover\.\w+\.(Assessment|ConditionalInterval|HorizonGain)"),
+    ("py:class", r"rotflex_jax\.discover\.\w+\.(Assessment|ConditionalInterval|FinalFit|HorizonGain)"),
     ("py:class", r"rotflex_jax\.discover\.\w+\.(ModelTests|RunErrors)"),
     ("py:class", r"rotflex_jax\.(arena|experiment)\.\w+\.(Event|Share|SequentialStep)"),
     ("py:class", r"rotflex_jax\.latent\.\w+\.(Drift|PeriodicTorque)"),

@@ -420,7 +420,7 @@ class SearchResult:
 
     @property
     def model(self) -> Model:
-        """The model to use: that after the last round, or its final fit where there is one.
+        """The model after the last round, or that of the final fit where there is one; the one to use.
 
         Errors of the stages are those of `final.model`, which was fitted to the training recordings alone.
         """
