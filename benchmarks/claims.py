@@ -736,8 +736,12 @@ def calibrated_sets() -> str:
 # -- mutants ------------------------------------------------------------------------------------------------
 
 
-def _mutants() -> list[dict[str, Any]]:
-    return list(results("mutants.json")["mutants"].values())
+def _mutants(file: str = "mutants.json") -> list[dict[str, Any]]:
+    return list(results(file)["mutants"].values())
+
+
+def _fresh_mutants() -> list[dict[str, Any]]:
+    return _mutants("mutants_fresh.json")
 
 
 @named
@@ -767,18 +771,18 @@ def mutants_same() -> str:
 @named
 def mutants_fresh() -> str:
     """How many of a second sample were noticed when they were drawn."""
-    rows = results("mutants_fresh.json")["mutants"].values()
+    rows = _fresh_mutants()
     return f"{sum(r['first'] for r in rows)} of {len(rows)}"
 
 
 @named
 def mutants_fresh_same() -> str:
     """How many of the others of that sample change nothing."""
-    return str(sum("equivalent" in r for r in results("mutants_fresh.json")["mutants"].values()))
+    return str(sum("equivalent" in r for r in _fresh_mutants()))
 
 
 @named
 def mutants_fresh_share() -> str:
     """Share of those that change something which was noticed when it was drawn [%]."""
-    rows = [r for r in results("mutants_fresh.json")["mutants"].values() if "equivalent" not in r]
+    rows = [r for r in _fresh_mutants() if "equivalent" not in r]
     return f"{100 * sum(r['first'] for r in rows) / len(rows):.0f}"

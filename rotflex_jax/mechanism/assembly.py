@@ -273,7 +273,8 @@ class Constants(NamedTuple):
     """Constants of the exponential step, formed once per parameter set.
 
     With `phi_k` the functions of an exponential integrator at `A h`, m linear states and p torque ports; each
-    array has a last axis of directions where sensitivities are carried along.
+    array has a last axis of directions where sensitivities are carried along. What a step uses has a row of
+    zeros more for each memory in all responses of the states (`Exponential.prepare`).
 
     Attributes:
         values: Parameter values.

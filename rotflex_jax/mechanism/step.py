@@ -158,7 +158,7 @@ def transmitted_torques(
     Args:
         mechanism: With (traced) parameter values.
         rows: From `load_rows`.
-        x: Linear part of the state.
+        x: State, of which the linear part is read.
         z: Memories.
         v: Voltage [V].
         gates: One factor per effect.
@@ -302,7 +302,7 @@ def torques(
 
     Args:
         mechanism: With (traced) parameter values.
-        x: Linear part of the state.
+        x: State, of which the linear part is read.
         z: Memories.
         v: Voltage [V].
         gates: One factor per effect.
