@@ -28,6 +28,7 @@ from rotflex_jax.discover.score_test import (
     _score,
     score_test,
 )
+from rotflex_jax.discover.selection import predictions_apart
 from rotflex_jax.discover.stepwise import fit_baseline
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, build, scales
 from rotflex_jax.discover.validation import Horizons, as_free_run
@@ -280,12 +281,16 @@ def test_a_pair_must_be_better_than_each_of_its_members(spring: float):
     # Where steps of one effect had ended with another pair, this one would be fitted and told; where they
     # have ended with it, nothing is.
     pairs = promising_pairs(*tests)
-    (other,) = validated_pairs(
-        at, current, [tuple(t.pairs([sp.HUB, JOINT])[0] for t in tests)], lambda h, p: True
-    ).values()
+    wrong = tuple(t.pairs([sp.HUB, JOINT])[0] for t in tests)
+    (other,) = validated_pairs(at, current, [wrong], lambda h, p: True).values()
     (only,) = (p for p in pairs if set(p[0].locations) == {sp.HUB, STIFFENS})
     given = at, current, [only]
     fits, alike = pairs_passed_by(*given, other, lambda h, p: True, lines.append)
     assert [set(p) for p in alike] == [{sp.HUB, STIFFENS}] and len(fits) == 1
+    assert all(v.free_run for v in fits)
+    # Predictions refuse the wrong one beyond doubt, and no fit to free runs is spent on it.
+    (fit,), alike = pairs_passed_by(at, current, [wrong], found.found, lambda h, p: True, lines.append)
+    assert not alike and {sp.HUB, JOINT} <= set(fit.hypothesis.locations) and fit.free_run is None
+    assert predictions_apart(found.found, other) and not predictions_apart(other, found.found)
     nothing = pairs_passed_by(*given, other, lambda h, p: True, lines.append, known=[found.found])
     assert nothing == pairs_passed_by(*given, found.found, lambda h, p: True, lines.append) == ([], [])

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from rotflex_jax.mechanism.friction import (
+    all_slide,
     at_rest,
     coupled_contacts,
     independent_contacts,
     limited,
+    sliding_torques,
     solve_masked,
 )
 from rotflex_jax.runtime.xla import double_precision
@@ -213,3 +215,23 @@ def test_contacts_that_do_not_touch_are_as_if_alone() -> None:
     alone = run(independent_contacts, v0, free, np.repeat(own[:, None], CASES, 1), up, down)
     for a, b in zip(together, alone, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_contacts_that_all_slide_need_no_elimination(k: int) -> None:
+    """Where contacts are said to slide, the full law gives the same torques, and nothing stops."""
+    rng = np.random.default_rng(10 + k)
+    v0, _, up, down = draws(rng, k)
+    free, up, down = v0 + 0.3 * rng.normal(size=v0.shape), 0.3 * up, 0.3 * down
+    L = rng.normal(size=(k, k))
+    stop = L @ L.T + 0.2 * np.eye(k)
+    slide = run(all_slide, v0, free, stop, up, down)
+    found = run(coupled_contacts, v0, free, stop, up, down)
+    torque = run(sliding_torques, v0, up, down)
+    assert 0.02 < np.mean(slide) < 0.7
+    np.testing.assert_allclose(found.torque[:, slide], torque[:, slide], rtol=1e-14)
+    assert not found.crossed[:, slide].any()
+    # And all that keep their direction in the full law, each by itself too, are found.
+    together, alone = free + stop @ found.torque, free + np.diag(stop)[:, None] * torque
+    keeps = np.all((v0 * together > 0) & (v0 * alone > 0) & ~found.crossed, axis=0)
+    assert slide[keeps].all()

@@ -44,3 +44,36 @@ def test_what_is_repeated_is_computed_once() -> None:
     traced = jax.make_jaxpr(lambda x, o: without_repetition(f, D, x, o))(*given)
     shapes = {e.primitive.name: e.outvars[0].aval.shape for e in traced.jaxpr.eqns}
     assert [shapes[name][-1] for name in ("sin", "cos", "exp", "tanh", "add")] == [1, 1, 1, D, D]
+
+
+def test_a_choice_is_made_once_and_only_one_way_is_computed() -> None:
+    def f(x: jax.Array, other: jax.Array) -> jax.Array:
+        everywhere = jnp.all(x > 0) & (jnp.max(x) < 2)
+        return jax.lax.cond(everywhere, lambda: jnp.sin(x) * other, lambda: jnp.exp(x) + other)
+
+    rng = np.random.default_rng(1)
+    with double_precision():
+        other = jnp.asarray(rng.normal(size=(2, D)))
+        for first in (0.5, -0.5, 2.5):
+            once = jnp.asarray([[first], [1.0]])
+            found = without_repetition(f, D, once, other)
+            expected = f(jnp.broadcast_to(once, (2, D)), other)
+            np.testing.assert_allclose(found, expected, rtol=1e-15)
+        traced = jax.make_jaxpr(lambda x, o: without_repetition(f, D, x, o))(once, other)
+    (choice,) = (e for e in traced.jaxpr.eqns if e.primitive.name == "cond")
+    shapes = {
+        e.primitive.name: e.outvars[0].aval.shape for b in choice.params["branches"] for e in b.jaxpr.eqns
+    }
+    assert shapes["sin"] == shapes["exp"] == (2, 1)
+
+
+def test_what_every_way_repeats_is_repeated_after_the_choice() -> None:
+    def f(x: jax.Array, other: jax.Array) -> tuple[jax.Array, jax.Array]:
+        both = lambda g: lambda: (g(x), g(x) * other)  # noqa: E731
+        one, mixed = jax.lax.cond(jnp.all(x > 0), both(jnp.sin), both(jnp.cos))
+        return jnp.exp(one), jnp.tanh(mixed)
+
+    given = jnp.ones((2, 1)), jnp.ones((2, D))
+    traced = jax.make_jaxpr(lambda x, o: without_repetition(f, D, x, o))(*given)
+    shapes = {e.primitive.name: e.outvars[0].aval.shape for e in traced.jaxpr.eqns}
+    assert shapes["exp"] == (2, 1) and shapes["tanh"] == (2, D)

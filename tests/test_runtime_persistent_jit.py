@@ -1,6 +1,7 @@
 """Programs on disk: found again by another process, and only where nothing they depend on differs."""
 
 import dataclasses
+import gc
 import hashlib
 import json
 import os
@@ -128,6 +129,35 @@ def test_a_program_made_ahead_is_there_when_it_is_needed(folder: Path) -> None:
     make_ahead(lambda: beyond.append(held.program(3.0, X)))
     none_left()
     np.testing.assert_array_equal(beyond, [3 * X])
+
+
+@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize("was_on", [True, False])
+def test_garbage_is_not_searched_for_while_programs_are_made(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, kept: bool, was_on: bool
+) -> None:
+    """By several threads, of which one fails; what the user had set is back afterwards."""
+    seen: list[bool] = []
+    if not kept:
+        monkeypatch.setattr(persistent_jit, "programs_folder", lambda: None)
+
+    def line(slope: float, x: jax.Array) -> jax.Array:
+        seen.append(gc.isenabled())
+        time.sleep(0.02 * slope)
+        if slope == 3:
+            raise ValueError("no such line")
+        return slope * x
+
+    program = PersistentJit(line, static=1)
+    (gc.enable if was_on else gc.disable)()
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            made = [pool.submit(program, slope, jnp.ones(2)) for slope in (1, 2, 3)]
+        assert [m.exception() is None for m in made] == [True, True, False]
+        assert seen == [False] * len(seen) and len(seen) >= 3
+        assert gc.isenabled() == was_on
+    finally:
+        gc.enable()
 
 
 def test_what_goes_wrong_ahead_goes_wrong_where_it_is_needed(folder: Path) -> None:

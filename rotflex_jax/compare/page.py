@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.signal import welch
 
 from rotflex_jax.compare.table import Comparison, Row
 from rotflex_jax.recording import Recording
@@ -222,7 +222,7 @@ def spectra(comparison: Comparison) -> Figure:
         length = min(4096, max(16, (r.N - begin) // 5))
         for row, (colour, dash, _) in line_styles(comparison):
             e = scale * (r.y - row.simulated[i])[begin:, c]
-            f, density = welch(e, 1 / r.Ts, nperseg=length, detrend="constant")
+            f, density = scipy.signal.welch(e, 1 / r.Ts, nperseg=length, detrend="constant")
             size = np.sqrt(np.maximum(density, np.finfo(float).tiny))
             ax.loglog(f[1:], size[1:], color=colour, ls=dash, lw=1.3, label=f"{row.method} ({row.family})")
         floor = scale * comparison.noise_floor.get(channel, 0.0)

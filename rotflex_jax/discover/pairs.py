@@ -27,11 +27,12 @@ from rotflex_jax.discover.selection import (
     best_window_rmse,
     describe,
     distinguished,
+    predictions_apart,
     shares_of_gain,
 )
 from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis
+from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
 from rotflex_jax.discover.verdict import NATS_PER_SAMPLE, NEAR_FLOOR
 from rotflex_jax.effects import CATALOG
 
@@ -112,6 +113,7 @@ def validated_pairs(
     beside: ValidatedHypothesis,
     pairs: Sequence[tuple[PairScore, PairScore]],
     is_plausible: Callable[[Hypothesis, EffectLocation], bool],
+    grown: Sequence[Hypothesis] | None = None,
 ) -> dict[Pair, ValidatedHypothesis]:
     """A model with each pair, refitted and validated at both horizons; what is not plausible is left out.
 
@@ -120,10 +122,12 @@ def validated_pairs(
         beside: The model that they are added to.
         pairs: Their scores of predictions and of free runs.
         is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
+        grown: The models with them, where they were refitted to predictions before.
     """
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
     assert beside.free_run
-    grown = refit_pairs(problem, beside.hypothesis, [a.starts for a, _ in pairs])
+    if grown is None:
+        grown = refit_pairs(problem, beside.hypothesis, [a.starts for a, _ in pairs])
     runs = refit_pairs(runs_problem, beside.free_run.hypothesis, [b.starts for _, b in pairs])
     runs = refit_near_predictions(runs_problem, runs, grown)
     found: dict[Pair, ValidatedHypothesis] = {}
@@ -170,7 +174,16 @@ def pairs_passed_by(
     if len(effects) < 2 or not others:
         return [], []
     say("pairs of the start that were not found: " + ", ".join(_named(a.locations) for a, _ in others))
-    tried = validated_pairs(horizons, beside, others, is_plausible)
+    grown = refit_pairs(horizons.prediction.problem, beside.hypothesis, [a.starts for a, _ in others])
+    tried: dict[Pair, ValidatedHypothesis] = {}
+    for h, scores in zip(grown, others, strict=True):
+        pair = scores[0].locations
+        v = validate(horizons.prediction.validation, h, beside)
+        if not predictions_apart(found, v):
+            tried |= validated_pairs(horizons, beside, [scores], is_plausible, [h])
+        # One whose predictions are worse beyond doubt needs no fit to free runs, whatever they say.
+        elif all(is_plausible(h, p) for p in pair):
+            tried[pair] = v
     _say_gains(tried, found, say)
     return list(tried.values()), [p for p, v in tried.items() if not distinguished(found, v)]
 

@@ -310,8 +310,11 @@ def validate_from_best_states(
 
 def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
     """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
-    if free_runs_apart(winner, rival):
-        return True
+    return free_runs_apart(winner, rival) or predictions_apart(winner, rival)
+
+
+def predictions_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
+    """Whether predictions of all recordings together, block by block, prefer the winner beyond doubt."""
     # Where runs validate each other, the blocks of training are the same samples once more.
     both = [(t.blocks,) if t.folds else (t.blocks, t.hypothesis.blocks) for t in (winner, rival)]
     a, b = (np.concatenate(blocks) for blocks in both)

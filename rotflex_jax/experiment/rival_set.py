@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy.signal import fftconvolve
 
 from rotflex_jax.experiment.rival_fit import LARGEST_STEP, MAX_STEPS, RULES, with_calibrations
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
@@ -255,7 +255,7 @@ class RivalSet:
         for i in range(x.shape[-1]):
             for j in range(x.shape[-1]):
                 kernel = response[:, i, j].reshape((1,) * (x.ndim - 2) + (M,))
-                out[..., i] += fftconvolve(x[..., j], kernel, axes=-1)[..., :M]
+                out[..., i] += scipy.signal.fftconvolve(x[..., j], kernel, axes=-1)[..., :M]
         return out[..., ::-1, :] if adjoint else out @ L.T
 
     # -- fits --------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.export.expression import Expression, Operand, make, node
 from rotflex_jax.export.unfold import CALLS, MOVES, CannotUnfold, each, moved, run, unfold, unknown
 from rotflex_jax.mechanism.assembly import Layout, motor_voltage
+from rotflex_jax.mechanism.shortcut import without_shortcuts
 from rotflex_jax.mechanism.simulate import read_outputs
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision
@@ -253,7 +254,8 @@ def _program(model: Model, Ts: float) -> SampleProgram:
         one_step: Any = dataclasses.replace(solver, substeps=1)  # of which the code takes `substeps`
         constants = solver.prepare(structure, values, gates, jnp.asarray(Ts))
         outputs = unfold(lambda s: read_outputs(mechanism, gates, s), x)
-        advanced = unfold(lambda s, w: one_step.advance(structure, s, w, constants), x, v)
+        with without_shortcuts():
+            advanced = unfold(lambda s, w: one_step.advance(structure, s, w, constants), x, v)
         voltage, memories = per_sample(
             lambda u: motor_voltage(mechanism, gates, u, jnp.asarray(Ts)), node("u")
         )

@@ -250,7 +250,7 @@ def elastic_step(
         flight, touching, start, share * stiff, share * loss, jnp.broadcast_to(mass, r.shape) / share
     )
     first = solve(jnp.ones_like(r))
-    push = lambda found: _pushed(matvec(a.moments, side[None] * found.moments), x)  # noqa: E731
+    push = lambda found: matvec(a.moments, side[None] * found.moments)  # noqa: E731
     end = in_flight + push(first)
     found = first
     if layout.contacts:
@@ -268,11 +268,6 @@ def elastic_step(
     angle, side1 = end[k], jnp.where(end[k] > 0, 1.0, -1.0)
     again = (jnp.abs(angle) > gap) & (side1 * end[k + 1] > 0) & ~(found.lasts & (side1 == side))
     return end.at[k].set(jnp.where(again, side1 * gap, angle))
-
-
-def _pushed(linear: Array, x: Array) -> Array:
-    """A change of the linear states as one of all states."""
-    return jnp.concatenate([linear, jnp.zeros_like(x[len(linear) :])])
 
 
 def _impact_time(flight: Cubic, travel: Array, impacts: Array) -> Array:

@@ -7,8 +7,11 @@ with one sign for `t` and with the other for `1 - t`. Sticking is exact: a port 
 the drive stays within the level.
 """
 
+import functools
+import operator
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -78,6 +81,36 @@ def independent_contacts(
     return Contact(f, t, holds, ~keeps)
 
 
+def sliding_torques(
+    v0: Float[Array, "*S"], up: Float[Array, "*S"], down: Float[Array, "*S"]
+) -> Float[Array, "*S"]:
+    """Torques of contacts that keep their direction; arguments as in `independent_contacts`."""
+    return -jnp.sign(v0) * jnp.where(v0 > 0, up, down)
+
+
+def all_slide(
+    v0: Float[Array, "k *S"],
+    free: Float[Array, "k *S"],
+    stop: Float[Array, "k k *D"],
+    up: Float[Array, "k *S"],
+    down: Float[Array, "k *S"],
+) -> Bool[Array, "*S"]:
+    """Whether all contacts keep their direction, each by itself and together.
+
+    `coupled_contacts` gives `sliding_torques` then. Arguments as there.
+    """
+    k, torque = len(v0), sliding_torques(v0, up, down)
+    keeps = []
+    for i in range(k):
+        own = expand_axes(stop[i, i], v0[i])
+        alone = free[i] + own * torque[i]
+        together = sum((expand_axes(stop[i, j], v0[i]) * torque[j] for j in range(k) if j != i), alone)
+        sign = jnp.sign(v0[i])
+        rests = at_rest(v0[i], free[i], own, up[i], down[i])
+        keeps.append((sign * alone > 0) & (sign * together > 0) & ~rests)
+    return functools.reduce(operator.and_, keeps)
+
+
 def limited(f: Float[Array, "*S"], up: Float[Array, "*S"], down: Float[Array, "*S"]) -> Float[Array, "*S"]:
     """Torques limited to their levels.
 
@@ -99,18 +132,23 @@ def solve_masked(
     second, or those of the other arguments.
     """
     k = matrix.shape[0]
-    matrix = expand_axes(matrix, rhs[None])
     if k == 1:
-        return jnp.where(mask, rhs / matrix[0], other)
-    eye = expand_axes(jnp.eye(k, dtype=matrix.dtype), matrix)
+        return jnp.where(mask, rhs / expand_axes(matrix, rhs[None])[0], other)
     ridge = 1e-10 * jnp.max(jnp.abs(matrix), axis=(0, 1), keepdims=True)
-    full = jnp.where(mask[:, None], matrix + ridge * eye, eye)
-    full = jnp.concatenate([full, jnp.where(mask, rhs, other)[:, None]], axis=1)
-    rows = [full[i] for i in range(k)]
+    matrix = matrix + ridge * expand_axes(jnp.eye(k, dtype=matrix.dtype), matrix)
+    part = lambda a: expand_axes(a, rhs[0])  # noqa: E731
+    rows = [
+        [*(jnp.where(own, part(matrix[i, j]), float(i == j)) for j in range(k)), jnp.where(own, b, f)]
+        for i, (own, b, f) in enumerate(zip(mask, rhs, other, strict=True))
+    ]
     for i in range(k):  # Gauss-Jordan
-        rows[i] = rows[i] / rows[i][i][None]
-        rows = [r if j == i else r - r[i][None] * rows[i] for j, r in enumerate(rows)]
-    return jnp.stack([r[k] for r in rows])
+        scale = 1 / rows[i][i]
+        rows[i] = [entry * scale for entry in rows[i]]
+        rows = [
+            row if j == i else [x - row[i] * p for x, p in zip(row, rows[i], strict=True)]
+            for j, row in enumerate(rows)
+        ]
+    return jnp.stack([row[k] for row in rows])
 
 
 def coupled_contacts(
@@ -139,39 +177,61 @@ def coupled_contacts(
         passes: One more than contacts if None.
     """
     k = v0.shape[0]
-    own = expand_axes(jnp.stack([stop[i, i] for i in range(k)]), v0)
     if k == 1:
-        return independent_contacts(v0, free, own, up, down)
-    eye = expand_axes(jnp.eye(k, dtype=stop.dtype), v0[None])
-    stop = jnp.broadcast_to(expand_axes(stop, v0[None]), (k, *v0.shape))
-    full = jnp.concatenate([stop, free[:, None]], axis=1)
-    slack = 1 + 1e3 * jnp.finfo(v0.dtype).eps
+        return independent_contacts(v0, free, expand_axes(stop[0], v0), up, down)
+    return _coupled(v0, free, stop, up, down, k + 1 if passes is None else passes)
+
+
+# Traced once for all places of a step, and of other steps with arrays like these.
+@functools.partial(jax.jit, static_argnames="passes")
+def _coupled(v0: Array, free: Array, stop: Array, up: Array, down: Array, passes: int) -> Contact:
+    """Several contacts; arguments as in `coupled_contacts`."""
+    k = v0.shape[0]
+    # Contact by contact: a matrix put together of its rows is a branch in the compiled loop over the entries.
+    every, (start, end, forward, back) = range(k), map(jnp.unstack, (v0, free, up, down))
+    mobility = [[expand_axes(stop[i, j], start[0]) for j in every] for i in every]
+    slack = 1 + 1e3 * jnp.finfo(start[0].dtype).eps
     # A contact without a level does not stick.
-    held = at_rest(v0, free, own, up, down) & (up + down > 0)
-    f = jnp.zeros_like(v0)
-    for last in (*[False] * (k if passes is None else passes - 1), True):
-        rows, needed = [full[i] for i in range(k)], []
-        for i in range(k):  # Gauss-Jordan
+    held = [
+        at_rest(start[i], end[i], mobility[i][i], forward[i], back[i]) & (forward[i] + back[i] > 0)
+        for i in every
+    ]
+    f = [jnp.zeros_like(start[0])] * k
+    for last in (*[False] * (passes - 1), True):
+        rows, needed = [[*mobility[i], end[i]] for i in every], []
+        for i in every:  # Gauss-Jordan
             # Three contacts on two coordinates: one that is at rest by the others alone carries no torque.
-            needed.append(held[i] & (rows[i][i] > 1e-5 * own[i]))
-            pivot = rows[i] / jnp.where(needed[i], rows[i][i], 1.0)[None]
+            needed.append(held[i] & (rows[i][i] > 1e-5 * mobility[i][i]))
+            scale = 1 / jnp.where(needed[i], rows[i][i], 1.0)
+            pivot = [entry * scale for entry in rows[i]]
             rows = [
-                jnp.where(needed[i][None], pivot if j == i else row - row[i][None] * pivot, row)
+                [
+                    jnp.where(needed[i], p if j == i else entry - row[i] * p, entry)
+                    for entry, p in zip(row, pivot, strict=True)
+                ]
                 for j, row in enumerate(rows)
             ]
-        A, b = jnp.stack([row[:k] for row in rows]), jnp.stack([row[k] for row in rows])
-        mobile = jnp.where(held, own, jnp.maximum(jnp.sum(A * eye, axis=1), 1e-6 * own))
-        found = independent_contacts(v0, b + jnp.sum(A * (1 - eye) * f[None], axis=1), mobile, up, down)
-        f = jnp.where(held, 0.0, found.torque)
-        torque = jnp.where(jnp.stack(needed), -(b + jnp.sum(A * f[None], axis=1)), f)
+        A, b = [row[:k] for row in rows], [row[k] for row in rows]
+        found = [
+            independent_contacts(
+                start[i],
+                sum((A[i][j] * f[j] for j in every if j != i), b[i]),
+                jnp.where(held[i], mobility[i][i], jnp.maximum(A[i][i], 1e-6 * mobility[i][i])),
+                forward[i],
+                back[i],
+            )
+            for i in every
+        ]
+        f = [jnp.where(held[i], 0.0, found[i].torque) for i in every]
+        torque = [jnp.where(needed[i], -sum((A[i][j] * f[j] for j in every), b[i]), f[i]) for i in every]
         if last:
             break
-        fits = (torque <= down * slack) & (torque >= -up * slack)
-        f = jnp.where(held & ~fits, limited(torque, up, down), f)
-        held = held & fits
+        fits = [(torque[i] <= back[i] * slack) & (torque[i] >= -forward[i] * slack) for i in every]
+        f = [jnp.where(held[i] & ~fits[i], limited(torque[i], forward[i], back[i]), f[i]) for i in every]
+        held = [held[i] & fits[i] for i in every]
     return Contact(
-        torque=limited(torque, up, down),
-        t=jnp.where(held, 0.0, found.t),
-        holds=jnp.where(held, 1.0, found.holds),
-        crossed=held | found.crossed,
+        torque=jnp.stack([limited(torque[i], forward[i], back[i]) for i in every]),
+        t=jnp.stack([jnp.where(held[i], 0.0, found[i].t) for i in every]),
+        holds=jnp.stack([jnp.where(held[i], 1.0, found[i].holds) for i in every]),
+        crossed=jnp.stack([held[i] | found[i].crossed for i in every]),
     )

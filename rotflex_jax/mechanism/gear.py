@@ -30,7 +30,8 @@ from rotflex_jax.mechanism.assembly import (
     stamped,
 )
 from rotflex_jax.mechanism.mechanism import Mechanism
-from rotflex_jax.mechanism.small_matrices import matvec
+from rotflex_jax.mechanism.shortcut import shortcut
+from rotflex_jax.mechanism.small_matrices import matvec, with_rows
 
 # From moments of order 0, 1, 2 on [0, 1] to the polynomial of degree two that has them: inverse of the
 # Hilbert matrix.
@@ -96,11 +97,13 @@ def gear_constants(
         # The rotor of a gear that is switched off stays at rest, and its teeth never touch.
         flight = jax.tree.map(lambda apart, one: jnp.where(gates[i] > 0, apart, one), flight, tight)
         teeth = (jnp.asarray(teeth[0], h.dtype), jnp.asarray(teeth[1], h.dtype))
+    # Responses of the whole state: memories do not respond at once.
+    padded = lambda m: jnp.pad(m, ((0, layout.size - len(m)), (0, 0)))  # noqa: E731
     return GearConstants(
         gap=gates[i] * gear.stops(),
         flight=flight,
-        line=line,
-        moments=ends @ jnp.asarray(MOMENTS_TO_POLYNOMIAL, ends.dtype),
+        line=padded(line),
+        moments=padded(ends @ jnp.asarray(MOMENTS_TO_POLYNOMIAL, ends.dtype)),
         correction=-jnp.array([[q, -b], [-p, a]]) / (a * q - b * p),
         mass=-1 / push[speed],
         teeth=teeth,
@@ -153,8 +156,8 @@ def geared_step(
     k, gap = layout.rotor, a.gap
     r = jnp.where(x[k] > gap, gap, jnp.where(x[k] < -gap, -gap, x[k]))
     s = x[k + 1]
-    x = x.at[k].set(r)
-    in_contact, in_flight = advance(x, c, None), advance(x, a.flight, None)
+    x = with_rows(x, {k: r})
+    in_flight = advance(x, a.flight, None)
     touching = (jnp.abs(r) >= gap * (1 - 1e-9)) & (s == 0)
     stays, separation = _separation(r, in_flight[k], in_flight[k + 1], touching, a)
     beyond = jnp.abs(in_flight[k]) > gap
@@ -162,21 +165,29 @@ def geared_step(
     # Separated and driven back to the same stop within the step: as if it had stayed in contact.
     stays = stays | (touching & ~separation.separates & beyond & (stop * r > 0)) | (gap <= 0)
     impacts = beyond & ~separation.separates
-    impact = _impact(r, s, in_flight[k], in_flight[k + 1], stop, impacts, c)
-    moments = jnp.where(impacts[None], impact.moments, 0.0)
-    moments = jnp.where(separation.separates[None], separation.moments, moments)
-    push = matvec(a.moments, moments)
-    push = jnp.concatenate([push, jnp.zeros_like(x[len(push) :])])
-    response = advance(x, a.flight, push) - in_flight - push
-    end = in_flight + push + jnp.where(impacts[None], delayed(impact.t, response, layout), response)
-    rests = impacts & impact.rests
-    # Friction and other torques have responded to the torque of the teeth.
-    error = jnp.stack([end[k] - stop, end[k + 1]])
-    corrected = matvec(a.line, jnp.where(rests[None], matvec(a.correction, error), 0.0))
-    end = end.at[: len(corrected)].add(corrected)
-    angle = jnp.where(rests, stop, jnp.where(end[k] > gap, gap, jnp.where(end[k] < -gap, -gap, end[k])))
-    end = end.at[k].set(angle).at[k + 1].set(jnp.where(rests, 0.0, end[k + 1]))
-    return jnp.where(stays[None], in_contact.at[k + 1].set(0.0), end)
+
+    def in_contact() -> Array:
+        return with_rows(advance(x, c, None), {k + 1: jnp.zeros_like(r)})
+
+    def any_case() -> Array:
+        impact = _impact(r, s, in_flight[k], in_flight[k + 1], stop, impacts, c)
+        moments = jnp.where(impacts[None], impact.moments, 0.0)
+        moments = jnp.where(separation.separates[None], separation.moments, moments)
+        push = matvec(a.moments, moments)
+        response = advance(x, a.flight, push) - in_flight - push
+        end = in_flight + push + jnp.where(impacts[None], delayed(impact.t, response, layout), response)
+        rests = impacts & impact.rests
+        # Friction and other torques have responded to the torque of the teeth.
+        error = jnp.stack([end[k] - stop, end[k + 1]])
+        end = end + matvec(a.line, jnp.where(rests[None], matvec(a.correction, error), 0.0))
+        angle = jnp.where(rests, stop, jnp.where(end[k] > gap, gap, jnp.where(end[k] < -gap, -gap, end[k])))
+        end = with_rows(end, {k: angle, k + 1: jnp.where(rests, 0.0, end[k + 1])})
+        return jnp.where(stays[None], in_contact(), end)
+
+    # Most steps are all in contact or all in flight.
+    flies = ~stays & ~impacts & ~separation.separates
+    elsewhere = lambda: shortcut(lambda: (flies, lambda: in_flight), any_case)  # noqa: E731
+    return shortcut(lambda: (stays, in_contact), elsewhere)
 
 
 class Separation(NamedTuple):

@@ -43,6 +43,7 @@ from rotflex_jax.mechanism.gear import gear_steps
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
 from rotflex_jax.mechanism.sensitivities import LinearisedRun, RecordingSamples, RunParameters
+from rotflex_jax.mechanism.shortcut import without_shortcuts
 from rotflex_jax.mechanism.simulate import (
     PredictorStep,
     Solver,
@@ -76,7 +77,8 @@ _traced = _Traced()
 def _recorded(evaluations: _Evaluations) -> Iterator[None]:
     _traced.evaluations = evaluations
     try:
-        yield
+        with without_shortcuts():
+            yield
     finally:
         _traced.evaluations = _Evaluations()
 

@@ -22,6 +22,8 @@ _BY_PLACE = {
     "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
 }
 # fmt: on
+# Reductions that give the same for one copy as for several.
+_SAME_OF_COPIES = {"reduce_and", "reduce_max", "reduce_min", "reduce_or"}
 
 
 class _Once:
@@ -59,15 +61,50 @@ def _evaluated(jaxpr: Jaxpr, consts: Sequence[Any], given: Sequence[Any], length
         if equation.primitive.name in ("jit", "pjit"):
             inner: ClosedJaxpr = equation.params["jaxpr"]
             found = _evaluated(inner.jaxpr, inner.consts, operands, length)
+        elif equation.primitive.name == "cond":
+            found = _branched(equation.params["branches"], operands, length)
         else:
             found = _applied(equation, operands, length)
         known.update(zip(equation.outvars, found, strict=True))
     return [value(v) for v in jaxpr.outvars]
 
 
+def _branched(branches: Sequence[ClosedJaxpr], operands: Sequence[Any], length: int) -> list[Any]:
+    """Results of the branch that the first operand chooses, `_Once` where all branches repeat them."""
+    index, *given = operands
+    repeated = [isinstance(x, _Once) for x in given]
+    arrays = [x.once if once else x for x, once in zip(given, repeated, strict=True)]
+
+    def results(branch: ClosedJaxpr, arrays: Sequence[Any]) -> list[Any]:
+        known = [_Once(a) if once else a for a, once in zip(arrays, repeated, strict=True)]
+        return _evaluated(branch.jaxpr, branch.consts, known, length)
+
+    repeats: list[list[bool]] = []
+    for branch in branches:
+
+        def noted(*arrays: Array, branch: ClosedJaxpr = branch) -> None:
+            repeats.append([isinstance(x, _Once) for x in results(branch, arrays)])
+
+        jax.eval_shape(noted, *arrays)
+    common = [all(flags) for flags in zip(*repeats, strict=True)]
+
+    def run(branch: ClosedJaxpr) -> Callable[..., list[Any]]:
+        return lambda *arrays: [
+            x.once if once else _whole(x, length)
+            for x, once in zip(results(branch, arrays), common, strict=True)
+        ]
+
+    found = jax.lax.switch(_whole(index, length), [run(b) for b in branches], *arrays)
+    return [_Once(x) if once else x for x, once in zip(found, common, strict=True)]
+
+
 def _applied(equation: Any, operands: list[Any], length: int) -> list[Any]:
     """Results of one operation, `_Once` where they are known to be repeated."""
     primitive, params = equation.primitive, equation.params
+    if primitive.name in _SAME_OF_COPIES and isinstance(operands[0], _Once):
+        array = operands[0].once
+        if array.ndim - 1 in params["axes"]:
+            return [primitive.bind(array, **params)]
     changed = _changed(primitive.name, params, operands, length)
     if changed is None:
         bound = primitive.get_bind_params(params)

@@ -299,7 +299,8 @@ def accumulate_outputs(
 def _takes_repeated_constants(structure: Mechanism, solver: Solver) -> bool:
     """Whether the step accepts constants that are repeated along the directions."""
     by_motor = any(e.driven_by != "voltage" for _, e in effects_of(structure, Memory))
-    return isinstance(solver, Exponential) and not effects_of(structure, Gear) and not by_motor
+    elastic = any(gear.teeth() is not None for _, gear in effects_of(structure, Gear))
+    return isinstance(solver, Exponential) and not elastic and not by_motor
 
 
 def outputs_with_sensitivities(

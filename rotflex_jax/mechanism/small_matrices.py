@@ -6,7 +6,7 @@ its sensitivities along many directions (`sensitivities`): the directions come l
 
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -43,6 +43,18 @@ def sparse_matvec(rows: tuple[tuple[float, ...], ...], x: Shaped[Array, "m *S"])
         terms = [each[j] if c == 1 else c * each[j] for j, c in enumerate(row) if c]
         found.append(sum(terms[1:], terms[0]) if terms else zero)
     return jnp.stack(found) if found else jnp.zeros((0, *x.shape[1:]), x.dtype)
+
+
+def with_rows(x: Shaped[Array, "n *S"], rows: Mapping[int, Shaped[Array, "*S"]]) -> Shaped[Array, "n *S"]:
+    """The same states with other rows.
+
+    Chosen entry by entry: rows set or put together are branches in the compiled loop over the entries, and
+    vector units take none.
+    """
+    place = expand_axes(jnp.arange(len(x)), x)
+    for k, row in rows.items():
+        x = jnp.where(place == k, row[None], x)
+    return x
 
 
 def computed_once(a: Shaped[Array, "*S"]) -> Shaped[Array, "*S"]:

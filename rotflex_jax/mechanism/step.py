@@ -19,10 +19,18 @@ from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of, equations, own_states
 from rotflex_jax.mechanism.elastic_teeth import elastic_step
-from rotflex_jax.mechanism.friction import coupled_contacts, limited, solve_masked
+from rotflex_jax.mechanism.friction import (
+    Contact,
+    all_slide,
+    coupled_contacts,
+    limited,
+    sliding_torques,
+    solve_masked,
+)
 from rotflex_jax.mechanism.gear import gear_constants, gear_steps, geared_step
 from rotflex_jax.mechanism.intersample import Intersample, substep_voltages
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.mechanism.shortcut import shortcut
 from rotflex_jax.mechanism.small_matrices import (
     computed_once,
     evaluate_effect,
@@ -30,6 +38,7 @@ from rotflex_jax.mechanism.small_matrices import (
     matvec,
     scaled_vector,
     sparse_matvec,
+    with_rows,
 )
 
 
@@ -481,11 +490,7 @@ def _advance_smooth(
         own = end if extra is None else end - extra
         final = guess + _fourth_order(mechanism, x, z, z1, v, f0, brake, own, c)
     final = _with_dry_friction(mechanism, x, final, z1, v, c, solver.passes)
-    # Not a concatenation, which in the compiled loop over the entries is a branch: vector units take none.
-    row = expand_axes(jnp.arange(len(x)), x)
-    for k, memory in enumerate(jnp.unstack(z1), layout.linear):
-        final = jnp.where(row == k, memory[None], final)
-    return final
+    return with_rows(final, dict(enumerate(jnp.unstack(z1), layout.linear)))
 
 
 def _with_rows_of_memories(c: Constants, number: int) -> Constants:
@@ -531,7 +536,7 @@ def _friction_levels(
         for levels, direction in ((up, 1.0), (down, -1.0)):
             level = friction_level(e, position[k], speed[k], direction, None if load is None else load[k])
             levels[k] = levels[k] + gate[i] * level
-    return jnp.stack(up), jnp.stack(down)
+    return jnp.stack([computed_once(x) for x in up]), jnp.stack([computed_once(x) for x in down])
 
 
 def _predicted_friction(
@@ -556,25 +561,57 @@ def _with_dry_friction(
     k = layout.contacts
     if not k:
         return end
+    steady = all(e.steady for _, e in effects_of(mechanism, DryFriction))
     q0, v0 = (m[:k] for m in port_motion(layout, x))
     free, stop = port_motion(layout, end)[1][:k], c.stop[:k, :k]
     levels = _friction_levels(mechanism, x, end, z, v, c)
-    if not all(e.steady for _, e in effects_of(mechanism, DryFriction)):
-        # The level belongs to the speed that friction leaves, not to the one without it.
-        rough = coupled_contacts(v0, free, stop, *levels, passes=1)
-        levels = _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], rough.torque), z, v, c)
-    found = coupled_contacts(v0, free, stop, *levels, passes=passes)
-    end = end + matvec(c.hold[:, :k], found.torque)
+
+    def levels_after(torque: Array) -> tuple[Array, Array]:
+        """Levels that belong to the speed that friction leaves, not to the one without it."""
+        return _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], torque), z, v, c)
+
+    def any_case() -> Array:
+        final = levels
+        if not steady:
+            final = levels_after(coupled_contacts(v0, free, stop, *levels, passes=1).torque)
+        found = coupled_contacts(v0, free, stop, *final, passes=passes)
+        return _stopped(layout, c, end + matvec(c.hold[:, :k], found.torque), q0, v0, found, final)
+
+    def sliding() -> tuple[Array, Callable[[], Array]]:
+        """Most steps pass no stop, and what follows one costs more than the rest of the step."""
+        final, slides = levels, all_slide(v0, free, stop, *levels)
+        if not steady:
+            final = levels_after(sliding_torques(v0, *levels))
+            slides = slides & all_slide(v0, free, stop, *final)
+        torque = sliding_torques(v0, *final)
+        return slides, lambda: end + matvec(c.hold[:, :k], torque)
+
+    return shortcut(sliding, any_case)
+
+
+def _stopped(
+    layout: Layout,
+    c: Constants,
+    end: Array,
+    q0: Array,
+    v0: Array,
+    found: Contact,
+    levels: tuple[Array, Array],
+) -> Array:
+    """The state at the end of a step in which contacts may stop, positions matched to the stop inside it."""
+    k = layout.contacts
     q1, v1 = (m[:k] for m in port_motion(layout, end))
     # A constant torque changes the speed linearly from v0 to v1; in truth it reaches zero after t h. A port
     # that sticks does not move at all, not even by the curvature of that line.
-    half = expand_axes(c.h[None], v0) / 2
-    late = half * (found.t * v0 + (1 - found.t) * v1 - v0 - v1)
-    curved = half * (v0 + v1) - (q1 - q0)
-    shift = late + (1 - found.t) * found.holds * curved
-    # A contact that is switched off needs no correction; its derivative is that of the contact alone.
-    own = expand_axes(jnp.stack([c.mobility[i, i] for i in range(k)]), shift)
-    alone = jnp.where(found.crossed, shift / own, 0.0)
+    half = expand_axes(c.h, v0[0]) / 2
+    shift, alone = [], []
+    for i in range(k):
+        late = half * (found.t[i] * v0[i] + (1 - found.t[i]) * v1[i] - v0[i] - v1[i])
+        curved = half * (v0[i] + v1[i]) - (q1[i] - q0[i])
+        shift.append(computed_once(late + (1 - found.t[i]) * found.holds[i] * curved))
+        # A contact that is switched off needs no correction; its derivative is that of the contact alone.
+        own = expand_axes(c.mobility[i, i], shift[i])
+        alone.append(jnp.where(found.crossed[i], shift[i] / own, 0.0))
     works = found.crossed & (levels[0] + levels[1] > 0)
-    impulse = solve_masked(c.mobility[:k, :k], works, shift, alone)
+    impulse = solve_masked(c.mobility[:k, :k], works, jnp.stack(shift), jnp.stack(alone))
     return end + matvec(c.push[:, :k], impulse)

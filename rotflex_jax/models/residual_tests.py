@@ -3,8 +3,8 @@
 import dataclasses
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Complex, Float, Int, Real
-from scipy.signal import csd, welch
 
 from rotflex_jax.errors import InputError
 
@@ -65,9 +65,9 @@ def frequency_response(u: Real[np.ndarray, " N"], y: Real[np.ndarray, "N C"], Ts
     length = max(16, min(2 * N // (LEAST_STRETCHES + 1), round(LONGEST_STRETCH / Ts)))
     options = {"fs": 1.0 / Ts, "nperseg": min(length, N), "detrend": "linear"}
     outputs, drive = np.asarray(y, float).T, np.asarray(u, float)
-    f, of_input = welch(drive, **options)
-    cross = np.stack([csd(drive, x, **options)[1] for x in outputs])
-    own = np.stack([welch(x, **options)[1] for x in outputs])
+    f, of_input = scipy.signal.welch(drive, **options)
+    cross = np.stack([scipy.signal.csd(drive, x, **options)[1] for x in outputs])
+    own = np.stack([scipy.signal.welch(x, **options)[1] for x in outputs])
     starts = _bins(f[1:])
     count = np.diff([*starts, len(f) - 1])
     f = np.add.reduceat(f[1:], starts) / count

@@ -78,6 +78,33 @@ class _Held:
     key: Any
 
 
+class _Paused:
+    """While programs are made, by any thread, the search of cyclic garbage rests, if it was on.
+
+    Tracing makes so many objects that Python goes through all that the process holds again and again, and
+    meanwhile every thread waits: a tenth of the time of a first search.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._users, self._was_on = threading.Lock(), 0, False
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._users:
+                self._was_on = gc.isenabled()
+                gc.disable()
+            self._users += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if not self._users and self._was_on:
+                gc.enable()
+
+
+_without_garbage_collection = _Paused()
+
+
 @dataclasses.dataclass
 class _Storage:
     """Where programs are kept: a folder that was chosen, the usual one, or none."""
@@ -190,10 +217,12 @@ class PersistentJit:
             _count(loaded=1)
             return stored
         if file is None:
-            result = program(*leaves)
+            with _without_garbage_collection:
+                result = program(*leaves)
             _count(compiled=1, seconds=time.perf_counter() - began)
             return program, result
-        compiled = program.lower(*leaves).compile()
+        with _without_garbage_collection:
+            compiled = program.lower(*leaves).compile()
         _count(compiled=1, seconds=time.perf_counter() - began)
         _write(compiled, file)
         return compiled, compiled(*leaves)

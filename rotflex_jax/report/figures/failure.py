@@ -3,12 +3,12 @@
 import dataclasses
 
 import numpy as np
+import scipy
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy.signal import savgol_filter
 
 from rotflex_jax.discover.localise import half_width, missing_acceleration
 from rotflex_jax.discover.result import SearchResult, Where
@@ -47,7 +47,7 @@ def _grid(discovery: SearchResult, s: Shown) -> tuple[list[np.ndarray], list[str
     scale, read = readable(1.0, unit if is_speed else f"{unit}/s")
     window = 2 * (half_width(s.recording) or 3) + 1
     order = 0 if is_speed else 1
-    rate = savgol_filter(s.measured[:, 0], window, 2, deriv=order, delta=s.recording.Ts)
+    rate = scipy.signal.savgol_filter(s.measured[:, 0], window, 2, deriv=order, delta=s.recording.Ts)
     values = [scale * np.asarray(rate)]
     labels = [f"{channels[0] if is_speed else f'speed of {channels[0]}'} [{read}]"]
     if len(channels) == 1:

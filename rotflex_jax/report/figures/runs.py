@@ -4,10 +4,10 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.signal import welch
 
 from rotflex_jax.discover.explanation import Explanation
 from rotflex_jax.discover.learned_torque_figure import learned_figure
@@ -205,7 +205,7 @@ def spectra(discovery: SearchResult) -> Figure:
             error = scale * (s.measured[:, c] - run[:, c])
             # Nine stretches of the recording or more, half overlapping, are averaged.
             length = min(4096, max(16, N // 5))
-            f, density = welch(error, 1 / Ts, nperseg=length, detrend="constant")
+            f, density = scipy.signal.welch(error, 1 / Ts, nperseg=length, detrend="constant")
             size = np.sqrt(np.maximum(density, np.finfo(float).tiny))
             line: Any = BASELINE_LINE if label == "baseline" else "-"
             ax.loglog(f[1:], size[1:], color=colour, ls=line, lw=1.3, label=label)
