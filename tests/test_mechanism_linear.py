@@ -163,3 +163,11 @@ def test_the_filter_reaches_the_variance_that_the_equation_promises():
     np.testing.assert_allclose(e.T @ e / len(e) / scale, S / scale, atol=0.08)
     after = e[1:].T @ e[:-1] / len(e) / scale  # white: no correlation with the sample before
     np.testing.assert_allclose(after, 0.0, atol=0.08)
+
+
+@pytest.mark.parametrize(("damping", "determined"), [(1e6, True), (1e16, False)])
+def test_a_model_too_fast_for_double_precision_has_no_gain(damping, determined):
+    """Damping over inertia times the period: of 5e6 the exponential keeps nine digits, of 5e16 none."""
+    gains = kalman_gains(single_inertia(0.002, damping=damping), [{"hub": 1e-5}], np.array([1e-4]), 0.01)
+    assert np.isfinite(gains).all() == determined
+    assert np.isnan(gains).any() == (not determined)

@@ -82,8 +82,20 @@ def zero_order_hold(
     0.500 0.500
     """
     n, k = B.shape
-    big = scipy.linalg.expm(np.block([[A, B], [np.zeros((k, n + k))]]) * Ts)
+    big = _exponential(np.block([[A, B], [np.zeros((k, n + k))]]) * Ts)
     return big[:n, :n], big[:n, n:]
+
+
+def _exponential(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """`e^A`; not a number where double precision leaves no correct digit of it.
+
+    The relative error grows as `eps |A|` (Moler and Van Loan, SIAM Rev. 45, 2003). Parameters far outside
+    their physical ranges give such an `A`. SciPy then returns arbitrary entries, or raises where a pivot
+    happens to be zero, which depends on the processor. A model with such a gain counts as one that diverges.
+    """
+    if not np.linalg.norm(A, 1) * np.finfo(float).eps < 1:
+        return np.full_like(A, np.nan)
+    return scipy.linalg.expm(A)
 
 
 @persistent_jit(static=1)
@@ -182,7 +194,7 @@ def process_covariance(
     g = np.zeros(len(A))
     g[n : 2 * n] = push
     h = Ts / 2**doublings
-    half = scipy.linalg.expm(A * (h / 2))
+    half = _exponential(A * (h / 2))
     middle, end = half @ g, half @ half @ g
     Q = h / 6 * (np.outer(g, g) + 4 * np.outer(middle, middle) + np.outer(end, end))
     E = half @ half
