@@ -475,18 +475,22 @@ for _hidden in ("friction", "drag", "uneven friction", "nothing"):
 
 # -- other ways to find the effect --------------------------------------------------------------------------
 
+# Fits every candidate with this package's own simulator, hence no other tool's: counted apart.
+REFITS = "refit + BIC"
+
 
 def _search() -> dict[str, Any]:
     """Sums of the search on the records that the others were given."""
     return results("B6.json")["summary"]["rotflex_jax"]
 
 
-def _rivals() -> dict[str, dict[str, Any]]:
-    """Sums of every method that was given all records that the search was, the search itself left out."""
+def _regressions() -> dict[str, dict[str, Any]]:
+    """Sums of the regressions that were given all records that the search was."""
     summary = results("B6.json")["summary"]
     given = lambda sums: (sums["first"][1], sums["false_alarms"][1])  # noqa: E731
     every = given(summary["rotflex_jax"])
-    return {n: sums for n, sums in summary.items() if n != "rotflex_jax" and given(sums) == every}
+    apart = {"rotflex_jax", REFITS}
+    return {n: sums for n, sums in summary.items() if n not in apart and given(sums) == every}
 
 
 @named
@@ -502,31 +506,61 @@ def rivals_ours() -> str:
 
 
 @named
+def rivals_exact() -> str:
+    """In how many the search named it and nothing else."""
+    return str(_search()["exact"][0])
+
+
+@named
+def rivals_refits() -> str:
+    """In how many the lowest BIC of all refits was the hidden effect's."""
+    return str(results("B6.json")["summary"][REFITS]["first"][0])
+
+
+@named
+def rivals_refits_exact() -> str:
+    """In how many the refits named it and nothing else."""
+    return str(results("B6.json")["summary"][REFITS]["exact"][0])
+
+
+@named
 def rivals_best() -> str:
-    """In how many the best of the others did."""
-    return str(max(sums["first"][0] for sums in _rivals().values()))
+    """In how many the best of the regressions named it first."""
+    return str(max(sums["first"][0] for sums in _regressions().values()))
 
 
 @named
 def rivals_count() -> str:
-    """How many others there are."""
-    return str(len(_rivals()))
+    """How many regressions there are."""
+    return str(len(_regressions()))
 
 
 @named
 def rivals_columns() -> str:
-    """Whether the regressions that are counted had columns for states and for errors of sensors."""
-    counted = set(_rivals()) - {"refit + BIC"}
-    rows = [r for r in results("B6.json")["rows"].values() if r["rival"] in counted]
+    """Whether the regressions had columns for states and for errors of sensors."""
+    rows = [r for r in results("B6.json")["rows"].values() if r["rival"] in _regressions()]
     having = sum(bool(r.get("states")) for r in rows)
     return "had none" if not having else "had them" if having == len(rows) else "had them in part"
 
 
 @named
 def rivals_alarms() -> str:
-    """Alarms of the others where nothing was hidden: the least and the most."""
-    alarms = [sums["false_alarms"][0] for sums in _rivals().values()]
+    """Alarms of the regressions where nothing was hidden: the least and the most."""
+    alarms = [sums["false_alarms"][0] for sums in _regressions().values()]
     return f"{min(alarms)} to {max(alarms)}"
+
+
+@named
+def rivals_refits_alarms() -> str:
+    """Alarms of the refits where nothing was hidden."""
+    return str(results("B6.json")["summary"][REFITS]["false_alarms"][0])
+
+
+@named
+def rivals_outside() -> str:
+    """Records with an effect that the catalogue lacks, and in how many the refits named something."""
+    rows = [r for r in results("B6.json")["rows"].values() if r["rival"] == REFITS and r["outside"]]
+    return f"{sum(bool(r['rounds']) for r in rows)} of {len(rows)}"
 
 
 @named

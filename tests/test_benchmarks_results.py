@@ -11,8 +11,6 @@ from claims import most
 from origin import RESULTS, Imports, begin, meaning, of_changed_tree, part, remark, runs_that_count, standing
 
 FILES = sorted(RESULTS.rglob("*.json"))
-# Files with runs of a tree that was changed, from before this was refused. A new run leaves the list.
-OF_CHANGED_TREES = {"B6.json"}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
@@ -21,10 +19,7 @@ def test_results_come_from_committed_code(file: Path) -> None:
     assert runs, f"{file.name} does not say what made it; see benchmarks/origin.py"
     # `stored`: from before results said what made them; the commit that they came with.
     changed = [run.get("date") for run in runs if of_changed_tree(run) and not run.get("stored")]
-    if file.name in OF_CHANGED_TREES:
-        assert changed, f"{file.name} is clean now: take it off the list"
-    else:
-        assert not changed, f"{file.name}: run it again from a committed tree"
+    assert not changed, f"{file.name}: run it again from a committed tree"
 
 
 @pytest.mark.parametrize(
