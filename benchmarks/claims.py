@@ -524,6 +524,13 @@ def rivals_refits_exact() -> str:
 
 
 @named
+def rivals_refits_seconds() -> str:
+    """What the refits take of a processor, a record: median and most."""
+    taken = [r["cpu_s"] for r in results("B6.json")["rows"].values() if r["rival"] == REFITS]
+    return f"{statistics.median(taken):.0f} s (at most {max(taken):.0f})"
+
+
+@named
 def rivals_best() -> str:
     """In how many the best of the regressions named it first."""
     return str(max(sums["first"][0] for sums in _regressions().values()))
