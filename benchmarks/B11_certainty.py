@@ -23,6 +23,7 @@ from typing import Any
 from rich.console import Console
 
 import B0_discovery as B0
+from origin import begin
 from rotflex_jax.text.files import write_file
 
 HERE = Path(__file__).resolve().parent
