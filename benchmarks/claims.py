@@ -579,6 +579,33 @@ def rivals_nothing() -> str:
 # -- the next experiment ------------------------------------------------------------------------------------
 
 
+def _until_decided(kind: str) -> list[tuple[float, float]]:
+    """Seconds that a kind of standard input and that the loop needed in each case that can be decided.
+
+    What decides nothing or wrongly counts as if it had needed the whole time.
+    """
+    found = results("B4_sequential.json")
+    rows, most = [r for r in found["rows"] if not r["hopeless"]], 20.0
+    right = lambda how, r: how["best"] == r["truth"] and how.get("decided", r["verdict"] == "decided")  # noqa: E731
+    pairs = [(r, next(s for s in r["standard"] if s["input"] == kind)) for r in rows]
+    return [tuple(how["seconds"] if right(how, r) else most for how in (s, r)) for r, s in pairs]
+
+
+def _kind_seconds(kind: str) -> str:
+    """Median over the cases [s]."""
+    return f"{statistics.median(a for a, _ in _until_decided(kind)):.1f}"
+
+
+def _kind_ratio(kind: str) -> str:
+    """Median of its seconds over those of the loop."""
+    return f"{statistics.median(a / b for a, b in _until_decided(kind)):.1f}"
+
+
+for _kind in ("multisine", "prbs", "sweep", "steps", "noise"):
+    NAMED[f"decided_{_kind}_seconds"] = functools.partial(_kind_seconds, _kind)
+    NAMED[f"decided_{_kind}_ratio"] = functools.partial(_kind_ratio, _kind)
+
+
 def _next_ratio(pair: str) -> str:
     """How many times a design is worth the best standard input: the least and the largest."""
     ratios = []

@@ -133,7 +133,6 @@ TABLES = {
 }
 KNOWN = {
     "next_experiment.md": {
-        "2.3": "median of the ratios that B4_sequential.md prints",
         **dict.fromkeys(["0.01", "0.5", "0.3", "0.2"], "error, segment, limits and sizes, settings"),
     },
     "kernels.md": {
