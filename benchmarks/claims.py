@@ -576,6 +576,16 @@ def rivals_nothing() -> str:
     return str(_search()["false_alarms"][1])
 
 
+# -- how sure ------------------------------------------------------------------------------------------------
+
+
+@named
+def certainty_cost() -> str:
+    """Processor time of profiles, what can be known, bands and probabilities: the least and the most [s]."""
+    each = [parts["all"] for parts in results("B11.json")["summary"]["cost"].values()]
+    return f"{min(each):.0f} to {max(each):.0f} s"
+
+
 # -- the next experiment ------------------------------------------------------------------------------------
 
 
