@@ -209,7 +209,10 @@ def test_a_set_has_what_its_fits_say_at_each_horizon(at):
     runs = fit_of("coulomb", train=5.0)
     both = fit_of("coulomb", "sensor_bias", train=1.0, free_run=runs)
     alone = fit_of("lag", train=2.0)
-    first, second = fitted_sets(horizons, [both], [alone], getattr(horizons, at), [offset])
+    # Predictions ruled it out, so that it was not fitted to free runs: these blocks are never of free runs.
+    ruled_out = fit_of("dead_zone", train=3.0)
+    first, third, second = fitted_sets(horizons, [both, ruled_out], [alone], getattr(horizons, at), [offset])
+    assert third.prediction is ruled_out.blocks and third.free_run is None
     assert first.effects == {"coulomb@hub", "voltage_offset@hub"}
     assert first.prediction is both.blocks and first.free_run is runs.blocks
     assert second.effects == {"lag@hub", "voltage_offset@hub"}

@@ -163,8 +163,8 @@ def pairs_passed_by(
         known: Models that were fitted before.
 
     Returns:
-        What was fitted and validated, and the pairs that validation data do not distinguish from the model
-        found, or prefer.
+        What was fitted and validated at both horizons, and the pairs that validation data do not distinguish
+        from the model found, or prefer.
     """
     s = horizons.prediction.problem.supermodel
     effects = s.without_calibrations(found.hypothesis.locations)
@@ -181,11 +181,13 @@ def pairs_passed_by(
         v = validate(horizons.prediction.validation, h, beside)
         if not predictions_apart(found, v):
             tried |= validated_pairs(horizons, beside, [scores], is_plausible, [h])
-        # One whose predictions are worse beyond doubt needs no fit to free runs, whatever they say.
+        # One whose predictions are worse beyond doubt needs no fit to free runs, whatever they say. It has no
+        # probability then: where predictions count little, it would pass for as good as what was found.
         elif all(is_plausible(h, p) for p in pair):
             tried[pair] = v
     _say_gains(tried, found, say)
-    return list(tried.values()), [p for p, v in tried.items() if not distinguished(found, v)]
+    fitted_at_both = [v for v in tried.values() if v.free_run]
+    return fitted_at_both, [p for p, v in tried.items() if not distinguished(found, v)]
 
 
 def _say_gains(

@@ -301,8 +301,8 @@ def fitted_sets(
 
     Args:
         horizons: With the training recordings.
-        at_both: Fitted at both horizons.
-        at_reported: Fitted at one.
+        at_both: Fitted at both horizons, or to predictions alone.
+        at_reported: Fitted at the reported horizon.
         reported: That one.
         machine: Calibrations that belong to the machine.
     """
@@ -310,11 +310,12 @@ def fitted_sets(
     at_prediction: dict[frozenset[str], list[ValidatedHypothesis]] = {}
     at_free_run: dict[frozenset[str], list[ValidatedHypothesis]] = {}
     known: dict[frozenset[str], None] = {}
-    for v in (*at_both, *at_reported):
+    fits = [(v, v.free_run) for v in at_both]
+    fits += [(v, v if reported is horizons.free_run else v.free_run) for v in at_reported]
+    for v, free in fits:
         effects = [p for p in v.hypothesis.locations if p not in s.calibrations]
         names = set_names([*effects, *machine])
         known[names] = None
-        free = v.free_run or (v if reported is horizons.free_run else None)
         if free:
             at_free_run.setdefault(names, []).append(free)
         if v is not free:
