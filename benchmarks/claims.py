@@ -12,7 +12,7 @@ from typing import Any
 
 import scipy.stats
 
-from arena.probability import classes, usable
+from arena.probability import classes, credible, scatter_of_right, usable
 from rotflex_jax.arena.scores import calibration_error
 from rotflex_jax.parameters import HALF_WIDTH_95
 from speed.table import waiting
@@ -59,10 +59,60 @@ def worlds_named() -> str:
     return "{} of {}".format(*_worlds("named"))
 
 
+# Laws of dry friction, of which one stands in for another where much else is wrong.
+FRICTION = {"coulomb", "coulomb_asymmetric", "stribeck", "dahl", "lugre", "bouc_wen"}
+
+
+@named
+def worlds_other_law() -> str:
+    """Of the others, those in which another law of friction was named where one was hidden."""
+    found = results("B0_wrong_worlds.json")["records"].values()
+    missed = [r for r in found if r.get("named") is False]
+    friction = [r for r in missed if r["hidden"][0] in FRICTION]
+    alike = [
+        r
+        for r in friction
+        if any(q["effect"] in FRICTION and q["port"] == r["hidden"][1] for q in r["rounds"])
+    ]
+    return f"{len(alike)} of {len(missed)}"
+
+
 @named
 def worlds_wrong() -> str:
     """Worlds in which a wrong effect was called established."""
     return "{} of {}".format(*_worlds("wrong_established"))
+
+
+def _worlds_with_probabilities() -> list[dict[str, Any]]:
+    return usable(results("B0_wrong_worlds.json")["records"].values())
+
+
+@named
+def worlds_most_probable() -> str:
+    """Worlds whose most probable set is right."""
+    top = [classes(row)[0] for row in _worlds_with_probabilities()]
+    return f"{sum(e.true for e in top)} of {len(top)}"
+
+
+@named
+def worlds_claimed() -> str:
+    """Mean probability of these sets [%]."""
+    return f"{100 * statistics.mean(classes(row)[0].probability for row in _worlds_with_probabilities()):.0f}"
+
+
+@named
+def worlds_calibrated() -> str:
+    """Mean distance between probability and frequency of these, and what right probabilities would show."""
+    top = [classes(row)[0] for row in _worlds_with_probabilities()]
+    chance, _ = scatter_of_right([[e.probability] for e in top])
+    return f"{calibration_error(top):.2f} ({chance:.2f} if all were right)"
+
+
+@named
+def worlds_credible() -> str:
+    """In how many a credible set of 90 % holds the truth [%], and its mean size."""
+    c = credible(_worlds_with_probabilities())
+    return f"{100 * c.held:.0f} % (mean size {c.size:.1f})"
 
 
 # -- the measured joint -------------------------------------------------------------------------------------
