@@ -59,11 +59,11 @@ def named(result: rf.Discovery) -> list[dict[str, Any]]:
     ]
 
 
-def errors(model: rf.Model, recordings: Recordings) -> dict[str, Any]:
+def errors(model: rf.Model | Callable[[rf.Recording], rf.Model], recordings: Recordings) -> dict[str, Any]:
     """Root mean square errors of free runs over recordings that the model has not seen.
 
     Args:
-        model: fitted.
+        model: fitted, or what gives the model of a recording.
         recordings: one or several; of each the first `n_init` samples tell the first state.
 
     Returns:
@@ -71,8 +71,8 @@ def errors(model: rf.Model, recordings: Recordings) -> dict[str, Any]:
         with the voltage offset of each recording, found on its first `WINDOW` seconds; `offsets` [V].
         Errors that are not finite, and calibrations of machines that have no voltage, are None.
     """
-    bare = [(model, r) for r in recordings]
-    own = [(calibrated(model, r), r) for r in recordings]
+    bare = [(model if isinstance(model, rf.Model) else model(r), r) for r in recordings]
+    own = [(calibrated(m, r), r) for m, r in bare]
     found: dict[str, Any] = {"whole": _whole(bare), "windows": _windows(bare)}
     known = [(m, r) for (m, _), r in ((pair, r) for pair, r in own if pair is not None)]
     complete = len(known) == len(own)

@@ -68,7 +68,7 @@ def row(
         "simulated": {
             "baseline": errors(result.baseline.model, way.test),
             "final": errors(result.final.model, way.test),
-            "fitted to all": errors(result.model, way.test) if result.final_fit else None,
+            "fitted to all": errors(result.model_of, way.test) if result.final_fit else None,
         },
         "each_test": [errors(result.final.model, [r]) for r in way.test] if len(way.test) > 1 else None,
         "seconds": {

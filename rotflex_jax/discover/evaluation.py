@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
 from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem, refit
-from rotflex_jax.discover.result import RunErrors, Stage
+from rotflex_jax.discover.result import KnownRuns, RunErrors, Stage
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import (
     Horizons,
@@ -131,6 +131,40 @@ def errors_as_trained(
     )
     model = validation.model_of(trained, locations, 0)
     return free_runs(validation, [model] * len(validation.problem.dataset.recordings)).errors
+
+
+def errors_on_test(
+    test: ValidationSet,
+    h: Hypothesis,
+    own: Float[np.ndarray, "K L"],
+    locations: Sequence[EffectLocation],
+    runs: KnownRuns,
+) -> RunErrors:
+    """Errors over recordings that had no say, each with the offsets that are known of its run.
+
+    A recording of a run that was fitted has the offsets of that run. One of another run has those that the
+    machine has, and none that a single run has shown; nor the phase of a disturbance.
+
+    Args:
+        test: The recordings.
+        h: Trained.
+        own: Unconstrained values of its local parameters in each of the fitted recordings.
+        locations: What its model has.
+        runs: The fitted recordings.
+    """
+    s, recordings = test.problem.supermodel, test.problem.dataset.recordings
+    known = [runs.index(r) for r in recordings]
+    rows = np.array([own.mean(axis=0) if k is None else own[k] for k in known]).reshape(len(known), -1)
+    trained = dataclasses.replace(
+        h,
+        local_z=rows * [i not in s.phased for i in h.local],
+        x0=np.repeat(h.x0[:1], len(known), axis=0),
+        K=np.repeat(h.K[:1], len(known), axis=0),
+        densities=np.array(-np.inf),
+    )
+    machine = [p for p in locations if runs.compared or p not in s.calibrations]
+    on = [machine if k is None else locations for k in known]
+    return free_runs(test, [test.model_of(trained, p, i) for i, p in enumerate(on)]).errors
 
 
 def evaluate(
@@ -324,11 +358,13 @@ class Evaluation:
         validation: Free runs over the validation recordings.
         test: Free runs over recordings that had no say; None without any.
         calibrate_seconds: How much of a recording its own offsets may be fitted to [s].
+        runs: Those of the training recordings.
     """
 
     validation: ValidationSet
     test: ValidationSet | None
     calibrate_seconds: float
+    runs: KnownRuns
 
     @classmethod
     def of(
@@ -354,7 +390,9 @@ class Evaluation:
             whole = LikelihoodProblem.of(s, solver, dataset, problem.ports)
             cut = whole.of_free_runs(Windows.of_seconds(model, dataset, seconds, number))
             other = ValidationSet(cut, seconds)
-        return cls(validation, other, calibrate_seconds)
+        train = horizons.free_run.problem.dataset.recordings
+        runs = KnownRuns.of(train, validation.problem.dataset.recordings)
+        return cls(validation, other, calibrate_seconds, runs)
 
     def make_ahead(self, found: ValidatedHypothesis, longest: Recording) -> None:
         """Have the programs made that evaluating nested models will need.
@@ -399,7 +437,8 @@ class Evaluation:
                 self.validation, validated, locations, self.calibrate_seconds
             )
         if self.test:
-            found["test"] = errors_as_trained(self.test, validated.hypothesis, locations)
+            h = validated.hypothesis
+            found["test"] = errors_on_test(self.test, h, h.local_z, locations, self.runs)
             if self.calibrate_seconds:
                 found["test_calibrated"] = errors_with_own_calibration(
                     self.test, trained, locations, self.calibrate_seconds

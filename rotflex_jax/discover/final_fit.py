@@ -15,10 +15,12 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.discover.evaluation import (
     Evaluation,
     errors_as_trained,
+    errors_on_test,
     errors_with_own_calibration,
     free_runs,
 )
@@ -88,6 +90,13 @@ class _Structure:
         local_z = np.tile(z[list(self.hypothesis.local)], (len(self.hypothesis.x0), 1))
         return dataclasses.replace(self.hypothesis, z=z, local_z=local_z)
 
+    def own_values(self, found: Fit, count: int) -> Float[np.ndarray, "K L"]:
+        """Unconstrained values of the local parameters of the search in each of the fitted recordings."""
+        s, m = self.supermodel, found.model.mechanism
+        transform = Transform.of(m.parameter_specifications)
+        z = np.array([transform.unconstrain(found.model_of(k).mechanism.values) for k in range(count)])
+        return z[:, [m.parameter_names.index(s.mechanism.parameter_names[i]) for i in self.hypothesis.local]]
+
     def validated(self, h: Hypothesis, folds: Sequence[Hypothesis] = ()) -> ValidatedHypothesis:
         """A hypothesis, or one for each recording, as errors are evaluated; nothing is adapted."""
         return ValidatedHypothesis(h, np.zeros(0), h, np.zeros(0), folds=tuple(folds))
@@ -147,7 +156,7 @@ def _fitted_to_all(
     failed = log_error_ratio(_as_carried(structure, every, evaluation), bare) > MOST_WORSE
     if failed or log_error_ratio(_on_validation(structure, every, evaluation), searched) > 0:
         return None
-    return _reported(structure, found, evaluation, trained, searched)
+    return _reported(structure, found, (*train, *held_back), evaluation, trained, searched)
 
 
 def _with_offsets_of_the_machine(
@@ -205,6 +214,7 @@ def _as_carried(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluati
 def _reported(
     structure: _Structure,
     found: Fit,
+    fitted: tuple[Recording, ...],
     evaluation: Evaluation,
     trained: RunErrors,
     searched: RunErrors,
@@ -214,7 +224,9 @@ def _reported(
     seconds = evaluation.calibrate_seconds
     if evaluation.test:
         h = structure.as_hypothesis(found)
-        test = errors_as_trained(evaluation.test, h, structure.on)
+        runs = evaluation.runs._replace(recordings=fitted)
+        own = structure.own_values(found, len(fitted))
+        test = errors_on_test(evaluation.test, h, own, structure.on, runs)
         if seconds:
             validated = structure.validated(h)
             calibrated = errors_with_own_calibration(evaluation.test, validated, structure.on, seconds)

@@ -14,9 +14,11 @@ from rotflex_jax.effects.labels import effect_phrase, with_titles
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.fit.result import Fit
+from rotflex_jax.mechanism.roles import calibrations
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import of_one_run
 
 
 class ConditionalInterval(NamedTuple):
@@ -158,6 +160,29 @@ class Stage:
                 out[name] = plain(errors.whole)
                 out[windows] = {"seconds": self.window_seconds, **plain(errors.windows)}
         return out
+
+
+class KnownRuns(NamedTuple):
+    """The runs that a model was fitted to, and what is known of their offsets.
+
+    An offset of the voltage or a bias of a sensor belongs to a run until another run shows the same.
+
+    Attributes:
+        recordings: What was fitted.
+        compared: Whether offsets of one run were tried on another: those in a model are then the machine's.
+    """
+
+    recordings: tuple[Recording, ...]
+    compared: bool
+
+    @classmethod
+    def of(cls, train: Sequence[Recording], validation: Sequence[Recording]) -> "KnownRuns":
+        """Those of training recordings; where these validate each other, `validation` is the same."""
+        return cls(tuple(train), any(not of_one_run(a, b) for a in train for b in validation))
+
+    def index(self, recording: Recording) -> int | None:
+        """Which of the recordings is of the same run as another one; None if none is."""
+        return next((k for k, r in enumerate(self.recordings) if of_one_run(r, recording)), None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -425,6 +450,33 @@ class SearchResult:
         Errors of the stages are those of `final.model`, which was fitted to the training recordings alone.
         """
         return self.final_fit.model if self.final_fit else self.final.model
+
+    def model_of(self, recording: Recording) -> Model:
+        """The model to use for a recording: `model` with the offsets that are known of its run.
+
+        A recording of a run that was fitted has the offsets of that run. For one of another run, `model` is
+        without those that a single run has shown.
+
+        Args:
+            recording: Any of this machine; a part of a recording knows its run.
+        """
+        runs, m = KnownRuns.of(self.train, self.validation), self.model.mechanism
+        fit = self.final_fit.fit if self.final_fit else None
+        k = runs._replace(recordings=(*self.train, *self.validation) if fit else self.train).index(recording)
+        if k is None and not runs.compared:
+            for location in self.offsets:
+                m = m.without(*location)
+        elif k is not None and fit is not None:
+            own = {name: each[k].value for name, each in fit.local.items() if name in m.parameter_names}
+            m = m.with_values(own)
+        return dataclasses.replace(self.model, mechanism=m)
+
+    @property
+    def offsets(self) -> tuple[tuple[str, str], ...]:
+        """Offsets and biases in `model` that the search has added, as (effect, port)."""
+        given, m = self.baseline.model.mechanism, self.model.mechanism
+        before, after = ({(e.name, e.at) for e in each.effects} for each in (given, m))
+        return tuple(p for p in calibrations(given) if p in after - before)
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

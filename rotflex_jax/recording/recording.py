@@ -377,6 +377,29 @@ def _one_after_the_other(a: Recording, b: Recording) -> bool:
     return at >= 0 and np.array_equal(before.u[here], first.u) and np.array_equal(before.y[here], first.y)
 
 
+def of_one_run(a: Recording, b: Recording) -> bool:
+    """Whether two recordings are parts of one run, or the same one.
+
+    Parts that were cut from one recording know how it began (`continues`). Two runs may begin with the same
+    standstill, so the beginning that both know must have `FEWEST_MOVING` samples that differ from the one
+    before.
+    """
+    first, second = (_beginning(r) for r in (a, b))
+    N = min(first.N, second.N)
+    if first.Ts != second.Ts or first.y.shape[1] != second.y.shape[1]:
+        return False
+    here, there = (np.column_stack([r.u[:N], r.y[:N]]) for r in (first, second))
+    moving = np.count_nonzero(np.any(here[1:] != here[:-1], axis=1))
+    return bool(moving >= FEWEST_MOVING) and np.array_equal(here, there)
+
+
+def _beginning(recording: Recording) -> Recording:
+    """The first recording of a run."""
+    while recording.continues is not None:
+        recording = recording.continues
+    return recording
+
+
 def check_apart(fitted: Sequence[Recording], unseen: Sequence[Recording], purpose: str, reason: str) -> None:
     """Refuses data that were fitted in the place of data that no fit has seen.
 

@@ -1,0 +1,69 @@
+"""An offset belongs to a run until another run shows the same."""
+
+import numpy as np
+import pytest
+from test_discover_final_fit import OFFSET, run, short_runs_miss
+
+import rotflex_jax as rf
+from rotflex_jax.discover.result import KnownRuns
+from rotflex_jax.effects import Coulomb
+from rotflex_jax.recording.recording import of_one_run
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """A run with an offset in three parts, and one of the same machine without."""
+    first, rest = run(0.06, 0.04, 0, N=4500).split(1 / 3)
+    return first, *rest.split(0.5), run(0.06, 0.0, 1)
+
+
+@pytest.fixture(scope="module")
+def found(parts):
+    """Learnt from one run, and evaluated on its end and on another one."""
+    arm = rf.joints.rotary_arm(flexible=False) + Coulomb("hub", level=0.03)
+    return rf.discover(arm, parts[0], parts[1], test=parts[2:], candidates=[], rounds=0)
+
+
+def test_parts_know_their_run(parts):
+    first, second, third, other = parts
+    assert of_one_run(first, second) and of_one_run(third, second) and of_one_run(other, other)
+    assert not of_one_run(first, other) and not of_one_run(other, third)
+    # A common beginning at rest makes no common run.
+    N, moving = 200, np.random.default_rng(0).normal(size=(2, 200))
+    a, b = (
+        rf.Recording(np.r_[np.zeros(N), u], np.r_[np.zeros(N), u][:, None], 0.002, channels=("theta",))
+        for u in moving
+    )
+    assert not of_one_run(a.slice(N, 2 * N), b.slice(N, 2 * N))
+
+
+def test_runs_are_compared_where_validation_has_another_one(parts):
+    first, second, third, other = parts
+    assert not KnownRuns.of([first], [second, third]).compared
+    assert KnownRuns.of([first], [second, other]).compared
+    assert KnownRuns.of([first, other], [first, other]).compared
+    assert KnownRuns.of([other, first], [second]).index(third) == 1
+
+
+def test_another_run_starts_without_the_offset_of_one(found, parts):
+    *_, third, other = parts
+    value = dict(zip(found.model.mechanism.parameter_names, found.model.mechanism.values, strict=True))
+    assert value[OFFSET] == pytest.approx(0.04, abs=0.004)
+    assert found.offsets == (("voltage_offset", "input"),)
+    assert OFFSET in found.model_of(third).mechanism.parameter_names
+    bare = found.model_of(other)
+    assert OFFSET not in bare.mechanism.parameter_names
+    # Reported are the errors of just these models.
+    missed = [short_runs_miss(found.model_of(r), r) for r in (third, other)]
+    lengths = [r.N for r in (third, other)]
+    together = np.sqrt(np.average(np.square(missed), weights=lengths))
+    assert found.final.test.windows["theta"] == pytest.approx(together, rel=0.05)
+    assert missed[1] < 0.2 * short_runs_miss(found.model, other)
+
+
+def test_an_offset_that_two_runs_share_is_the_machine_s(parts):
+    arm = rf.joints.rotary_arm(flexible=False) + Coulomb("hub", level=0.03)
+    again, unseen = run(0.06, 0.04, 2), run(0.06, 0.04, 3)
+    found = rf.discover(arm, parts[0], again, test=unseen, candidates=[], rounds=0)
+    assert found.model_of(unseen) == found.model
+    assert OFFSET in found.model.mechanism.parameter_names
