@@ -59,6 +59,7 @@ def test_another_run_starts_without_the_offset_of_one(found, parts):
     together = np.sqrt(np.average(np.square(missed), weights=lengths))
     assert found.final.test.windows["theta"] == pytest.approx(together, rel=0.05)
     assert missed[1] < 0.2 * short_runs_miss(found.model, other)
+    assert any("seen in one run" in note for note in found.notes)
 
 
 def test_an_offset_that_two_runs_share_is_the_machine_s(parts):
@@ -66,4 +67,5 @@ def test_an_offset_that_two_runs_share_is_the_machine_s(parts):
     again, unseen = run(0.06, 0.04, 2), run(0.06, 0.04, 3)
     found = rf.discover(arm, parts[0], again, test=unseen, candidates=[], rounds=0)
     assert found.model_of(unseen) == found.model
+    assert not any("seen in one run" in note for note in found.notes)
     assert OFFSET in found.model.mechanism.parameter_names

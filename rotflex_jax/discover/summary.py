@@ -27,6 +27,7 @@ from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, proba
 from rotflex_jax.discover.result import (
     ConditionalInterval,
     FinalFit,
+    KnownRuns,
     Ranked,
     Round,
     Stage,
@@ -36,7 +37,13 @@ from rotflex_jax.discover.result import (
 )
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import helps
-from rotflex_jax.discover.stepwise import calibration_notes, disturbance_notes, far_from_given, nested_models
+from rotflex_jax.discover.stepwise import (
+    calibration_notes,
+    disturbance_notes,
+    far_from_given,
+    nested_models,
+    titled,
+)
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, validate
 from rotflex_jax.fit.plausibility import Remark, at_bounds, beyond_recordings
@@ -142,6 +149,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *_resumed(state.resumed),
             *conditional_note(conditional),
             *calibration_notes(supermodel, evaluated.final, state.own),
+            *_run_notes(state, evaluated.test),
             *disturbance_notes(supermodel, evaluated.final),
             *difference_notes(supermodel, evaluated.pairs),
             *_far_baseline(state),
@@ -199,6 +207,19 @@ def _far_baseline(state: SearchState) -> tuple[str, ...]:
         f"The fit of the model as it is has moved {' and '.join(moved)}: values that were given far off do "
         "that, and friction that holds a machine at rest"
         + ("; candidates were also tried beside the values given." if state.ranking else "."),
+    )
+
+
+def _run_notes(state: SearchState, test: Sequence[Recording]) -> tuple[str, ...]:
+    """Which offsets test recordings of other runs are evaluated without, in a sentence."""
+    held_back = state.validation.problem.dataset.recordings
+    runs = KnownRuns.of(state.problem.dataset.recordings, held_back)
+    offsets = [p for p in state.order if p in state.problem.supermodel.calibrations]
+    if not offsets or runs.compared or all(runs.index(r) is not None for r in test):
+        return ()
+    return (
+        f"{' and '.join(map(titled, offsets))} was seen in one run: errors on test recordings of other runs "
+        "are without it, as is the model that `model_of` gives for them.",
     )
 
 

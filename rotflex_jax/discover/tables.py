@@ -161,8 +161,8 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     remarks = "".join(f" {remark.sentence}." for remark in found.fit.remarks)
     return (
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
-        f"measured first states. The same fit to other recordings alone has errors over {seconds:g} s on "
-        f"validation data of {', '.join(shown)}{own}.{ending}{remarks}"
+        f"measured first states. Fitted in the same way without the validation data, its errors on these "
+        f"over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
     )
 
 
