@@ -137,7 +137,7 @@ def test_a_delay_within_the_sample_is_that_of_the_switched_linear_system():
     for solver in (Exponential(), Exponential(between="switched")):
         y = simulate(joint + fx.Delay(time=late), u, Ts, solver=solver)
         error[solver.between] = np.max(np.abs(y - np.array(exact)))
-    assert error["held"] > 1e-4 and error["switched"] < 0.02 * error["held"]
+    assert error["held"] > 1e-4 and error["switched"] < 0.05 * error["held"]
     # Where the voltage is constant over each sample, nothing changes.
     for solver in (Exponential(), Exponential(between="switched")):
         moved = simulate(joint + fx.Delay(time=2 * Ts), u, Ts, solver=solver)
