@@ -4,12 +4,15 @@
 
 A machine of the independent simulator hides one effect; an ordinary recording of 6 s at about 1 V rms hardly
 says which of two or three it is. Each rival is fitted to that recording, and all start equally probable. Then
-`experiment_until` plays on the simulator, half a second at a time, until one has the probability 99 %.
+`experiment_until` plays on the simulator and evaluates what was recorded every 0.1 s, until one has the
+probability 99 %.
 
 Beside it the standard inputs, without a pause and evaluated by the same rule: of each kind (multisine, binary
-sequence, sweep, steps, noise) the setting and level that the fitted models expect most of, and of these five
-the one that turned out fastest. They are evaluated at fewer moments, and the earliest possible one counts.
-Last, cases that no input within the limits can tell: does the loop say so.
+sequence, sweep, steps, noise) the setting and level with which the fitted models expect to be told apart
+soonest. From one second on they are evaluated at fewer moments, and the earliest possible one counts. Two
+comparisons are made: with one kind for all cases, the one whose median is least, and with the kind that
+turned out fastest in each case, which nobody knows beforehand. Last, cases that no input within the limits
+can tell: does the loop say so.
 
 Writes results/B4_sequential.json and .md after each case; rows that are there are kept, so that a run that
 was stopped goes on. Processes share compiled programs where ROTFLEX_PROGRAMS names a folder.
@@ -36,18 +39,19 @@ from rotflex_jax.data import excitation
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.experiment import Rig, experiment_until
 from rotflex_jax.experiment.rival_set import RunData
-from rotflex_jax.experiment.segment_choice import SegmentChoice
-from rotflex_jax.experiment.sequential import SequentialExperiment, sequential_experiment
+from rotflex_jax.experiment.segment_choice import LEVELS, SegmentChoice
+from rotflex_jax.experiment.sequential import SHAPES_AFTER, SequentialExperiment, sequential_experiment
 from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
 from rotflex_jax.text.files import write_file
 
-TS, ORDINARY, MOST, SEGMENT, ERROR = 0.002, 6.0, 20.0, 0.5, 0.01
+TS, ORDINARY, MOST, SEGMENT, CHECK, ERROR = 0.002, 6.0, 20.0, 0.5, 0.1, 0.01
 LIMITS = rf.Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
 # Within these nothing moves far beyond the noise.
 NARROW = rf.Limits(voltage=0.3, travel=np.deg2rad(5), deflection=np.deg2rad(0.3))
 # Moments at which a standard input is evaluated [s]; the earliest since the one before counts.
-MOMENTS = (0.5, 1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20)
-LEVELS, PLAYED = (1.0, 0.5, 0.25), 1
+MOMENTS = (*(k * CHECK for k in range(1, 11)), 1.2, 1.5, 1.8, 2.2, 2.6, 3.2)
+MOMENTS += (4, 5, 6, 7, 8, 10, 12, 14, 17, 20)
+KINDS = ("multisine", "prbs", "sweep", "steps", "noise")
 
 # The effect that is there with its numbers, and its rivals.
 CASES = {
@@ -153,7 +157,7 @@ def standard(N: int, seed: int) -> list[tuple[str, str, np.ndarray]]:
 
 
 def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str, np.ndarray]]:
-    """Of each kind the setting and level that the models expect most of, within the limits all the time."""
+    """Of each kind the setting and level that are expected to decide soonest, always within the limits."""
     long = SequentialExperiment(
         start.rivals, type(start.settings)(LIMITS, segment_seconds=MOST, improve=False), start.prior
     )
@@ -166,15 +170,17 @@ def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str
         for (k, s, _), u, good in zip(made, U, ok, strict=True)
         if good
     ]
-    T, _ = choice.evidence(np.array([u for *_, u in offered]), (1.0,), drawn=False)
-    worth = choice.usefulness(T[0].min(axis=2))
-    chosen, taken = [], {}
-    for i in np.argsort(-worth):
+    # As the loop: none that moves hardly more than the noise.
+    seen = choice.loud(np.array([u for *_, u in offered]))
+    offered = [o for o, good in zip(offered, seen, strict=True) if good]
+    parts = tuple(t / MOST for t in MOMENTS)
+    T, _ = choice.evidence(np.array([u for *_, u in offered]), parts, drawn=False)
+    seconds = choice.seconds_until_decided(T.min(axis=3), parts)
+    chosen: dict[str, tuple[str, str, np.ndarray]] = {}
+    for i in np.argsort(seconds):
         k, s, _, u = offered[i]
-        if taken.get(k, 0) < PLAYED:
-            taken[k] = taken.get(k, 0) + 1
-            chosen.append((k, f"{s}, {np.max(np.abs(u)):.2g} V", u))
-    return chosen
+        chosen.setdefault(k, (k, f"{s}, {np.max(np.abs(u)):.2g} V", u))
+    return list(chosen.values())
 
 
 def played_standard(start: SequentialExperiment, rig: ArenaRig, u: np.ndarray) -> dict:
@@ -190,13 +196,13 @@ def played_standard(start: SequentialExperiment, rig: ArenaRig, u: np.ndarray) -
         new = []
         for h in range(r.count):
             x = unknowns[h] if unknowns else np.concatenate([r.prior_mean[h], first])
-            starts = [x] + (r.other_shapes(h, x) if t <= 3 * SEGMENT else [])
+            starts = [x] + (r.other_shapes(h, x) if t <= SHAPES_AFTER * SEGMENT else [])
             new.append(r.fitted(h, starts, [run], 0, start.samples).unknowns)
         unknowns = tuple(new)
         e = SequentialExperiment(r, start.settings, start.prior, runs=(run,), unknowns=unknowns)
         p = e.probabilities
         if p.max() >= 1 - ERROR:
-            return {"seconds": before + SEGMENT, "decided": True, "best": r.labels[int(np.argmax(p))]}
+            return {"seconds": round(before + CHECK, 6), "decided": True, "best": r.labels[int(np.argmax(p))]}
         before = t
     return {"seconds": MOST, "decided": False, "best": r.labels[int(np.argmax(p))]}
 
@@ -208,7 +214,13 @@ def trial(name: str, seed: int, say, hopeless: bool = False, alone: bool = False
     models = fits(truth, numbers, rivals, seed)
     right, limits = "@".join(truth), NARROW if hopeless else LIMITS
     rig = ArenaRig(truth, numbers, seed, limits)
-    settings = {"noise": NOISE, "error": ERROR, "max_seconds": MOST, "segment_seconds": SEGMENT}
+    settings = {
+        "noise": NOISE,
+        "error": ERROR,
+        "max_seconds": MOST,
+        "segment_seconds": SEGMENT,
+        "check_seconds": CHECK,
+    }
     result = experiment_until(models, rig, **settings, progress=say)
     row = {
         "case": name,
@@ -218,7 +230,7 @@ def trial(name: str, seed: int, say, hopeless: bool = False, alone: bool = False
         "verdict": result.verdict,
         "best": result.best,
         "sentence": result.sentence,
-        "seconds": result.seconds,
+        "seconds": round(result.seconds, 6),
         "probability": result.probabilities[result.best],
         "misfit": result.history[-1].misfit if result.history else None,
         "inputs": [[s.input, s.setting, s.voltage] for s in result.history],
@@ -249,13 +261,34 @@ def fastest(row: dict) -> dict:
     return min(good, key=lambda s: s["seconds"]) if good else least
 
 
-def ratio(row: dict) -> float:
-    """Seconds of the best standard input over those of the loop, of a case that has to be decided.
-
-    Where the loop decided nothing, or wrongly, it counts as if it had needed the whole time.
-    """
+def own_seconds(row: dict) -> float:
+    """Seconds of the loop, of a case that has to be decided; the whole time where it did not, or wrongly."""
     good = row["verdict"] == "decided" and row["best"] == row["truth"]
-    return fastest(row)["seconds"] / (row["seconds"] if good else MOST)
+    return row["seconds"] if good else MOST
+
+
+def ratio(row: dict) -> float:
+    """Seconds of the best standard input over those of the loop."""
+    return fastest(row)["seconds"] / own_seconds(row)
+
+
+def of_kinds(rows: list[dict]) -> dict[str, dict[str, float]]:
+    """Each kind of standard input by itself: what decides nothing or wrongly counts as the whole time."""
+    found = {}
+    for kind in KINDS:
+        played = [(r, s) for r in rows for s in r["standard"] if s["input"] == kind]
+        if not played:
+            continue
+        right = [s["decided"] and s["best"] == r["truth"] for r, s in played]
+        seconds = [s["seconds"] if good else MOST for (_, s), good in zip(played, right, strict=True)]
+        ratios = [t / own_seconds(r) for (r, _), t in zip(played, seconds, strict=True)]
+        found[kind] = {
+            "seconds": float(np.median(seconds)),
+            "ratio": float(np.median(ratios)),
+            "decided": sum(s["decided"] for _, s in played),
+            "wrong": sum(s["decided"] and not good for (_, s), good in zip(played, right, strict=True)),
+        }
+    return found
 
 
 def totals(rows: list[dict]) -> dict:
@@ -264,6 +297,9 @@ def totals(rows: list[dict]) -> dict:
     decided = [r for r in told if r["verdict"] == "decided"]
     played = [(s, r["truth"]) for r in told for s in r["standard"]]
     sure = [s["best"] == truth for s, truth in played if s["decided"]]
+
+    kinds = of_kinds(told)
+    one_kind = min(kinds, key=lambda k: kinds[k]["seconds"], default="")
 
     def median(values: list[float]) -> float | None:
         return float(np.median(values)) if values else None
@@ -278,6 +314,10 @@ def totals(rows: list[dict]) -> dict:
         "ratio": median([ratio(r) for r in told]),
         "seconds": median([r["seconds"] for r in told]),
         "standard_seconds": median([fastest(r)["seconds"] for r in told]),
+        "kinds": kinds,
+        "kind": one_kind,
+        "kind_seconds": kinds[one_kind]["seconds"] if kinds else None,
+        "kind_ratio": kinds[one_kind]["ratio"] if kinds else None,
         "hopeless": len(lost),
         "hopeless_said": sum(r["verdict"] == "not distinguishable" for r in lost),
         "hopeless_decided": sum(r["verdict"] == "decided" for r in lost),
@@ -291,8 +331,9 @@ def page(rows: list[dict]) -> str:
     lines = [
         "# Seconds on the rig until it is decided",
         "",
-        f"Error probability {ERROR:g}, at most {MOST:g} s, segments of {SEGMENT:g} s; the fastest of five "
-        "standard inputs that decided rightly stands beside, `>` where none did.",
+        f"Error probability {ERROR:g}, at most {MOST:g} s, evaluated every {CHECK:g} s; the fastest of five "
+        "standard inputs that decided rightly stands beside, which is known in hindsight only; `>` where "
+        "none did.",
         "",
         "| case | seed | the loop | seconds | best standard input | seconds | ratio |",
         "|---|---|---|---|---|---|---|",
@@ -311,6 +352,19 @@ def page(rows: list[dict]) -> str:
             f"{t['standard']} standard inputs {t['standard_decided']} decided, {t['standard_wrong']} of them "
             f"wrongly. Median of the ratios {t['ratio']:.1f}; median seconds {t['seconds']:.1f} beside "
             f"{t['standard_seconds']:.1f}.",
+        ]
+    if t["kinds"]:
+        lines += [
+            "",
+            "Each kind for all cases, its setting and level chosen for each case by the models; what decided "
+            f"nothing or wrongly counts as {MOST:g} s:",
+            "",
+            "| kind | seconds, median | over those of the loop, median | decided | wrongly |",
+            "|---|---:|---:|---:|---:|",
+            *(
+                f"| {k} | {v['seconds']:.1f} | {v['ratio']:.1f} | {v['decided']} | {v['wrong']} |"
+                for k, v in t["kinds"].items()
+            ),
         ]
     if t["hopeless"]:
         lines += [

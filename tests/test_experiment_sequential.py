@@ -12,8 +12,8 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment import rival_set
-from rotflex_jax.experiment.rival_set import CALIBRATION_SPREAD, STATE_SPREAD
+from rotflex_jax.experiment import common_structure, rival_set
+from rotflex_jax.experiment.rival_set import CALIBRATION_SPREAD, STATE_SPREAD, RunData
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import SequentialExperiment, sequential_experiment
 
@@ -110,6 +110,82 @@ def test_expected_evidence_is_found_on_average(pair):
     expected = T[0, 0, 1, 0, 0]
     assert expected > 0.3
     assert np.mean(got) == pytest.approx(expected, abs=4 * np.sqrt(2 * expected / 16))
+
+
+def test_the_first_part_of_an_input_counts_as_a_shorter_one():
+    settings = {"noise": NOISE, "error": 0.1, "improve": False}
+    models = {"light": known(0.01), "heavy": known(0.02)}
+    long, short = (
+        SegmentChoice(sequential_experiment(models, LIMITS, TS, segment_seconds=s, **settings))
+        for s in (0.8, 0.4)
+    )
+    u = np.sin(0.2 * np.arange(80))[None]
+    T, _ = long.evidence(u, (0.5, 1.0), drawn=False)
+    half, _ = short.evidence(u[:, :40], (1.0,), drawn=False)
+    np.testing.assert_allclose(T[0], half[0], rtol=1e-9)
+    assert np.all(T[1, 0, [0, 1], 0, [1, 0]] > half[0, 0, [0, 1], 0, [1, 0]])
+
+
+def test_seconds_until_it_is_decided_by_hand(pair):
+    """At 10 % and equal probabilities log 9 nats are needed."""
+    choice, need = SegmentChoice(pair), np.log(9.0)
+    # After half a segment, one and four: the first model reaches what it needs at 3/4, the other at 10.
+    T = np.zeros((3, 1, 2, 2))
+    T[:, 0, 0, 1] = [0.5 * need, 1.5 * need, 6 * need]
+    T[:, 0, 1, 0] = [-need, 0.1 * need, 0.4 * need]
+    got = choice.seconds_until_decided(T, (0.5, 1.0, 4.0))
+    assert got == pytest.approx([0.4 * (0.75 + 10) / 2])
+    # Nobody sees a decision before the first evaluation.
+    T[:] = 9 * need
+    assert choice.seconds_until_decided(T, (0.5, 1.0, 4.0)) == pytest.approx([0.2])
+
+
+def test_a_segment_in_pieces_ends_where_it_is_decided(tmp_path):
+    settings = {"noise": NOISE, "segment_seconds": 0.6, "improve": False, "uncertainty": 0.3}
+    machine = servo(0.011) + fx.Coulomb(at="hub", level=0.003)
+
+    def ran(check: float | None, error: float, stops: bool = False) -> SequentialExperiment:
+        rig = rf.SimulatedRig(machine, LIMITS, TS, NOISE, seed=4)
+        e = sequential_experiment(friction_rivals(), LIMITS, TS, check_seconds=check, error=error, **settings)
+        while not (e := e.with_next_segment()).verdict and e.seconds < 1.15:
+            e = e.with_recording(rig.play(e.due))
+            if stops:
+                e = SequentialExperiment.load(e.save(tmp_path / "state.json"))
+        return e
+
+    whole, pieces = ran(None, 1e-9), ran(0.25, 1e-9, stops=True)
+    # Two segments of 0.25, 0.25 and 0.1 s are recorded as those in one piece, whatever their inputs are.
+    assert [len(r.u) for r in pieces.runs] == [len(r.u) for r in whole.runs] == [120]
+    assert len(pieces.history) == len(whole.history) == 2
+    assert pieces.history[1].seconds == pytest.approx(1.2)
+    soon = ran(0.1, 0.01)
+    assert soon.verdict == "decided" and soon.planned is None
+    assert soon.seconds < 1.15 and soon.seconds == pytest.approx(0.1 * round(10 * soon.seconds))
+    assert [s.seconds for s in soon.history] == pytest.approx([0.6, soon.seconds])
+
+
+def test_a_lag_is_not_taken_for_a_delay_that_its_model_has_approximated():
+    """Voltages that change at every sample, on the independent simulator: the model of a lag fits it."""
+    truth, h = {("lag", "input"): {"time": 5e-4}}, 0.002
+    u = 6.0 * np.sign(np.sin(2 * np.pi * 60 * h * np.arange(1000) + 0.3))
+    r = make_record(truth, seed=2101, played=u, fs=1 / h)
+    q = r["truth"]["plant"]
+    m = rf.joints.paper()
+    sizes = (q[n] for n in ("J_hub", "J_arm", "K", "k_t", "k_m", "R_m", "K_g", "eta", "B_hub", "B_joint"))
+    m = m.with_values(dict(zip(m.parameter_names, sizes, strict=True)))
+    rivals = common_structure.rival_set(
+        [m + fx.Lag(time=5e-4), m + fx.Delay(time=5e-4)], Ts=h, noise={"theta": 5e-4, "alpha": 5e-4}
+    )
+    run, costs = RunData(u, r["clean"]), []
+    for k in range(2):
+        start = np.concatenate([rivals.prior_mean[k], rivals.first_unknowns(run)])
+        costs.append(rivals.fitted(k, [start], [run], 0, 1000).cost)
+    assert costs[0] < 1 and costs[1] > 5
+    sticks = m + fx.Coulomb(at="hub")
+    for models in ([m, sticks], [sticks, sticks + fx.Lag()]):
+        solver = common_structure.rival_set(models, Ts=h, noise={"theta": 5e-4, "alpha": 5e-4}).solver
+        assert solver.between == "held"
+    assert rivals.solver.between == "switched"
 
 
 def friction_rivals() -> dict[str, rf.Mechanism]:
@@ -288,6 +364,7 @@ def test_a_rig_of_files_waits_for_what_was_recorded(tmp_path):
         ({"a": servo(), "b": servo()}, {"noise": None}, "sensor noise"),
         ({"a": servo(), "b": servo()}, {"error": 0.7}, "error"),
         ({"a": servo(), "b": servo()}, {"segment_seconds": 0.1}, "segment_seconds"),
+        ({"a": servo(), "b": servo()}, {"check_seconds": 0.01}, "check_seconds"),
         ({"a": servo(), "b": servo()}, {"max_seconds": 0.1}, "max_seconds"),
         ({"a": servo(), "b": servo()}, {"probabilities": {"a": 1.0}}, "probabilities"),
         ({"a": servo(), "b": servo()}, {"uncertainty": 0}, "uncertainty"),

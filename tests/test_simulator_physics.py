@@ -18,6 +18,7 @@ from scipy.linalg import expm
 from sticking import ARM, HUB, JOINT, Joint, asymmetric, coulomb, stribeck
 
 import rotflex_jax.effects as fx
+from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, SmoothRK4, free_run, linearise, simulate, simulate_states
 from rotflex_jax.mechanism.assembly import rest_state
@@ -117,6 +118,33 @@ def test_single_precision_stays_single_and_close():
     double = simulate(paper() + fx.Coulomb("hub", 0.03), u, 0.004)
     assert (single.dtype, double.dtype) == (np.float32, np.float64)
     np.testing.assert_allclose(single, double, atol=1e-4)
+
+
+def test_a_delay_within_the_sample_is_that_of_the_switched_linear_system():
+    """The voltage switches within each sample; matrix exponentials of both parts."""
+    joint, Ts, late, N = paper(hub_damping=0.01), 0.004, 0.0013, 200
+    space, u = linearise(joint), np.sign(np.random.default_rng(2).standard_normal(N))
+    A = np.pad(np.column_stack([space.A, space.B]), ((0, 1), (0, 0)))
+    before, after = expm(A * late), expm(A * (Ts - late))
+    x, exact = np.zeros(5), []
+    for k in range(N):
+        exact.append(space.C @ x[:4])
+        x[4] = u[max(k - 1, 0)]
+        x = before @ x
+        x[4] = u[k]
+        x = after @ x
+    error = {}
+    for solver in (Exponential(), Exponential(between="switched")):
+        y = simulate(joint + fx.Delay(time=late), u, Ts, solver=solver)
+        error[solver.between] = np.max(np.abs(y - np.array(exact)))
+    assert error["held"] > 1e-4 and error["switched"] < 0.05 * error["held"]
+    # Where the voltage is constant over each sample, nothing changes.
+    for solver in (Exponential(), Exponential(between="switched")):
+        moved = simulate(joint + fx.Delay(time=2 * Ts), u, Ts, solver=solver)
+        plain = simulate(joint, np.concatenate([[u[0]] * 2, u[:-2]]), Ts)
+        np.testing.assert_allclose(moved, plain, rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match="substeps"):
+        Exponential(between="switched", substeps=2)
 
 
 # -- symmetries ---------------------------------------------------------------------------------

@@ -307,11 +307,20 @@ class Delay(Actuation):
     equation: ClassVar[str] = "v(t) = u(t - time)"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 3
+    changes_within_samples: ClassVar[bool] = True
 
     time: float = parameter(0.004, unit="s", lower=0.0, meaning="delay")
 
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
         """Voltage [V] to hold over each sample."""
+        mean, moment = self.within_samples(voltage, Ts)
+        # The first moment, which the mean does not show: a pulse and its opposite one sample later.
+        return mean - jnp.diff(moment, prepend=0.0)
+
+    def within_samples(
+        self, voltage: Float[Array, " N"], Ts: Period
+    ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+        """Mean over each sample and first moment about its middle [V]."""
         # A delay of n + f samples: the older of two neighbouring commands fills the share f of a sample.
         late = self.time / Ts
         whole = jnp.floor(late)
@@ -319,9 +328,8 @@ class Delay(Actuation):
         newer = jnp.arange(voltage.shape[0]) - whole.astype(int)
         command = lambda k: voltage[jnp.maximum(k, 0)]  # noqa: E731
         mean = part * command(newer - 1) + (1 - part) * command(newer)
-        # The older one comes first, which the mean does not show: a pulse and its opposite one sample later.
-        late_half = part * (1 - part) / 2
-        return mean - late_half * (command(newer) - 2 * command(newer - 1) + command(newer - 2))
+        # The older one comes first.
+        return mean, part * (1 - part) / 2 * (command(newer) - command(newer - 1))
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
@@ -356,11 +364,20 @@ class Lag(Actuation):
     equation: ClassVar[str] = "time * dv/dt = u - v"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 4
+    changes_within_samples: ClassVar[bool] = True
 
     time: float = parameter(0.006, unit="s", lower=1e-7, meaning="time constant")
 
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
         """Voltage [V] to hold over each sample."""
+        mean, moment = self.within_samples(voltage, Ts)
+        # The first moment, which the mean does not show: a pulse and its opposite one sample later.
+        return mean - jnp.diff(moment, prepend=0.0)
+
+    def within_samples(
+        self, voltage: Float[Array, " N"], Ts: Period
+    ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+        """Mean over each sample and first moment about its middle [V]."""
         slow = self.time / Ts
         fade = jnp.exp(-1 / slow)
         behind = -slow * jnp.expm1(-1 / slow)  # mean of exp(-t / time) over a sample
@@ -370,9 +387,7 @@ class Lag(Actuation):
         def sample(v: jax.Array, u: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             return u + fade * (v - u), (u + behind * (v - u), early * (v - u))
 
-        mean, moment = jax.lax.scan(sample, voltage[0], voltage)[1]
-        # The first moment, which the mean does not show: a pulse and its opposite one sample later.
-        return mean - jnp.diff(moment, prepend=0.0)
+        return jax.lax.scan(sample, voltage[0], voltage)[1]
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:

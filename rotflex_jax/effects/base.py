@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
@@ -443,12 +444,24 @@ class Actuation(Effect):
     ports: ClassVar[tuple[str, ...]] = ("input",)
     # Several are applied in this order, from the command to the motor.
     stage: ClassVar[int] = 0
+    # Whether the voltage changes within a sample, so that `within_samples` says more than `drive`.
+    changes_within_samples: ClassVar[bool] = False
 
     at: str = "input"
 
     @abc.abstractmethod
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
         """The whole sequence (N,) [V] that reaches the motor."""
+
+    def within_samples(
+        self, voltage: Float[Array, " N"], Ts: Period
+    ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+        """Mean of the voltage over each sample, and its first moment about the middle, both [V].
+
+        The moment is the mean of `(s - 1/2) v(s)`, with `s` from 0 to 1 over the sample.
+        """
+        held = self.drive(voltage, Ts)
+        return held, jnp.zeros_like(held)
 
 
 class Sensing(Effect):

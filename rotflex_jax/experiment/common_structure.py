@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import checks
-from rotflex_jax.effects.base import Effect
+from rotflex_jax.effects.base import Actuation, DryFriction, Effect, Gear
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.rival_fit import with_calibrations
 from rotflex_jax.experiment.rival_set import RivalSet
 from rotflex_jax.fit.result import Fit
-from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism import Exponential, Mechanism, Solver
+from rotflex_jax.mechanism.gear import gear_steps
 from rotflex_jax.mechanism.mechanism import process_noise_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
@@ -110,7 +111,7 @@ def rival_set(
         labels,
         tuple(reduced),
         union,
-        reduced[0].solver,
+        _switching_solver(reduced, union),
         np.array(gates),
         np.array(values),
         tuple(free),
@@ -121,6 +122,25 @@ def rival_set(
         process_noise_of(first, process_noise),
         float(Ts),
     )
+
+
+def _switching_solver(models: Sequence[Model], union: Mechanism) -> Solver:
+    """The solver of the models, with voltages that delays and lags switch where their machine allows it.
+
+    A delay and a lag of a quarter of a sample differ by less than the error of a voltage that is held.
+    """
+    solver = models[0].solver
+    switched = [
+        m.mechanism.effects
+        for m in models
+        if any(isinstance(e, Actuation) and e.changes_within_samples for e in m.mechanism.effects)
+    ]
+    sticks = any(isinstance(e, DryFriction | Gear) for effects in switched for e in effects)
+    if not switched or sticks or gear_steps(union.structure) > 1:
+        return solver
+    if not isinstance(solver, Exponential) or solver.substeps > 1 or solver.between != "held":
+        return solver
+    return dataclasses.replace(solver, between="switched")
 
 
 def _items(given: Any) -> list[tuple[str | None, Any]]:

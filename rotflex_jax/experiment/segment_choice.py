@@ -35,7 +35,10 @@ DRAWS = 3
 # Share of a parameter's distance to its bound that a draw leaves.
 LEFT_TO_BOUND = 0.2
 # Levels at which each standard input is tried, as shares of what the limits allow.
-LEVELS = (1.0, 0.5, 0.2)
+LEVELS = (1.0, 0.4, 0.15, 0.06)
+# Motions of fewer standard deviations of the noise are not tried: the errors of a counter go on from sample
+# to sample there, and say far less than as many independent ones would.
+QUIET = 20.0
 # Inputs that are improved by gradient, evaluations of each, and shares of the voltage limit of its steps.
 IMPROVED, LOOKS, FIRST_STEP, MOMENTUM = 4, 40, 0.3, 0.5
 # A log-likelihood ratio of mean T has the variance 2T: beyond so many deviations it is left out of account.
@@ -44,6 +47,8 @@ DEVIATIONS = 2.0
 CUTS = 6
 # Inputs that a table lists.
 LISTED = 8
+# Least share of the needed evidence that an input is rated with.
+LEAST_SHARE = 1e-6
 # A shift of a logarithm beyond this is no longer a small change; the slope is then taken without it.
 LARGEST_SHIFT = 1.0
 
@@ -167,6 +172,12 @@ class SegmentChoice:
                 U[over] *= (0.98 / np.clip(excess[excess > 1], 1.02, 5.0))[:, None]
         return U, ok
 
+    def loud(self, U: Float[np.ndarray, "B M"]) -> Bool[np.ndarray, " B"]:
+        """Which inputs move some channel by far more than the noise; if none does, those that move most."""
+        y = self.outputs(U)[..., : self.M, :]
+        moved = np.nan_to_num(np.max(np.ptp(y, axis=-2) / self.r.noise, axis=(1, 2, 3)), nan=np.inf)
+        return moved >= min(QUIET, moved.max() / 4)
+
     # -- information -------------------------------------------------------------------------------
 
     def evidence(
@@ -181,7 +192,7 @@ class SegmentChoice:
 
         Args:
             U: Voltages.
-            repeats: Numbers of repetitions n.
+            repeats: Numbers of repetitions n, below one for the first part of the input.
             drawn: Whether the true parameters are drawn too.
             shift: Whether the minimising `d` and residuals are wanted, for gradients.
 
@@ -209,24 +220,28 @@ class SegmentChoice:
         J = J[:, inside].reshape(B, H, *J[:, inside].shape[1:])
         true = np.concatenate([y, self.outputs(U, drawn=True)[..., : self.M, :]], axis=2) if drawn else y
         out, details = np.zeros((len(repeats), B, H, true.shape[2], H)), [{} for _ in range(B)]
-        root = math.sqrt(self.e.scale)
+        root, C = math.sqrt(self.e.scale), y.shape[-1]
+        # Rows of the whitened outputs that each number of repetitions has, and its weight.
+        amounts = [(C * min(self.M, math.ceil(n * self.M - 1e-9)), max(n, 1.0)) for n in repeats]
         for b in range(B):
             for other in range(H):
                 D = self.machine_own[other]
                 A = r.whitened(other, np.moveaxis(J[b, other, ..., :D], -1, 0)) / root
                 A = A.reshape(D, -1).T
-                G = A.T @ A
+                G = {m: A[:m].T @ A[:m] for m, _ in amounts}
                 for h in range(H):
                     if h == other and not drawn:
                         continue
                     e = r.whitened(other, true[b, h] - y[b, other]) / root
                     e = e.reshape(len(e), -1)
-                    c, g = np.sum(e**2, axis=1), e @ A
-                    for i, n in enumerate(repeats):
-                        d = np.linalg.solve(self.information[other] + n * G, n * g.T)
+                    for i, (m, n) in enumerate(amounts):
+                        c, g = np.sum(e[:, :m] ** 2, axis=1), e[:, :m] @ A[:m]
+                        d = np.linalg.solve(self.information[other] + n * G[m], n * g.T)
                         out[i, b, h, :, other] = 0.5 * n * (c - np.sum(g * d.T, axis=1))
                     if shift and h != other:
-                        details[b][h, other] = ((e[0] - A @ d[:, 0]).reshape(self.M, -1), d[:, 0])
+                        left = e[0] - A @ d[:, 0]
+                        left[m:] = 0.0  # what comes later does not count
+                        details[b][h, other] = (left.reshape(self.M, -1), d[:, 0])
         own = np.einsum("ibhdh->ibhd", out)
         out = np.nan_to_num(out - own[..., None], nan=0.0, posinf=0.0, neginf=0.0)
         if shift:
@@ -253,6 +268,37 @@ class SegmentChoice:
     def usefulness(self, T: Float[np.ndarray, "*B H H"]) -> Float[np.ndarray, "*B"]:
         """Evidence (...,) that, if all pairs had it, would give the same bound [nat]."""
         return np.asarray(4 * (self.bound(np.zeros((self.r.count,) * 2)) - self.bound(T)))
+
+    @property
+    def needed(self) -> Float[np.ndarray, "H H"]:
+        """Entry (h, r): evidence for h against r at which h is decided, if r is its only rival [nat]."""
+        error = self.e.settings.error
+        return math.log((1 - error) / error) - np.log(self.p[:, None] / self.p[None, :])
+
+    def seconds_until_decided(
+        self, T: Float[np.ndarray, "n *B H H"], repeats: Sequence[float]
+    ) -> Float[np.ndarray, "*B"]:
+        """Expected seconds until one model is decided, over the probabilities of the models.
+
+        A model that is true is decided when its evidence is as large as is needed against each other one.
+
+        Args:
+            T: Evidence after each number of repetitions, see `evidence`.
+            repeats: The numbers of repetitions, increasing; between them evidence grows linearly, beyond the
+                last as it did until then.
+        """
+        need, other = self.needed, ~np.eye(self.r.count, dtype=bool)
+        share = np.where(other & (need > 0), T / np.where(need > 0, need, 1.0), 1 / LEAST_SHARE).min(axis=-1)
+        share = np.maximum.accumulate(np.maximum(share, LEAST_SHARE), axis=0)
+        last = repeats[-1] / np.minimum(share[-1], 1.0)
+        n, before, reached = last, (0.0, np.zeros_like(last)), np.zeros(last.shape, bool)
+        for k, s in zip(repeats, share, strict=True):
+            at = before[0] + (k - before[0]) * (1 - before[1]) / np.maximum(s - before[1], LEAST_SHARE)
+            # A decision is seen when what was recorded is evaluated.
+            n = np.where(~reached & (s >= 1), np.maximum(at, repeats[0]), n)
+            reached |= s >= 1
+            before = (k, s)
+        return self.e.settings.segment_seconds * np.sum(self.p / self.p.sum() * n, axis=-1)
 
     # -- choice ------------------------------------------------------------------------------------
 
@@ -283,7 +329,7 @@ class SegmentChoice:
         return out
 
     def best(self, say: Progress) -> tuple[Segment, str]:
-        """The segment with the least expected error, and why none would decide, if so."""
+        """The segment that is expected to decide soonest, and why none would decide, if so."""
         e, Ts = self.e, self.r.Ts
         named = self._standard()
         U = np.array([self.limits.playable(u, Ts) for *_, u in named])
@@ -295,28 +341,35 @@ class SegmentChoice:
             )
         named = [(k, s, level) for level in LEVELS for (k, s, _), good in zip(named, ok, strict=True) if good]
         U = np.concatenate([level * U[ok] for level in LEVELS])
+        seen = self.loud(U)
+        named, U = [n for n, good in zip(named, seen, strict=True) if good], U[seen]
         left = max(1.0, (e.settings.max_seconds - e.seconds) / e.settings.segment_seconds)
-        repeats = (float(min(LOOK_AHEAD, left)), left)
+        repeats = self._amounts(left)
         T, _ = self.evidence(U, repeats, drawn=True)
-        score = self.usefulness(T[0].min(axis=2))
+        seconds, worth = self._rated(T, repeats)
+        order = np.lexsort((-worth, seconds))
         tried = len(U)
         if e.settings.improve:
-            starts = self._distinct(np.argsort(-score), named)
+            starts = self._distinct(order, named)
             say(f"improving {len(starts)} inputs")
-            designs = self._improved(U[starts], repeats[0])
+            n = seconds[order[0]] / e.settings.segment_seconds
+            n = float(np.clip(n, repeats[0], min(LOOK_AHEAD, left)))
+            designs = self._improved(U[starts], n)
             designs, ok = self.within_limits(np.array([self.limits.playable(u, Ts) for u in designs]))
+            ok &= self.loud(designs)
             if ok.any():
                 new, _ = self.evidence(designs[ok], repeats, drawn=True)
                 T, U = np.concatenate([T, new], axis=1), np.concatenate([U, designs[ok]])
-                score = np.concatenate([score, self.usefulness(new[0].min(axis=2))])
                 from_ = [named[i] for i, good in zip(starts, ok, strict=True) if good]
                 named += [("design", f"from {k}, {s}", 1.0) for k, s, _ in from_]
                 tried = len(U)
-        order = np.argsort(-score)
+        seconds, worth = self._rated(T, repeats)
+        order = np.lexsort((-worth, seconds))
         top = order[0]
         peaks = self.peaks(U[top : top + 1])[0]
         label = lambda i: (named[i][0], named[i][1] + (f", x {named[i][2]:g}" if named[i][2] != 1 else ""))  # noqa: E731
-        worst = np.maximum(T[0, top].min(axis=1), 0.0)
+        ahead = self._ahead(repeats)
+        worst = np.maximum(T[ahead, top].min(axis=1), 0.0)
         segment = Segment(
             rivals=self.r.labels,
             u=U[top],
@@ -326,15 +379,32 @@ class SegmentChoice:
             nats=worst,
             expected_error=float(min(1.0 - e.probabilities.max(), math.exp(self.bound(worst)))),
             probabilities=tuple(e.probabilities.tolist()),
-            repeats=repeats[0],
+            repeats=repeats[ahead],
             peaks=dict(zip(self.r.structure.channels, peaks.tolist(), strict=True)),
-            table=tuple((*label(i), float(score[i])) for i in order[:LISTED]),
+            table=tuple((*label(i), float(worth[i])) for i in order[:LISTED]),
             tried=tried,
             limits=self.limits,
             outputs=self.outputs(U[top : top + 1])[0, :, 0, : self.M],
             channels=self.r.structure.channels,
         )
-        return segment, self._too_small(T[1], left, tried, label(int(order[0])))
+        return segment, self._too_small(T[-1], left, tried, label(int(order[0])))
+
+    def _amounts(self, left: float) -> tuple[float, ...]:
+        """Numbers of repetitions at which inputs are rated: pieces of the first, then up to the time left."""
+        pieces = [k * self.e.piece / self.M for k in range(1, math.ceil(self.M / self.e.piece))]
+        more = [1.0]
+        while 2 * more[-1] < left:
+            more.append(2 * more[-1])
+        return tuple(sorted({*pieces, *more, float(min(LOOK_AHEAD, left)), left}))
+
+    def _ahead(self, repeats: tuple[float, ...]) -> int:
+        """Which of the numbers of repetitions the worth of an input is of."""
+        return repeats.index(min(LOOK_AHEAD, repeats[-1]))
+
+    def _rated(self, T: np.ndarray, repeats: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Expected seconds until it is decided, and worth [nat], of each input; the worst of the draws."""
+        worst = T.min(axis=3)
+        return self.seconds_until_decided(worst, repeats), self.usefulness(worst[self._ahead(repeats)])
 
     def _distinct(self, order: np.ndarray, named: list[Any]) -> list[int]:
         """The best input of each of the best kinds."""

@@ -32,6 +32,8 @@ Progress = Callable[[str], None]
 
 SEGMENT_SECONDS, MOST_SECONDS, ERROR = 1.0, 60.0, 0.01
 SHORTEST_SEGMENT = 0.4
+# Samples of the shortest piece that is evaluated by itself.
+SHORTEST_PIECE = 10
 KIND = "rotflex_jax sequential experiment"
 # Segments that are played before giving up, and times in turn that the gain must be too small.
 TRIED, IN_TURN = 2, 2
@@ -51,6 +53,8 @@ class SequentialSettings:
         continues: Whether the motion goes on from one segment to the next.
         improve: Whether inputs are improved by gradient.
         seed: Of standard inputs and draws.
+        check_seconds: Time after which what was recorded is evaluated [s]: a segment is played in pieces of
+            this length and broken off where it is decided. None for whole segments.
     """
 
     limits: Limits
@@ -60,6 +64,7 @@ class SequentialSettings:
     continues: bool = True
     improve: bool = True
     seed: int = 0
+    check_seconds: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +81,8 @@ class SequentialExperiment:
         too_small: Times in turn that no input promised to decide.
         verdict: `decided`, `time is up`, `not distinguishable`, or empty while it goes on.
         reason: What the verdict rests on where nothing was decided.
-        planned: The segment to play next.
+        planned: The segment to play next, or of which the rest is to be played.
+        played: Samples of it that were played.
     """
 
     rivals: RivalSet
@@ -89,6 +95,7 @@ class SequentialExperiment:
     verdict: str = ""
     reason: str = ""
     planned: Segment | None = None
+    played: int = 0
 
     # -- what is known -----------------------------------------------------------------------------
 
@@ -96,6 +103,23 @@ class SequentialExperiment:
     def samples(self) -> int:
         """Samples of a segment."""
         return round(self.settings.segment_seconds / self.rivals.Ts)
+
+    @property
+    def piece(self) -> int:
+        """Samples that are played before what was recorded is evaluated."""
+        check = self.settings.check_seconds
+        return self.samples if check is None else min(round(check / self.rivals.Ts), self.samples)
+
+    @property
+    def due(self) -> Float[np.ndarray, " N"]:
+        """The voltage to play next: the planned segment, or a piece of it [V].
+
+        Raises:
+            InputError: No segment is planned.
+        """
+        if self.planned is None:
+            raise InputError("No segment is planned; plan the next one first.")
+        return self.planned.u[self.played : self.played + self.piece]
 
     @property
     def seconds(self) -> float:
@@ -109,7 +133,7 @@ class SequentialExperiment:
     @functools.cached_property
     def posteriors(self) -> tuple[RivalPosterior, ...]:
         """What is known of each rival after all recordings."""
-        place = len(self.runs[-1].u) - self._before
+        place = max(0, len(self.runs[-1].u) - self._before)
         return tuple(
             self.rivals.posterior(h, x, self.runs, place, self.samples) for h, x in enumerate(self.unknowns)
         )
@@ -172,6 +196,7 @@ class SequentialExperiment:
                 for f in dataclasses.fields(planned)
                 if f.name != "limits"
             },
+            "played": self.played,
         }
 
     @classmethod
@@ -217,6 +242,7 @@ class SequentialExperiment:
                 str(data["verdict"]),
                 str(data["reason"]),
                 planned,
+                int(data.get("played", 0)),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
@@ -257,8 +283,7 @@ class SequentialExperiment:
         """The same with the next segment planned, or with the verdict that none would decide."""
         if self.verdict or self.planned is not None:
             return self
-        planner = SegmentChoice(self)
-        segment, reason = planner.best(progress or (lambda _: None))
+        segment, reason = SegmentChoice(self).best(progress or (lambda _: None))
         too_small = self.too_small + 1 if reason else 0
         if too_small >= IN_TURN and len(self.history) >= TRIED:
             return dataclasses.replace(
@@ -267,7 +292,7 @@ class SequentialExperiment:
         return dataclasses.replace(self, too_small=too_small, planned=segment)
 
     def with_recording(self, recording: Recording | Float[np.ndarray, "N C"]) -> "SequentialExperiment":
-        """The same after the planned segment was played.
+        """The same after the voltage that was due was played.
 
         Args:
             recording: Outputs at the instants of the voltage, or a recording.
@@ -277,32 +302,36 @@ class SequentialExperiment:
         """
         if self.planned is None:
             raise InputError("A recording was given, but no segment is planned; plan the next one first.")
-        run = _checked(recording, self.planned, self.rivals)
+        run = _checked(recording, self.due, self.rivals)
         r, runs, N = self.rivals, self.runs, len(run.u)
-        known = [old.y[a : a + N] for old in runs for a in range(0, len(old.u), N)]
+        # Two short pieces near rest may well be alike to the last count.
+        whole = self.piece == self.samples
+        known = [old.y[a : a + N] for old in runs for a in range(0, len(old.u), N) if whole]
         if np.ptp(run.y, axis=0).any() and any(np.array_equal(run.y, y) for y in known):
             raise InputError("This recording was given before; give one of the voltage that is planned now.")
-        own = [r.first_unknowns(run)] if not runs or not self.settings.continues else []
+        first = self.played == 0
+        own = [r.first_unknowns(run)] if first and (not runs or not self.settings.continues) else []
         if own:
             runs = (*runs, run)
         else:
             last = runs[-1]
             whole = RunData(np.concatenate([last.u, run.u]), np.concatenate([last.y, run.y]))
             runs = (*runs[:-1], whole)
-        place, unknowns = len(runs[-1].u) - self._before, []
+        place, unknowns = max(0, len(runs[-1].u) - self._before), []
+        earlier = self.history if first else self.history[:-1]
         for h in range(r.count):
             start = np.concatenate([self.unknowns[h] if self.unknowns else r.prior_mean[h], *own])
             starts = [start]
-            if len(self.history) < SHAPES_AFTER:
+            if len(earlier) < SHAPES_AFTER:
                 starts += r.other_shapes(h, start)
             unknowns.append(r.fitted(h, starts, runs, place, self.samples).unknowns)
-        new = dataclasses.replace(self, runs=runs, unknowns=tuple(unknowns), planned=None)
+        new = dataclasses.replace(self, runs=runs, unknowns=tuple(unknowns))
         p = new.probabilities
         step = SequentialStep(
             seconds=new.seconds,
             input=self.planned.input,
             setting=self.planned.setting,
-            voltage=float(np.max(np.abs(run.u))),
+            voltage=float(max(np.max(np.abs(run.u)), 0.0 if first else self.history[-1].voltage)),
             expected_error=self.planned.expected_error,
             probabilities=dict(zip(r.labels, p.tolist(), strict=True)),
             misfit=math.sqrt(new.scale),
@@ -310,9 +339,17 @@ class SequentialExperiment:
         verdict = ""
         if np.max(p) >= 1 - self.settings.error:
             verdict = "decided"
-        elif new.seconds > self.settings.max_seconds - 0.5 * self.settings.segment_seconds:
+        elif new.seconds > self.settings.max_seconds - 0.5 * self.piece * r.Ts:
             verdict = "time is up"
-        return dataclasses.replace(new, history=(*self.history, step), verdict=verdict)
+        played = self.played + N
+        over = bool(verdict) or played >= len(self.planned.u)
+        return dataclasses.replace(
+            new,
+            history=(*earlier, step),
+            verdict=verdict,
+            planned=None if over else self.planned,
+            played=0 if over else played,
+        )
 
     def result(self) -> SequentialResult:
         """What is known now, as a result."""
@@ -365,9 +402,9 @@ def _correlation_time(residuals: Sequence[np.ndarray]) -> float:
     return most
 
 
-def _checked(recording: Any, planned: Segment, rivals: RivalSet) -> RunData:
-    """Voltage and outputs of the segment."""
-    N, channels = len(planned.u), rivals.structure.channels
+def _checked(recording: Any, due: np.ndarray, rivals: RivalSet) -> RunData:
+    """Voltage and outputs of what was due."""
+    N, channels = len(due), rivals.structure.channels
     if isinstance(recording, Recording):
         if abs(recording.Ts / rivals.Ts - 1) > 1e-3:
             raise InputError(
@@ -383,7 +420,7 @@ def _checked(recording: Any, planned: Segment, rivals: RivalSet) -> RunData:
         y = np.column_stack([recording.channel(c).astype(float) for c in channels])
     else:
         y = np.asarray(recording)
-        u = planned.u
+        u = due
         if y.dtype.kind not in "iuf" or y.ndim != 2 or y.shape[1] != len(channels):
             raise InputError(
                 f"The rig returned {checks.shown(recording)} of shape {y.shape}, but {N} samples of "
@@ -393,7 +430,7 @@ def _checked(recording: Any, planned: Segment, rivals: RivalSet) -> RunData:
     if len(y) != N or not np.all(np.isfinite(y)):
         flaw = "" if np.all(np.isfinite(y)) else ", some not finite"
         raise InputError(
-            f"The recording has {len(y)} samples{flaw}, but the segment has {N}; record every sample of it, "
+            f"The recording has {len(y)} samples{flaw}, but the voltage has {N}; record every sample of it, "
             "from its first."
         )
     return RunData(u, y)
@@ -408,6 +445,7 @@ def sequential_experiment(
     error: float = ERROR,
     max_seconds: float = MOST_SECONDS,
     segment_seconds: float = SEGMENT_SECONDS,
+    check_seconds: float | None = None,
     continues: bool = True,
     noise: Mapping[str, float] | None = None,
     process_noise: Mapping[str, float] | None = None,
@@ -422,6 +460,10 @@ def sequential_experiment(
     )
     max_seconds = checks.number(max_seconds, "max_seconds", least=segment_seconds, unit="s", example="60.0")
     Ts = checks.number(Ts, "Ts", above=0, below=0.05, unit="s", example="0.002")
+    if check_seconds is not None:
+        check_seconds = checks.number(
+            check_seconds, "check_seconds", least=SHORTEST_PIECE * Ts, unit="s", example="0.1"
+        )
     rivals = rival_set(models, Ts=Ts, noise=noise, process_noise=process_noise, uncertainty=uncertainty)
     settings = SequentialSettings(
         checked_limits(limits),
@@ -431,6 +473,7 @@ def sequential_experiment(
         bool(continues),
         bool(improve),
         checks.whole(seed, "seed", 0),
+        check_seconds if continues else None,
     )
     return SequentialExperiment(rivals, settings, _prior(probabilities, rivals.labels))
 

@@ -27,6 +27,7 @@ def experiment_until(
     error: float = ERROR,
     max_seconds: float = MOST_SECONDS,
     segment_seconds: float = SEGMENT_SECONDS,
+    check_seconds: float | None = None,
     noise: Mapping[str, float] | None = None,
     process_noise: Mapping[str, float] | None = None,
     uncertainty: float = UNKNOWN_SHARE,
@@ -56,6 +57,9 @@ def experiment_until(
         error: Probability of a wrong answer at which it stops.
         max_seconds: Time on the rig at which it stops [s].
         segment_seconds: Length of a segment [s].
+        check_seconds: Time after which what was recorded is evaluated [s]: on a rig whose motion goes on, a
+            segment is played in pieces of this length and broken off where it is decided. None for whole
+            segments.
         noise: Channel -> standard deviation of the sensor noise; that of the fits if None.
         process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
         uncertainty: Standard deviation of parameters that come without one, as a share of their value.
@@ -89,6 +93,7 @@ def experiment_until(
         error=error,
         max_seconds=max_seconds,
         segment_seconds=segment_seconds,
+        check_seconds=check_seconds,
         continues=rig.continues,
         noise=noise,
         process_noise=process_noise,
@@ -99,7 +104,7 @@ def experiment_until(
     while not (e := e.with_next_segment(say)).verdict:
         assert e.planned is not None
         say(f"{e.seconds:g} s: playing {e.planned.input}, {e.planned.setting}")
-        e = e.with_recording(rig.play(e.planned.u))
+        e = e.with_recording(rig.play(e.due))
         say(e.result().standing)
         if e.verdict:
             break

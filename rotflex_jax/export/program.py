@@ -229,7 +229,7 @@ def sample_program(model: Model, Ts: float) -> SampleProgram:
     Raises:
         InputError: An effect that C code cannot express, by name.
     """
-    if getattr(model.solver, "between", "held") != "held":
+    if getattr(model.solver, "between", "held") == "smooth":
         raise InputError(
             "The model's voltage is smooth between samples, which needs samples that are still in the future "
             'for a controller; export it with between="held".'

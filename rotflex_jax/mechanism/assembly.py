@@ -293,6 +293,8 @@ class Constants(NamedTuple):
         push: Response of the linear states to a unit impulse that acts on positions.
         gear: Constants of a gear with play (`gear.GearConstants`), None without one.
         load: Rows of the transmitted torques (`step.LoadRows`), None where no friction depends on them.
+        tilt: `12 h (phi_2 - phi_1 / 2) B`, the response to a voltage without mean and of the first moment
+            one; None where no step uses it.
     """
 
     values: Real[Array, "P *D"]
@@ -311,6 +313,7 @@ class Constants(NamedTuple):
     push: Float[Array, "m p *D"]
     gear: Any = None
     load: Any = None
+    tilt: Float[Array, "m *D"] | None = None
 
 
 def constants(
@@ -319,10 +322,11 @@ def constants(
     gates: Float[Array, " E"],
     h: Float[Array, ""],
     halves: bool = True,
+    tilts: bool = False,
 ) -> Constants:
     """Constants of a step of length `h` [s] for traced parameter values; on request those of half a step."""
-    layout = Layout.of(mechanism.structure)
-    return from_equations(equations(mechanism.with_values(values), gates), layout, values, gates, h, halves)
+    layout, eq = Layout.of(mechanism.structure), equations(mechanism.with_values(values), gates)
+    return from_equations(eq, layout, values, gates, h, halves, tilts)
 
 
 def from_equations(
@@ -332,6 +336,7 @@ def from_equations(
     gates: Float[Array, " E"],
     h: Float[Array, ""],
     halves: bool = True,
+    tilts: bool = False,
 ) -> Constants:
     """Constants of a step of length `h` [s] for equations whose states are in the order of the layout."""
     n = layout.n
@@ -364,6 +369,7 @@ def from_equations(
         stop=moved(one[n : 2 * n, 1:], one[:, 1:], layout.rotor + 1),
         mobility=moved(push[:n], push, layout.rotor),
         push=push,
+        tilt=12 * (two[:, 0] - one[:, 0] / 2) if tilts else None,
     )
 
 
@@ -375,6 +381,29 @@ def motor_voltage(
     for i, effect in sorted(effects_of(mechanism, Actuation), key=lambda pair: pair[1].stage):
         v = v + gates[i] * (effect.drive(v, Ts) - v)
     return v
+
+
+def voltage_within_samples(
+    mechanism: Mechanism, gates: Float[Array, " E"], u: Float[Array, " N"], Ts: Period
+) -> Float[Array, "N 2"]:
+    """Mean of the motor's voltage over each sample, and its first moment about the middle [V].
+
+    First moments of a delay and a lag one after the other add.
+    """
+    v, moment = u, jnp.zeros_like(u)
+    for i, effect in sorted(effects_of(mechanism, Actuation), key=lambda pair: pair[1].stage):
+        mean, own = effect.within_samples(v, Ts)
+        v, moment = v + gates[i] * (mean - v), moment + gates[i] * own
+    return jnp.stack([v, moment], axis=1)
+
+
+def motor_inputs(
+    solver: Any, mechanism: Mechanism, gates: Float[Array, " E"], u: Float[Array, " N"], Ts: Period
+) -> Float[Array, "N *h"]:
+    """What the steps of a solver take at each sample: the voltage of the motor, held, smooth or switched."""
+    if getattr(solver, "between", "held") == "switched":
+        return voltage_within_samples(mechanism, gates, u, Ts)
+    return solver.inputs(motor_voltage(mechanism, gates, u, Ts))
 
 
 def rest_state(structure: Mechanism, dtype: DTypeLike) -> Float[np.ndarray, " n"]:

@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from rotflex_jax.mechanism.assembly import Layout, motor_voltage, rest_state
+from rotflex_jax.mechanism.assembly import Layout, motor_inputs, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import states
 from rotflex_jax.mechanism.simulate import FreeStep, Solver, read_outputs
@@ -84,7 +84,7 @@ def _fitted_states(
     mechanism, constants = structure.with_values(values), solver.prepare(structure, values, gates, Ts)
 
     def fitted(guess: Array, hidden: Array, u: Array, y: Array) -> Array:
-        v = solver.inputs(motor_voltage(mechanism, gates, u, Ts))
+        v = motor_inputs(solver, mechanism, gates, u, Ts)
 
         def run(x0: Array) -> Array:
             return read_outputs(mechanism, gates, states(FreeStep(structure, solver), x0, v, constants).T).T

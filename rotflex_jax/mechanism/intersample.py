@@ -1,8 +1,10 @@
-"""Intersample behaviour of the voltage: held by a converter, or band-limited.
+"""Intersample behaviour of the voltage: held by a converter, band-limited, or switched within the samples.
 
-A converter holds each value until the next. A signal that was measured behind a low-pass filter is determined
-between its samples by the samples (Shannon); a step in substeps uses the mean of that curve over each
-substep. Holding a mean loses amplitude at high frequencies, which the weights restore.
+A converter holds each value until the next. Behind a delay the voltage switches within the sample, which
+counts where hundredths of a sample are distinguished (`assembly.voltage_within_samples`). A signal that was
+measured behind a low-pass filter is determined between its samples by the samples (Shannon); a step in
+substeps uses the mean of that curve over each substep. Holding a mean loses amplitude at high frequencies,
+which the weights restore.
 """
 
 import functools
@@ -12,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-Intersample = Literal["held", "smooth"]
+Intersample = Literal["held", "smooth", "switched"]
 KERNEL_HALF_WIDTH = 24
 """Samples on either side that have a weight: that of the ideal low-pass under a Kaiser window."""
 KAISER_SHAPE = 8.0

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
 from rotflex_jax.effects.base import Actuation, Gear, Memory
-from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, stamped
+from rotflex_jax.mechanism.assembly import effects_of, motor_inputs, stamped
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.repetition import without_repetition
 from rotflex_jax.mechanism.scan import directional, forcing, state_jacobians, states, tangent_recursion
@@ -152,7 +152,7 @@ def inactive_sensitivities(
 
     def voltage(values: Array, gates: Array) -> Any:
         known = structure.with_values(values)
-        return solver.inputs(motor_voltage(known, gates, samples.u, samples.Ts))
+        return motor_inputs(solver, known, gates, samples.u, samples.Ts)
 
     def prepare(values: Array, gates: Array) -> Any:
         return solver.prepare(structure, values, gates, samples.Ts)
@@ -242,7 +242,7 @@ def accumulate_outputs(
         return solver.prepare(structure, p, g, samples.Ts)
 
     def drive(p: Array, g: Array) -> Any:
-        return solver.inputs(motor_voltage(structure.with_values(p), g, samples.u, samples.Ts))
+        return motor_inputs(solver, structure.with_values(p), g, samples.u, samples.Ts)
 
     def read(x: Array, p: Array, g: Array) -> Array:
         return read_outputs(structure.with_values(p), g, x)

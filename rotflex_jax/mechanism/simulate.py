@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Integer, Real
 from rotflex_jax.checks import positive, shown, signal
 from rotflex_jax.effects.base import Sensing
 from rotflex_jax.errors import InputError
-from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_voltage, own_states, rest_state
+from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_inputs, own_states, rest_state
 from rotflex_jax.mechanism.linear import check_movable
 from rotflex_jax.mechanism.mechanism import Mechanism, check_mechanism
 from rotflex_jax.mechanism.scan import BLOCKED_FROM_SAMPLES, linear_outputs, states
@@ -167,7 +167,7 @@ def prepared_run(
     """The mechanism with its parameter values, the solver's input at each sample, the solver's constants."""
     mechanism = structure.with_values(values)
     constants = solver.prepare(structure, values, gates, Ts)
-    return mechanism, solver.inputs(motor_voltage(mechanism, gates, u, Ts)), constants
+    return mechanism, motor_inputs(solver, mechanism, gates, u, Ts), constants
 
 
 def free_run(

@@ -395,7 +395,9 @@ class Exponential:
         substeps: Steps per sample; compare with a larger number to see the error.
         passes: Passes over coupled friction contacts, see `friction.coupled_contacts`; None solves any case.
         between: The voltage between its samples: "held", or "smooth" as behind a low-pass filter, which needs
-            about four substeps.
+            about four substeps; "switched" where a delay or a lag changes it within the sample: the motion is
+            then right at the end of this sample, with "held" at the end of the next. For machines without dry
+            friction and play, in one step per sample.
     """
 
     order: int = 2
@@ -412,10 +414,12 @@ class Exponential:
         if self.passes is not None:
             whole(self.passes, "passes", 1)
         one_of(self.between, "between", get_args(Intersample))
+        if self.between == "switched" and self.substeps > 1:
+            raise InputError('between="switched" needs one step per sample; leave out `substeps`.')
 
     def inputs(self, v: Float[Array, " N"]) -> Float[Array, "N *h"]:
         """Input of `advance` at each sample, for a sequence of voltages."""
-        return v if self.between == "held" else substep_voltages(v, self.substeps)
+        return v if self.between != "smooth" else substep_voltages(v, self.substeps)
 
     def prepare(
         self,
@@ -426,7 +430,7 @@ class Exponential:
     ) -> Constants:
         """Constants for `advance`, formed once per parameter set."""
         h = Ts / (self.substeps * gear_steps(structure))
-        c = constants(structure, values, gates, h, halves=self.order == 4)
+        c = constants(structure, values, gates, h, halves=self.order == 4, tilts=self.between == "switched")
         c = c._replace(load=load_rows(structure.with_values(values), gates))
         gear, number = gear_constants(structure, values, gates, c), len(effects_of(structure, Memory))
         if gear is not None:
@@ -441,11 +445,16 @@ class Exponential:
         Args:
             structure: The mechanism without parameter values.
             x: State.
-            v: Voltage held over the sample (*S) [V], or over each substep (substeps, *S); from `inputs`.
+            v: Voltage held over the sample (*S) [V], over each substep (substeps, *S), or its mean and first
+                moment (2, *S); from `assembly.motor_inputs`.
             c: From `prepare`.
         """
         mechanism = structure.with_values(c.values)
         cut = gear_steps(structure)
+        if self.between == "switched":
+            body = lambda _, state: _step(mechanism, state, v[0], c, self)  # noqa: E731
+            end = body(0, x) if cut == 1 else jax.lax.fori_loop(0, cut, body, x)
+            return end + scaled_vector(c.tilt, v[1])
         if self.substeps * cut == 1:
             return _step(mechanism, x, v if self.between == "held" else v[0], c, self)
         at = lambda k: v if self.between == "held" else v[k // cut]  # noqa: E731
@@ -497,7 +506,7 @@ def _with_rows_of_memories(c: Constants, number: int) -> Constants:
     """Constants whose responses are those of the whole state: zero for its memories."""
     if not number:
         return c
-    names = ("E", "input", "hold", "ramp", "rise", "push", "half_E", "half_input", "half_hold")
+    names = ("E", "input", "hold", "ramp", "rise", "push", "half_E", "half_input", "half_hold", "tilt")
     arrays = {name: a for name in names if (a := getattr(c, name)) is not None}
     padded = {name: jnp.pad(a, ((0, number), *[(0, 0)] * (a.ndim - 1))) for name, a in arrays.items()}
     return c._replace(**padded)

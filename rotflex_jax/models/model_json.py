@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
+from rotflex_jax.mechanism.intersample import Intersample
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, HeldConstant, specifications
@@ -298,7 +299,7 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
             f"The file has the solver {name!r}, but {', '.join(_SOLVERS)} are known; write one of these."
         )
     for key, value in rule.items():
-        words = ("held", "smooth") if isinstance(value, str) else (None,)
+        words = get_args(Intersample) if isinstance(value, str) else (None,)
         positive = isinstance(value, int | float) and not isinstance(value, bool) and value > 0
         if not positive and value not in words:
             raise ValueError(f"the solver has {key} = {value!r:.50}")
