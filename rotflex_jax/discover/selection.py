@@ -220,14 +220,13 @@ def undecided(
     lost = paired_gain(found.blocks, rival.blocks)[0] + _training_gain(found, rival)[0]
     if predictions_apart(found, rival) and lost > left:
         return False
-    runs, others = found.free_run, rival.free_run
-    assert runs and others
-    certainty = min(paired_gain(runs.blocks, others.blocks)[1], _training_gain(runs, others)[1])
-    return certainty < FREE_RUN_Z or _log_best_ratio(rival, found) < LAWS_APART
+    return _free_run_certainty(found, rival) < FREE_RUN_Z or _log_best_ratio(rival, found) < LAWS_APART
 
 
 def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
-    """Whether training data prefer a generalisation after the penalty, and validation data prefer it at all.
+    """Whether predictions prefer a generalisation, or free runs do beyond doubt.
+
+    Predictions of training data must prefer it after the penalty, and those of validation data at all.
 
     Args:
         rich: The generalisation.
@@ -236,7 +235,8 @@ def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: Stacke
     """
     more = rich.parameter_count - simple.parameter_count
     gain = rich.log_likelihood - simple.log_likelihood
-    return gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
+    by_predictions = gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
+    return by_predictions or _free_run_certainty(rich, simple) > FREE_RUN_Z
 
 
 def _needed(parameter_count: int, data: StackedRecordings) -> float:
@@ -387,7 +387,14 @@ def _free_runs_insist(candidate: ValidatedHypothesis, current: ValidatedHypothes
     runs, before = candidate.free_run, current.free_run
     if runs is None or before is None or _log_error_ratio(runs, before) > -FREE_RUN_BETTER:
         return False
-    return min(paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1]) > FREE_RUN_Z
+    return _free_run_certainty(candidate, current) > FREE_RUN_Z
+
+
+def _free_run_certainty(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
+    """By how many standard deviations free runs prefer `a`, the less of training and of validation data."""
+    runs, others = a.free_run, b.free_run
+    assert runs and others
+    return min(paired_gain(runs.blocks, others.blocks)[1], _training_gain(runs, others)[1])
 
 
 def runs_clearly_better(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> bool:
