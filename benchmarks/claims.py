@@ -13,7 +13,9 @@ from typing import Any
 import scipy.stats
 
 from arena.probability import classes, credible, scatter_of_right, usable
+from arena.wrong_table import SEEN, fresh
 from rotflex_jax.arena.scores import calibration_error
+from rotflex_jax.effects.labels import law_of
 from rotflex_jax.parameters import HALF_WIDTH_95
 from speed.table import waiting
 
@@ -47,9 +49,10 @@ def _read(file: str) -> Any:
 # -- wrong worlds -------------------------------------------------------------------------------------------
 
 
-def _worlds(marked: str) -> tuple[int, int]:
+def _worlds(marked: str, seen: bool = False) -> tuple[int, int]:
     """How many wrong worlds have a mark, and of how many; without a hidden effect some marks are None."""
-    rows = [r for r in results("B0_wrong_worlds.json")["records"].values() if r.get(marked) is not None]
+    every = results("B0_wrong_worlds.json")["records"].values()
+    rows = [r for r in every if (r["world"] in SEEN) is seen and r.get(marked) is not None]
     return sum(bool(r[marked]) for r in rows), len(rows)
 
 
@@ -59,20 +62,40 @@ def worlds_named() -> str:
     return "{} of {}".format(*_worlds("named"))
 
 
-# Laws of dry friction, of which one stands in for another where much else is wrong.
-FRICTION = {"coulomb", "coulomb_asymmetric", "stribeck", "dahl", "lugre", "bouc_wen"}
+@named
+def worlds_missed_bound() -> str:
+    """The share of worlds with an effect that is not named which is not excluded [%]."""
+    found, count = _worlds("named")
+    return _at_most(count - found, count)
+
+
+@named
+def worlds_wrong_bound() -> str:
+    """The share of worlds with a wrong effect called established which is not excluded [%]."""
+    return _at_most(*_worlds("wrong_established"))
+
+
+@named
+def worlds_seen_named() -> str:
+    """The same of worlds that were read before the search was last revised."""
+    return "{} of {}".format(*_worlds("named", seen=True))
+
+
+@named
+def worlds_seen_wrong() -> str:
+    """Of these, worlds in which a wrong effect was called established."""
+    return "{} of {}".format(*_worlds("wrong_established", seen=True))
 
 
 @named
 def worlds_other_law() -> str:
-    """Of the others, those in which another law of friction was named where one was hidden."""
-    found = results("B0_wrong_worlds.json")["records"].values()
-    missed = [r for r in found if r.get("named") is False]
-    friction = [r for r in missed if r["hidden"][0] in FRICTION]
+    """Of the others, those in which another law of the same friction was named."""
+    missed = [r for r in _fresh_worlds() if r.get("named") is False]
+    friction = [r for r in missed if law_of(r["hidden"][0]) == "dry friction"]
     alike = [
         r
         for r in friction
-        if any(q["effect"] in FRICTION and q["port"] == r["hidden"][1] for q in r["rounds"])
+        if any(law_of(q["effect"]) == "dry friction" and q["port"] == r["hidden"][1] for q in r["rounds"])
     ]
     return f"{len(alike)} of {len(missed)}"
 
@@ -83,8 +106,12 @@ def worlds_wrong() -> str:
     return "{} of {}".format(*_worlds("wrong_established"))
 
 
+def _fresh_worlds() -> list[dict[str, Any]]:
+    return fresh(results("B0_wrong_worlds.json")["records"].values())
+
+
 def _worlds_with_probabilities() -> list[dict[str, Any]]:
-    return usable(results("B0_wrong_worlds.json")["records"].values())
+    return usable(_fresh_worlds())
 
 
 @named

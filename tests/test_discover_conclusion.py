@@ -32,8 +32,10 @@ from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_eff
 from rotflex_jax.discover.likelihood import LikelihoodProblem, levenberg_marquardt
 from rotflex_jax.discover.result import NEXT, HorizonGain, Round, Stage
 from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.tables import status_sentence
 from rotflex_jax.discover.validation import SearchHorizon, ValidatedHypothesis, ValidationSet
 from rotflex_jax.discover.verdict import Assessment, Grade, Verdict, assess, grade
+from rotflex_jax.effects.labels import effect_phrase, effect_title
 from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder
 from rotflex_jax.mechanism import simulate
 from rotflex_jax.models.model import Model
@@ -123,7 +125,7 @@ def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pyte
     """15 % of the size, half of the error that is left, the nats left in both sets; the worse set counts."""
     space = types.SimpleNamespace
     validation = space(folds=folds, problem="free runs, held out", window_seconds=2.0)
-    prediction = space(problem="predictions", validation=space(problem="predictions, held out"))
+    prediction = space(problem="predictions", validation=space(folds=folds, problem="predictions, held out"))
     runs = space(hypothesis=space(locations=(HUB,)), adapted=None)
     scatter = 0.152 if beyond == "scatter" else 0.15
     change = 0.495 if beyond == "change" else 0.5
@@ -176,6 +178,7 @@ def test_one_effect_in_the_place_of_several_has_the_signs_of_its_part(monkeypatc
     assert asked["gains"][HUB] == 4.0
 
 
+HELPS = HorizonGain(1.0, 2.0, 0.5)
 SAMPLES = 1000  # of each of the two channels
 NEAR = 1.5  # times the noise of the sensor
 
@@ -196,7 +199,10 @@ def told(
     final: Any = SimpleNamespace(
         held_out_rmse_windows=errors, process_noise_nats=noise_nats, window_seconds=2.0
     )
-    found: Any = [SimpleNamespace(effect="coulomb", port="hub", equivalent=others) for others in rounds]
+    found: Any = [
+        SimpleNamespace(effect="coulomb", port="hub", equivalent=others, phrase="dry friction at the hub")
+        for others in rounds
+    ]
     ranking: Any = [SimpleNamespace(excited=k < excited) for k in range(candidates)]
     recordings: Any = [SimpleNamespace(N=SAMPLES // 2)] * 2
     return end_state(baseline, found, final, floor, ranking, recordings)
@@ -220,6 +226,49 @@ def test_explained_leaves_little_to_process_noise(share: float, explained: bool)
     # 0.07 nat for each measured value, those of both channels.
     verdict = ended(noise_nats=0.07 * 2 * SAMPLES * share)
     assert verdict == (Verdict.NOTHING_MISSING if explained else Verdict.UNEXPLAINED)
+
+
+def test_an_unexplained_recording_is_told_what_is_certain_of_it() -> None:
+    sentence = told(ratio=2 * NEAR, rounds=(("stribeck",),))[1]
+    assert sentence.startswith("dry friction at the hub found, but something remains")
+    # Where the recording is explained, the effect is named, and others listed with it.
+    assert told(rounds=(("stribeck",),))[1].startswith("Coulomb friction at the hub explains")
+
+
+FRICTION, OTHER_LAWS = ("coulomb", "hub"), (("stribeck", "hub"), ("lugre", "hub"))
+
+
+@pytest.mark.parametrize(
+    ("effect", "equivalent", "doubts", "certain"),
+    [
+        (FRICTION, OTHER_LAWS, (), "dry friction at the hub"),
+        (FRICTION, (), (), ""),
+        (FRICTION, OTHER_LAWS, ("it is small",), ""),
+        (FRICTION, (*OTHER_LAWS, ("stribeck", "arm")), (), ""),
+        (FRICTION, (*OTHER_LAWS, ("dead_zone", "input")), (), ""),
+        (("delay", "input"), (("lag", "input"),), (), "late input"),
+        # Neither is a law of anything.
+        (("dead_zone", "input"), (("saturation", "input"),), (), ""),
+    ],
+)
+def test_what_is_certain_where_a_law_is_not(effect, equivalent, doubts, certain) -> None:
+    """Nothing but laws of the same thing at the same port may be open."""
+    (like,) = found().rounds
+    turn = dataclasses.replace(
+        like, effect=effect[0], port=effect[1], equivalent=equivalent, doubts=doubts, prediction=HELPS
+    )
+    assert turn.certain == turn.to_dict()["certain"] == certain
+    assert turn.status == ("provisional" if equivalent or doubts else "established")
+    if not certain:
+        assert "certain" not in turn.doubt and turn.phrase == effect_phrase(*effect)
+        assert "as a law" not in status_sentence(turn)
+        return
+    laws = " or ".join(effect_title(e) for e, _ in (effect, *equivalent)).replace(
+        " or ", ", ", len(equivalent) - 1
+    )
+    assert turn.phrase == certain
+    assert turn.doubt == f"{certain} is certain, but not whether it is {laws}"
+    assert status_sentence(turn) == f"Provisional as a law: {turn.doubt}."
 
 
 def test_one_round_that_others_equal_makes_the_end_ambiguous() -> None:

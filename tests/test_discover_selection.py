@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import small_problem as sp
 
-from rotflex_jax.discover import forward_selection, selection, stepwise
+from rotflex_jax.discover import selection, stepwise
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
 from rotflex_jax.discover.likelihood import in_blocks, levenberg_marquardt
 from rotflex_jax.discover.result import HorizonGain
@@ -653,87 +653,63 @@ def test_a_rival_gains_something_on_either_side() -> None:
         assert choose([none, best], BASE, DATA, NOISE) == (best, [])
 
 
-# -- laws between which a poor model does not decide ------------------------------------------------------
+# -- rivals in the place of an effect of a model that leaves much -----------------------------------------
 
-LUGRE = EffectLocation("lugre", "hub")
+LUGRE, DAHL = EffectLocation("lugre", "hub"), EffectLocation("dahl", "hub")
 MORE_NEEDED = selection.TRAIN_NATS + np.log(2 * N)  # of two further parameters
+LEFT = 500.0
+SQRT_2 = 2.0**0.5
 
 
-def undecided(windows: float = 5.0, special: dict | None = None, general: dict | None = None) -> list[str]:
-    """What is listed beside Stribeck friction, of Coulomb friction, LuGre's and friction elsewhere."""
-    lead: dict[str, Any] = {"held_out": 1000.0, "train": 1000.0, "windows": windows}
-    winner = trial(STRIBECK, **lead, numbers=3)
-    others = [
-        trial(ARM, **lead),
-        trial(LUGRE, **lead | {"held_out": 1010.0, "train": 1100.0} | (general or {}), numbers=5),
-        trial(COULOMB, **lead | {"held_out": 950.0, "train": 950.0} | (special or {})),
-    ]
-    assert distinguished(winner, others[2])
-    found = selection.undecided_laws(winner, [*others, winner], BASE, DATA, NOISE)
-    of_known = selection.undecided_generalisations(winner, [*others, winner], DATA, NOISE)
-    assert of_known == [t for t in found if t.location == LUGRE]
-    return [t.location.effect for t in found if t.location]
+def in_place(location=DAHL, z=4.0, windows=10.0, numbers=3, better=False, **lead: float):
+    """A model with another law in the place of Stribeck friction, free runs apart by so many deviations."""
+    predicts = {"held_out": -50.0, "train": -50.0, "windows": 20.0} | lead
+    gain = 100.0 if better else -100.0
+    runs = {"held_out": gain, "train": gain, "windows": windows, "scatter": scatter_for(z, 100.0)}
+    return dataclasses.replace(at_both(predicts, runs, location), parameter_count=numbers)
 
 
-def test_a_poor_model_lists_a_special_case_and_a_generalisation() -> None:
-    assert undecided() == ["coulomb", "lugre"]
-    assert undecided(windows=1.5) == []
-    # Near the noise not even one that nothing distinguishes: the choice is for the simpler of two such laws.
-    winner, same = trial(STRIBECK, 200.0, 200.0, 1.5, numbers=3), trial(COULOMB, 200.0, 200.0, 1.5)
-    assert not distinguished(winner, same)
-    assert selection.undecided_laws(winner, [same, winner], BASE, DATA, NOISE) == []
+def remains(other: ValidatedHypothesis, left: float = LEFT) -> bool:
+    found = dataclasses.replace(at_both({"windows": 20.0}, {"windows": 10.0}, STRIBECK), parameter_count=3)
+    return selection.undecided(found, other, left, DATA)
 
 
 @SIDES
-def test_a_poor_model_leaves_twice_the_noise(side: float) -> None:
-    assert undecided(windows=2.0 * side) == (["coulomb", "lugre"] if side > 1 else [])
-    assert undecided(windows=2.0) == []
+def test_predictions_exclude_a_law_by_more_than_they_leave(side: float) -> None:
+    """Training and validation data together, and beyond doubt."""
+    assert remains(in_place(held_out=-200.0, train=-300.0 * side)) is (side < 1)
+    assert remains(in_place(held_out=-200.0 * side, train=-300.0)) is (side < 1)
+    # Two deviations of all blocks together, twice as many as on either side.
+    scatter = 800.0 / (2.0 * side) * np.sqrt(2 * BLOCKS - 1) / (2 * BLOCKS)
+    assert remains(in_place(held_out=-400.0, train=-400.0, scatter=scatter)) is (side < 1)
 
 
 @SIDES
-def test_a_special_case_gains_nine_tenths_and_runs_a_tenth_worse_at_most(side: float) -> None:
-    assert ("coulomb" in undecided(special={"held_out": 800.0, "train": 1000.0 * side})) is (side > 1)
-    assert ("coulomb" in undecided(special={"windows": 5.0 * np.exp(0.1 * side)})) is (side < 1)
+def test_free_runs_exclude_a_law_that_differs_by_more_than_is_left(side: float) -> None:
+    """Its errors are larger by the root of two, beyond doubt on training and on validation data."""
+    assert remains(in_place(windows=10.0 * np.exp(side * np.log(SQRT_2)))) is (side < 1)
+    assert remains(in_place(windows=20.0, z=2.5 * side)) is (side < 1)
 
 
 @SIDES
-def test_a_generalisation_is_preferred_by_both_kinds_of_data_and_runs_a_tenth_worse_at_most(
-    side: float,
-) -> None:
-    assert ("lugre" in undecided(general={"train": 1000.0 + side * MORE_NEEDED})) is (side > 1)
-    assert ("lugre" in undecided(general={"held_out": 1000.0 + 10.0 * (side - 1.0)})) is (side > 1)
-    assert ("lugre" in undecided(general={"windows": 5.0 * np.exp(0.1 * side)})) is (side < 1)
-    # No better on validation data is not preferred, whatever training data say.
-    assert undecided(general={"held_out": 1000.0, "train": 5000.0}) == ["coulomb"]
+def test_a_generalisation_is_preferred_by_both_kinds_of_data(side: float) -> None:
+    more = in_place(LUGRE, numbers=5, held_out=10.0, train=side * MORE_NEEDED)
+    assert remains(more) is (side > 1)
+    assert remains(in_place(LUGRE, numbers=5, held_out=10.0 * (side - 1.0), train=100.0)) is (side > 1)
+    # Or by free runs, beyond doubt on both.
+    assert remains(in_place(LUGRE, numbers=5, windows=9.0, z=2.5 * side, better=True)) is (side > 1)
+    # Beside a special case or another law there is nothing to be preferred.
+    assert remains(in_place(COULOMB, numbers=1)) and remains(in_place(DAHL, numbers=2))
 
 
-def test_generalisations_of_what_was_found_before_are_noted_once(monkeypatch) -> None:
-    """Nor is a special case beside it one of them, though nothing distinguishes the two models."""
-    monkeypatch.setattr(forward_selection, "parameter_count", lambda *_: 3)
-    beside = trial(None, 1000.0, 1000.0, 5.0)
-    same = trial(COULOMB, 1000.0, 1000.0, 5.0)
-    richer = trial(LUGRE, 1010.0, 1100.0, 5.0, numbers=5)
-    state: Any = SimpleNamespace(
-        problem=SimpleNamespace(supermodel=None, noise=NOISE, dataset=SimpleNamespace(data=DATA)),
-        current=beside,
-        scores={STRIBECK: 1.0, DRAG: 1.0},
-        rivals={STRIBECK: [ARM], DRAG: []},
-    )
-    for _ in range(2):
-        forward_selection._note_generalisations(state, [same, richer])
-    assert state.rivals == {STRIBECK: [ARM, LUGRE], DRAG: []}
-
-
-@pytest.mark.parametrize("windows", [1.9, 2.1])
 @pytest.mark.parametrize("found", [[STRIBECK], [STRIBECK, DRAG]], ids=["alone", "beside another"])
-def test_other_laws_of_one_friction_remain_only_in_a_poor_model(monkeypatch, windows, found) -> None:
-    """Put in its place, such a law is refused by free runs alone, another effect by the likelihood too."""
-    final = trial(None, 1000.0, 1000.0, windows)
+def test_a_rival_of_a_round_must_hold_beside_the_other_effects(monkeypatch, found) -> None:
+    """In the place of what was found, it is refused by free runs or by the likelihood."""
+    final = trial(None, 1000.0, 1000.0, 1.5)
     in_place = {
-        LUGRE: trial(None, 900.0, 900.0, 1.09 * windows),
-        COULOMB: trial(None, 900.0, 900.0, 1.12 * windows),
-        ARM: trial(None, 900.0, 900.0, windows),
-        EffectLocation("dahl", "arm"): trial(None, 1000.0, 1000.0, windows),
+        EffectLocation("dead_zone", "input"): trial(None, 1000.0, 1000.0, 1.12 * 1.5),
+        ARM: trial(None, 900.0, 900.0, 1.5),
+        EffectLocation("dahl", "arm"): trial(None, 1000.0, 1000.0, 1.09 * 1.5),
     }
     candidates = dict.fromkeys(in_place, SimpleNamespace(probes=(((1.0,),),)))
     problem: Any = SimpleNamespace(supermodel=SimpleNamespace(candidates=candidates), noise=NOISE)
@@ -743,9 +719,16 @@ def test_other_laws_of_one_friction_remain_only_in_a_poor_model(monkeypatch, win
     monkeypatch.setattr(stepwise, "validate", lambda validation, h: in_place.get(h, final))
     rivals = {STRIBECK: [*in_place, DRAG], DRAG: []}
     left = stepwise.remaining_rivals(problem, None, final, rivals, found).alike[STRIBECK]  # pyright: ignore[reportArgumentType]
-    alone, poor = found == [STRIBECK], windows > 2
-    expected = [LUGRE] * poor + [COULOMB] * (poor and alone) + [ARM] * alone + [EffectLocation("dahl", "arm")]
-    assert left == expected + [DRAG] * alone
+    alone = found == [STRIBECK]
+    assert left == ([*in_place, DRAG] if alone else [EffectLocation("dahl", "arm")])
+
+
+@SIDES
+def test_a_poor_model_leaves_twice_the_noise(side: float) -> None:
+    """With the parameters that suit its free runs best."""
+    assert selection.is_poor(trial(None, windows=2.0 * side), NOISE) is (side > 1)
+    assert not selection.is_poor(trial(None, windows=2.0), NOISE)
+    assert selection.is_poor(at_both({"windows": 9.0}, {"windows": 2.0 * side}), NOISE) is (side > 1)
 
 
 @pytest.mark.parametrize(

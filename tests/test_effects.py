@@ -206,6 +206,8 @@ def test_ports_and_relations(cls):
     assert set(cls.searched) <= set(cls.ports)
     assert set(cls.amplitudes) <= set(cls.declared())
     assert set(cls.contains) <= set(CATALOG)
+    # A special case is a law of the same thing.
+    assert all(cls.law_of and CATALOG[name].law_of == cls.law_of for name in cls.contains)
     assert all(name in cls.equation for name in cls.declared())
 
 

@@ -68,7 +68,8 @@ def end_state(
     visible = [s for s in ranking if s.excited]
     invisible = len(ranking) - len(visible)
     if not end.is_explained:
-        found = f"{names} found, but something" if rounds else "Something"
+        found = " and ".join(r.phrase for r in rounds)
+        found = f"{found} found, but something" if rounds else "Something"
         why = "" if not end.at_noise else f"; {end.criterion}"
         return Verdict.UNEXPLAINED, f"{found} remains that no candidate explains: {reached}{why}{share}."
     if any(r.equivalent for r in rounds):
@@ -217,6 +218,19 @@ def nats_above_noise(problem: LikelihoodProblem, h: Hypothesis) -> float:
     return float(np.sum(counted.sum() * np.log(np.maximum(rms / problem.noise, 1.0))))
 
 
+def nats_left(prediction: SearchHorizon, final: ValidatedHypothesis) -> float:
+    """What is left above the sensor noise in training and validation data together [nat].
+
+    Args:
+        prediction: The recordings.
+        final: The model, fitted to predictions.
+    """
+    rest = nats_above_noise(prediction.problem, final.hypothesis)
+    if prediction.validation.folds:  # the validation recordings are those of training
+        return 2 * rest
+    return rest + nats_above_noise(prediction.validation.problem, final.adapted)
+
+
 def signs(
     horizons: tuple[SearchHorizon, SearchHorizon],
     final: ValidatedHypothesis,
@@ -230,15 +244,11 @@ def signs(
         gains: Effects that were added -> what predictions of training and validation data gained [nat].
     """
     prediction, free_run = horizons
-    runs = final.free_run
+    runs, rest = final.free_run, nats_left(prediction, final)
     assert runs
     sets = [(free_run.problem, runs.hypothesis)]
-    rest = nats_above_noise(prediction.problem, final.hypothesis)
-    if free_run.validation.folds:  # the validation recordings are those of training
-        rest *= 2
-    else:
+    if not free_run.validation.folds:
         sets.append((free_run.validation.problem, runs.adapted))
-        rest += nats_above_noise(prediction.validation.problem, final.adapted)
     locations = [p for p in runs.hypothesis.locations if p in gains]
     sizes = [window_sizes(problem, h, locations) for problem, h in sets]
     out = {}

@@ -14,8 +14,6 @@ from rotflex_jax.discover.selection import (
     describe,
     horizon_gains,
     replaced_by,
-    undecided_generalisations,
-    undecided_laws,
     validate_from_best_states,
 )
 from rotflex_jax.discover.stepwise import refit_candidates, refit_near_predictions
@@ -68,13 +66,20 @@ def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
     )
 
 
-def _refit_and_validate(
+def refit_and_validate(
     state: SearchState,
     beside: ValidatedHypothesis,
     starts: list[CandidateStart],
     runs_starts: list[CandidateStart],
 ) -> list[ValidatedHypothesis]:
-    """A model with each candidate, refitted and validated; what is not plausible is left out."""
+    """A model with each candidate, refitted and validated; what is not plausible is left out.
+
+    Args:
+        state: Where they join what was tried.
+        beside: The model that they are added to.
+        starts: Where refits of predictions start.
+        runs_starts: Where those of free runs start.
+    """
     s, horizons = state.problem.supermodel, state.horizons
     assert beside.free_run
     grown = refit_candidates(state.problem, beside.hypothesis, starts)
@@ -120,12 +125,11 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
     for beside, scores, starts, runs_starts in promising:
         state.say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
         scored += scores
-        refitted += _refit_and_validate(state, beside, starts, runs_starts)
+        refitted += refit_and_validate(state, beside, starts, runs_starts)
     candidates = _likelier(refitted)
     data, current = state.problem.dataset.data, state.current
     for candidate in candidates:
         state.say("  " + describe(candidate, current))
-    _note_generalisations(state, candidates)
     winner, rivals = choose(candidates, current, data, state.problem.noise)
     if winner is None or winner.location is None:
         return False
@@ -134,23 +138,11 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
         candidates = [*candidates, *(c for _, c in more)]
         winner, rivals = choose(candidates, current, data, state.problem.noise)
         assert winner and winner.location
-    rivals = [*rivals, *undecided_laws(winner, candidates, current, data, state.problem.noise)]
     nats = max((s.nats for s in scored if s.location == winner.location), default=0.0)
     not_distinguished = tuple(r.location for r in rivals if r.location)
     added = AddedEffect(winner.location, nats, not_distinguished, horizon_gains(winner, current))
     state.add(winner, [added])
     return True
-
-
-def _note_generalisations(state: SearchState, candidates: Sequence[ValidatedHypothesis]) -> None:
-    """Note generalisations of effects found before, refitted in this round, that no data decide against."""
-    s, h = state.problem.supermodel, state.current.hypothesis
-    for location in state.scores:
-        count = parameter_count(s, h, location)
-        known = dataclasses.replace(state.current, location=location, parameter_count=count)
-        more = undecided_generalisations(known, candidates, state.problem.dataset.data, state.problem.noise)
-        rivals = state.rivals[location]
-        rivals += [c.location for c in more if c.location and c.location not in rivals]
 
 
 def _refit_replaced(
@@ -168,7 +160,7 @@ def _refit_replaced(
     state.say("refitting what it may stand for: " + ", ".join(map(str, locations)))
     first, second = ({x.location: x for x in listed} for listed in before)
     starts, runs_starts = ([by[p].start for p in locations] for by in (first, second))
-    more = _refit_and_validate(state, state.origin, starts, runs_starts)
+    more = refit_and_validate(state, state.origin, starts, runs_starts)
     for candidate in more:
         state.say("  " + describe(candidate, state.current))
     return [(first[c.location], c) for c in more if c.location]

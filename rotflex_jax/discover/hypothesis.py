@@ -239,6 +239,12 @@ class CandidateStart:
     expected_gain: float = 0.0
 
 
+def usual_start(s: SuperModel, location: EffectLocation) -> CandidateStart:
+    """A candidate at its usual sizes, of every shape."""
+    first, *others = (np.array(shape).max(axis=0) for shape in s.candidates[location].probes)
+    return CandidateStart(location, first, tuple(others))
+
+
 def with_candidate(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
     """The hypothesis with one more effect, or with it in the place of simpler ones that it contains."""
     name, port = start.location

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from rotflex_jax.discover.probabilities import Probabilities
 from rotflex_jax.discover.verdict import NEAR_FLOOR as NEAR_FLOOR, Assessment, Verdict, assess
-from rotflex_jax.effects.labels import effect_phrase, with_titles
+from rotflex_jax.effects.labels import effect_phrase, effect_title, law_of, law_phrase, with_titles
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.fit.result import Fit
@@ -278,8 +278,23 @@ class Round:
     free_run: HorizonGain | None = None
 
     @property
+    def certain(self) -> str:
+        """What is certain where its law is not, as "dry friction at the hub"; else empty."""
+        others = {(law_of(effect), port) for effect, port in self.equivalent}
+        one_thing = others == {(law_of(self.effect), self.port)}
+        return law_phrase(self.effect, self.port) if one_thing and not self.doubts else ""
+
+    @property
+    def phrase(self) -> str:
+        """The effect in a sentence on the whole; where its law is open, what it is a law of."""
+        return self.certain or effect_phrase(self.effect, self.port)
+
+    @property
     def doubt(self) -> str:
         """Why the effect may stand in for something else, in words; empty where nothing speaks for that."""
+        if self.certain:
+            *laws, last = (effect_title(effect) for effect in (self.effect, *(e for e, _ in self.equivalent)))
+            return f"{self.certain} is certain, but not whether it is {', '.join(laws)} or {last}"
         alike = " or ".join(effect_phrase(*place) for place in self.equivalent)
         reasons = [f"these recordings cannot distinguish it from {alike}"] if alike else []
         return with_titles("; ".join([*reasons, *self.doubts]))
@@ -308,6 +323,7 @@ class Round:
             },
             "status": self.status,
             "doubt": self.doubt,
+            "certain": self.certain,
             "parameters_fitted_to": self.stage.horizon,
             "sentence": self.sentence,
             "equation": self.equation,

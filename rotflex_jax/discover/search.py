@@ -13,6 +13,7 @@ from rotflex_jax.discover.conclusion import with_proposal
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.evaluation import Evaluation
 from rotflex_jax.discover.forward_selection import ROUNDS, add_best, add_pair, score_candidates
+from rotflex_jax.discover.in_place import undecided_rivals
 from rotflex_jax.discover.likelihood import (
     LikelihoodProblem,
     correct_discretisation_bias,
@@ -20,6 +21,7 @@ from rotflex_jax.discover.likelihood import (
 )
 from rotflex_jax.discover.pairs import pairs_passed_by
 from rotflex_jax.discover.search_state import Progress, SearchState, as_it_was, fit_as_it_is
+from rotflex_jax.discover.selection import is_poor
 from rotflex_jax.discover.stepwise import (
     Eliminated,
     assign_calibrations,
@@ -219,7 +221,10 @@ def _simplify(state: SearchState) -> None:
     assigned = assign_calibrations(problem, validation, state.at(reported, state.current).hypothesis, order)
     final, order, notes = assigned.final.hypothesis, assigned.order, assigned.notes
     found = [p for p in order if p in state.scores]
-    rivals, swapped = remaining_rivals(problem, validation, assigned.final, state.rivals, found)
+    if is_poor(state.current, state.problem.noise):
+        rivals, swapped = undecided_rivals(state), []
+    else:
+        rivals, swapped = remaining_rivals(problem, validation, assigned.final, state.rivals, found)
     state.machine = [p for p in order if p not in state.scores]
     state.alternatives = [*swapped, *(_left_out(state, needed) if reported is horizons.prediction else ())]
     if one := merge_effects(problem, validation, assigned.final, order):

@@ -40,6 +40,9 @@ FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
 # What predictions want by so many standard deviations, on validation and on training data, need not show in
 # free runs whose error something else makes, if these get no worse.
 PREDICTION_Z = 3.5
+# Free runs of a poor model exclude a rival whose errors are larger by this (mean log ratio): its runs then
+# differ by as much as the errors that are left, if the two are independent.
+LAWS_APART = 0.5 * float(np.log(2.0))
 # Candidates in whose place a winner may stand: so many at most, each with so much of the best score of its
 # round (shares of both horizons added up), of which no more than the last share is left beside the winner.
 REPLACED, REPLACED_SHARE, REPLACED_LEFT = 2, 0.25, 0.1
@@ -126,7 +129,7 @@ def admissible(
     needed = _needed(candidate.parameter_count, data)
     # Likelihood is about the next samples, a user's free runs are about many: both must agree. Far from the
     # sensor noise, an effect that leaves free runs as they were is flexibility, not a discovery.
-    far = bool(np.any(best_window_rmse(current) > 2 * noise))
+    far = is_poor(current, noise)
     limit = -WINDOWS_BETTER if far else WINDOWS_WORSE
     enough = nats > HELD_OUT_NATS and z > HELD_OUT_Z and train > needed and train_z > TRAIN_Z
     runs, before = candidate.free_run, current.free_run
@@ -139,6 +142,11 @@ def admissible(
         beyond_doubt = min(z, train_z) > PREDICTION_Z
         return not far or certainty > HELD_OUT_Z or as_trained < -FREE_RUN_BETTER or beyond_doubt
     return far and _free_runs_insist(candidate, current)
+
+
+def is_poor(t: ValidatedHypothesis, noise: Float[np.ndarray, " C"]) -> bool:
+    """Whether a model leaves errors far above the noise: what it lacks has a share in every comparison."""
+    return bool(np.any(best_window_rmse(t) > 2 * noise))
 
 
 def best_window_rmse(t: ValidatedHypothesis) -> Float[np.ndarray, " C"]:
@@ -191,48 +199,34 @@ def choose(
     return winner, [t for t in gains if _alike(winner, t, current, noise)]
 
 
-def undecided_laws(
-    winner: ValidatedHypothesis,
-    candidates: Sequence[ValidatedHypothesis],
-    current: ValidatedHypothesis,
-    data: StackedRecordings,
-    noise: Float[np.ndarray, " C"],
-) -> list[ValidatedHypothesis]:
-    """Special cases and generalisations of the winner that its errors do not decide against.
+def undecided(
+    found: ValidatedHypothesis, rival: ValidatedHypothesis, left: float, data: StackedRecordings
+) -> bool:
+    """Whether a rival in the place of an effect of a poor model remains possible.
 
-    Where a model leaves errors far above the noise, what is missing besides suits one law of friction better
-    than another, and both the penalty for parameters and the test against the simpler law count chance as
-    noise alone would make it. A special case is undecided where it is like the winner as far as such a model
-    can tell, a generalisation where training and validation data both prefer it, though not beyond doubt.
+    What such a model lacks suits one of two laws better than the other. It cannot make the whole difference
+    where free runs over training and validation data differ by more than is left of their errors, or where
+    predictions lose more than would be gained if what is left were the sensor noise alone. A generalisation
+    must be preferred besides: without a use for its further parameters it is the law that was found.
 
     Args:
-        winner: Effect that is going to be added.
-        candidates: What was refitted beside the same model.
-        current: The model without it.
+        found: The model that was found; `parameter_count` is that of the effect.
+        rival: The same with the rival in the place of the effect.
+        left: What predictions of training and validation data leave above the sensor noise [nat].
         data: Training recordings.
-        noise: Standard deviation of the sensor noise of each channel.
     """
-    if not np.any(best_window_rmse(winner) > 2 * noise):
-        return []
-    special = [t for t in candidates if _contained(t, winner) and _alike(winner, t, current, noise)]
-    return [*special, *undecided_generalisations(winner, candidates, data, noise)]
-
-
-def undecided_generalisations(
-    known: ValidatedHypothesis,
-    candidates: Sequence[ValidatedHypothesis],
-    data: StackedRecordings,
-    noise: Float[np.ndarray, " C"],
-) -> list[ValidatedHypothesis]:
-    """The generalisations among `undecided_laws`; arguments as there, `known` has its effect already."""
-    if not np.any(best_window_rmse(known) > 2 * noise):
-        return []
-    general = [t for t in candidates if _contained(known, t)]
-    return [t for t in general if prefers(t, known, data) and not free_runs_apart(known, t)]
+    if _contained(found, rival) and not prefers(rival, found, data):
+        return False
+    lost = paired_gain(found.blocks, rival.blocks)[0] + _training_gain(found, rival)[0]
+    if predictions_apart(found, rival) and lost > left:
+        return False
+    return _free_run_certainty(found, rival) < FREE_RUN_Z or _log_best_ratio(rival, found) < LAWS_APART
 
 
 def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
-    """Whether training data prefer a generalisation after the penalty, and validation data prefer it at all.
+    """Whether predictions prefer a generalisation, or free runs do beyond doubt.
+
+    Predictions of training data must prefer it after the penalty, and those of validation data at all.
 
     Args:
         rich: The generalisation.
@@ -241,7 +235,8 @@ def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: Stacke
     """
     more = rich.parameter_count - simple.parameter_count
     gain = rich.log_likelihood - simple.log_likelihood
-    return gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
+    by_predictions = gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
+    return by_predictions or _free_run_certainty(rich, simple) > FREE_RUN_Z
 
 
 def _needed(parameter_count: int, data: StackedRecordings) -> float:
@@ -334,7 +329,7 @@ def _alike(
     """
     if not distinguished(winner, rival):
         return True
-    if free_runs_apart(winner, rival) or not np.any(best_window_rmse(winner) > 2 * noise):
+    if free_runs_apart(winner, rival) or not is_poor(winner, noise):
         return False
     gains = [
         paired_gain(t.blocks, current.blocks)[0] + _training_gain(t, current)[0] for t in (winner, rival)
@@ -355,7 +350,12 @@ def related(a: EffectLocation, b: EffectLocation) -> bool:
 
 def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
     """Whether short free runs distinguish the winner from a rival that is worse."""
-    return float(np.mean(np.log(best_window_rmse(rival) / best_window_rmse(winner)))) > WINDOWS_APART
+    return _log_best_ratio(rival, winner) > WINDOWS_APART
+
+
+def _log_best_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
+    """Mean log ratio of the errors of short free runs with the parameters that suit them best."""
+    return float(np.mean(np.log(best_window_rmse(a) / best_window_rmse(b))))
 
 
 def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
@@ -376,7 +376,7 @@ def _clearly_better(
     nats, z = paired_gain(rich.blocks, simple.blocks)
     train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
     share = nats / max(paired_gain(rich.blocks, current.blocks)[0], 1e-9)
-    runs_as_well = float(np.mean(np.log(best_window_rmse(rich) / best_window_rmse(simple)))) < WINDOWS_BETTER
+    runs_as_well = _log_best_ratio(rich, simple) < WINDOWS_BETTER
     return _free_runs_insist(rich, simple) or (
         nats > 10 and z > 2.5 and train > 20 and share > 0.003 and runs_as_well
     )
@@ -387,7 +387,14 @@ def _free_runs_insist(candidate: ValidatedHypothesis, current: ValidatedHypothes
     runs, before = candidate.free_run, current.free_run
     if runs is None or before is None or _log_error_ratio(runs, before) > -FREE_RUN_BETTER:
         return False
-    return min(paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1]) > FREE_RUN_Z
+    return _free_run_certainty(candidate, current) > FREE_RUN_Z
+
+
+def _free_run_certainty(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
+    """By how many standard deviations free runs prefer `a`, the less of training and of validation data."""
+    runs, others = a.free_run, b.free_run
+    assert runs and others
+    return min(paired_gain(runs.blocks, others.blocks)[1], _training_gain(runs, others)[1])
 
 
 def runs_clearly_better(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> bool:

@@ -31,9 +31,7 @@ from rotflex_jax.discover.selection import (
     TRAIN_Z,
     WINDOWS_BETTER,
     distinguished,
-    free_runs_apart,
     paired_gain,
-    related,
     runs_clearly_better,
 )
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
@@ -289,11 +287,10 @@ def remaining_rivals(
     """Rivals that the final model, with one of them in the place of a found effect, cannot exclude.
 
     What looked alike in a round may be distinguished once the other effects are in the model; a rival that
-    was itself found in another round is no rival. Nor is another law of the same friction where the final
-    model explains its recordings: they have decided between the two.
+    was itself found in another round is no rival.
     """
-    s, far = problem.supermodel, bool(np.any(final.window_rmse > 2 * problem.noise))
-    remaining = {p: [r for r in rivals[p] if r not in found and (far or not related(p, r))] for p in found}
+    s = problem.supermodel
+    remaining = {p: [r for r in rivals[p] if r not in found] for p in found}
     # One that is refitted at its line has passed already beside the models of its round.
     pairs = [(p, r) for p in found for r in remaining[p] if not CATALOG[r.effect].line]
     if not pairs or len(found) == 1:
@@ -303,11 +300,7 @@ def remaining_rivals(
         start = CandidateStart(r, np.array(s.candidates[r].probes[0]).max(axis=0))
         swapped.append(with_effect(s, without(s, final.hypothesis, p), start, 0.4))
     validated = [validate(validation, h) for h in refit(problem, swapped)]
-    alike = {
-        (p, r)
-        for (p, r), t in zip(pairs, validated, strict=True)
-        if (not free_runs_apart(final, t) if related(p, r) else not distinguished(final, t))
-    }
+    alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(final, t)}
     left = {p: [r for r in remaining[p] if (p, r) in alike or CATALOG[r.effect].line] for p in found}
     return RemainingRivals(left, validated)
 

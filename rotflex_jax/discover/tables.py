@@ -177,6 +177,8 @@ def status_sentence(added: Round) -> str:
         return "Established: training data ask for it, and validation runs are better with its trained value."
     if not added.doubt:
         return "Established: it helps predictions and free runs, and no recording disagrees about its size."
+    if added.certain:
+        return f"Provisional as a law: {added.doubt}."
     return f"Provisional, it may stand in for something else: {added.doubt}."
 
 

@@ -304,6 +304,7 @@ class Delay(Actuation):
 
     name: ClassVar[str] = "delay"
     title: ClassVar[str] = "input delay"
+    law_of: ClassVar[str] = "late input"
     equation: ClassVar[str] = "v(t) = u(t - time)"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 3
@@ -361,6 +362,7 @@ class Lag(Actuation):
 
     name: ClassVar[str] = "lag"
     title: ClassVar[str] = "input lag"
+    law_of: ClassVar[str] = "late input"
     equation: ClassVar[str] = "time * dv/dt = u - v"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 4

@@ -31,6 +31,7 @@ class Gravity(Force):
 
     name: ClassVar[str] = "gravity"
     title: ClassVar[str] = "gravity torque"
+    law_of: ClassVar[str] = "torque that depends on the angle"
     equation: ClassVar[str] = "tau = -(sine * sin(position) + cosine * cos(position))"
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm")
     amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")
@@ -83,6 +84,7 @@ class Cogging(Force):
 
     name: ClassVar[str] = "cogging"
     title: ClassVar[str] = "cogging torque"
+    law_of: ClassVar[str] = "torque that depends on the angle"
     equation: ClassVar[str] = "tau = -(sine * sin(periods * position) + cosine * cos(periods * position))"
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm")
     amplitudes: ClassVar[tuple[str, ...]] = ("sine", "cosine")

@@ -96,6 +96,8 @@ class Effect(abc.ABC):
     amplitudes: ClassVar[tuple[str, ...]] = ()
     # Simpler effects that this one contains at special values of its parameters.
     contains: ClassVar[tuple[str, ...]] = ()
+    # What several laws describe, such as dry friction; only a model near the noise can tell these laws apart.
+    law_of: ClassVar[str] = ""
     # Ports a search tries it at by default; none for what a model has from the start.
     searched: ClassVar[tuple[str, ...]] = ()
     # Its volts are the unit of the input, also where that is no voltage but a current or a goal.

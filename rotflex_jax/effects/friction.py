@@ -28,6 +28,7 @@ class Coulomb(DryFriction):
 
     name: ClassVar[str] = "coulomb"
     title: ClassVar[str] = "Coulomb friction"
+    law_of: ClassVar[str] = "dry friction"
     equation: ClassVar[str] = "tau = -level * sign(speed), holds while |tau| <= level"
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
@@ -72,6 +73,7 @@ class CoulombAsymmetric(DryFriction):
 
     name: ClassVar[str] = "coulomb_asymmetric"
     title: ClassVar[str] = "asymmetric Coulomb friction"
+    law_of: ClassVar[str] = "dry friction"
     equation: ClassVar[str] = (
         "tau = -forward if speed > 0, +backward if speed < 0, holds while -forward <= tau <= backward"
     )
@@ -124,6 +126,7 @@ class Stribeck(DryFriction):
 
     name: ClassVar[str] = "stribeck"
     title: ClassVar[str] = "Stribeck friction"
+    law_of: ClassVar[str] = "dry friction"
     equation: ClassVar[str] = (
         "tau = -(level + excess * exp(-(v / speed)^2)) * sign(v), holds while |tau| <= level + excess"
     )
@@ -190,6 +193,7 @@ class LoadFriction(DryFriction):
 
     name: ClassVar[str] = "load_friction"
     title: ClassVar[str] = "load-dependent friction"
+    law_of: ClassVar[str] = "dry friction"
     equation: ClassVar[str] = (
         "tau = -(level + share * |load|) * sign(speed), share = driving if load * speed > 0, driven "
         "otherwise, load torque through the gear"

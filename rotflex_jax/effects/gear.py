@@ -34,6 +34,7 @@ class Backlash(Gear):
 
     name: ClassVar[str] = "backlash"
     title: ClassVar[str] = "backlash"
+    law_of: ClassVar[str] = "play"
     equation: ClassVar[str] = (
         "|r| <= gap, torque passes only at |r| = gap, r angle of the rotor against the port, rotor inertia = "
         "share * inertia"
@@ -100,6 +101,7 @@ class ElasticBacklash(Gear):
 
     name: ClassVar[str] = "elastic_backlash"
     title: ClassVar[str] = "backlash with elastic teeth"
+    law_of: ClassVar[str] = "play"
     equation: ClassVar[str] = (
         "tau = max(0, stiffness * depth + damping * depth') * sign(r), depth = |r| - gap > 0, r angle of the "
         "rotor against the port, rotor inertia = share * inertia"

@@ -30,6 +30,7 @@ class Dahl(Memory):
 
     name: ClassVar[str] = "dahl"
     title: ClassVar[str] = "Dahl friction"
+    law_of: ClassVar[str] = "dry friction"
     equation: ClassVar[str] = "dz/dt = speed / presliding * (1 - z * sign(speed)), tau = -level * z"
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
@@ -94,6 +95,7 @@ class LuGre(Memory):
 
     name: ClassVar[str] = "lugre"
     title: ClassVar[str] = "LuGre friction"
+    law_of: ClassVar[str] = "dry friction"
     equation: ClassVar[str] = (
         "g = 1 + rise * exp(-(speed/slow)**2), dz/dt = (speed - |speed| * z / g) / presliding, "
         "tau = -(level * z + damping * presliding * dz/dt)"
@@ -161,6 +163,7 @@ class BoucWen(Memory):
 
     name: ClassVar[str] = "bouc_wen"
     title: ClassVar[str] = "Bouc-Wen hysteresis"
+    law_of: ClassVar[str] = "dry friction"
     equation: ClassVar[str] = (
         "dz/dt = (speed - beta * |speed| * z - (1 - beta) * speed * |z|) / width, tau = -level * z"
     )

@@ -26,13 +26,29 @@ def effect_phrase(effect: str, port: str) -> str:
     return _placed(effect, port, "the ")
 
 
-def _placed(effect: str, port: str, article: str) -> str:
-    known, title = CATALOG.get(effect), effect_title(effect)
+def law_phrase(effect: str, port: str) -> str:
+    """What an effect is a law of, with its port, within a sentence; empty where no other law describes it.
+
+    >>> law_phrase("stribeck", "hub"), law_phrase("lag", "input"), law_phrase("saturation", "input")
+    ('dry friction at the hub', 'late input', '')
+    """
+    thing = law_of(effect)
+    return _placed(effect, port, "the ", thing) if thing else ""
+
+
+def law_of(effect: str) -> str:
+    """What an effect is a law of, beside others; empty where it is the only one."""
+    known = CATALOG.get(effect)
+    return known.law_of if known else ""
+
+
+def _placed(effect: str, port: str, article: str, noun: str = "") -> str:
+    known, noun = CATALOG.get(effect), noun or effect_title(effect)
     if known is not None and known.acts_on == "input" and port == "input":
-        return title
+        return noun
     if known is not None and known.acts_on == "channel":
-        return f"{title} of {port}"
-    return f"{title} at {article}{port}"
+        return f"{noun} of {port}"
+    return f"{noun} at {article}{port}"
 
 
 def effect_title(effect: str) -> str:

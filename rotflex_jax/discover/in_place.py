@@ -1,0 +1,76 @@
+"""Other laws in the places of the effects of a final model that leaves much, and which of them remain.
+
+What a model lacks besides suits one law of friction better than another, and a round refits only the laws
+that its scores put forward. At the end every other law of the same thing (`Effect.law_of`) and every rival of
+its round take the place of an effect, fitted at both horizons.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+from rotflex_jax.discover.conclusion import nats_left
+from rotflex_jax.discover.forward_selection import refit_and_validate
+from rotflex_jax.discover.hypothesis import parameter_count, usual_start, without
+from rotflex_jax.discover.search_state import SearchState
+from rotflex_jax.discover.selection import describe, undecided
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
+from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects.labels import law_of
+
+
+def other_laws(s: SuperModel, location: EffectLocation) -> list[EffectLocation]:
+    """Candidates at the port of an effect that are laws of the same thing."""
+    law = law_of(location.effect)
+    at_port = (p for p in s.candidates if p.port == location.port and p != location)
+    return [p for p in at_port if law and law_of(p.effect) == law]
+
+
+def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLocation]]:
+    """Effects that were found -> those that data do not exclude in their places, of an unexplained model.
+
+    Args:
+        state: A search that is done, with rivals of its rounds. What is fitted joins `tried`.
+    """
+    s, found = state.problem.supermodel, list(state.scores)
+    final = state.current
+    left = nats_left(state.horizons.prediction, final)
+    remaining = {}
+    for location in [p for p in found if p in final.hypothesis.locations]:
+        wanted = dict.fromkeys([*other_laws(s, location), *state.rivals[location]])
+        rivals = [p for p in wanted if p not in final.hypothesis.locations]
+        count = parameter_count(s, final.hypothesis, location)
+        known = dataclasses.replace(final, location=location, parameter_count=count)
+        fitted = _in_place(state, location, [p for p in rivals if not CATALOG[p.effect].line])
+        for rival in fitted:
+            state.say(f"  in the place of {location}, " + describe(rival, final))
+        # One that is refitted at its line has passed already beside the models of its round.
+        remaining[location] = [p for p in rivals if CATALOG[p.effect].line]
+        data = state.problem.dataset.data
+        remaining[location] += [t.location for t in fitted if t.location and undecided(known, t, left, data)]
+    return remaining
+
+
+def _in_place(
+    state: SearchState, location: EffectLocation, rivals: Sequence[EffectLocation]
+) -> list[ValidatedHypothesis]:
+    """The final model with each rival in the place of an effect, at both horizons; known ones as they are."""
+    s, final = state.problem.supermodel, state.current
+    assert final.free_run
+    others = s.without_calibrations(final.hypothesis.locations) - {location}
+    tried = {s.without_calibrations(v.hypothesis.locations): v for v in state.tried if v.free_run}
+    known = {r: tried[others | {r}] for r in rivals if others | {r} in tried}
+    starts = [usual_start(s, r) for r in rivals if r not in known]
+    less = dataclasses.replace(
+        final,
+        hypothesis=without(s, final.hypothesis, location),
+        free_run=dataclasses.replace(
+            final.free_run, hypothesis=without(s, final.free_run.hypothesis, location)
+        ),
+    )
+    fitted = refit_and_validate(state, less, starts, starts) if starts else []
+    counts = {r: parameter_count(s, v.hypothesis, r) for r, v in known.items()}
+    return [
+        *(dataclasses.replace(v, location=r, parameter_count=counts[r]) for r, v in known.items()),
+        *fitted,
+    ]

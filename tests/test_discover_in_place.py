@@ -1,0 +1,118 @@
+"""Other laws in the places of what was found, where the model leaves much: which of them remain."""
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rotflex_jax as rf
+import rotflex_jax.effects as fx
+from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.discover import Discovery, in_place
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.tables import status_sentence
+from rotflex_jax.discover.validation import ValidatedHypothesis
+
+COULOMB, STRIBECK, DAHL, LUGRE = (EffectLocation(e, "hub") for e in ("coulomb", "stribeck", "dahl", "lugre"))
+ARM, DEAD_ZONE = EffectLocation("coulomb", "arm"), EffectLocation("dead_zone", "input")
+SHAKING = EffectLocation("periodic_disturbance", "input")
+DELAY, LAG = EffectLocation("delay", "input"), EffectLocation("lag", "input")
+EVERY = (COULOMB, STRIBECK, DAHL, LUGRE, ARM, DEAD_ZONE, SHAKING, DELAY, LAG)
+
+
+def supermodel() -> Any:
+    one = SimpleNamespace(probes=(((1.0, 0.0), (0.0, 2.0)), ((3.0, 0.0), (0.0, 4.0))))
+    return SimpleNamespace(
+        candidates=dict.fromkeys(EVERY, one),
+        without_calibrations=frozenset,
+    )
+
+
+def test_laws_of_one_thing_at_one_port():
+    s = supermodel()
+    assert in_place.other_laws(s, STRIBECK) == [COULOMB, DAHL, LUGRE]
+    assert in_place.other_laws(s, ARM) == []
+    assert in_place.other_laws(s, LAG) == [DELAY]
+    # Two of nothing that is a law of the same thing have nothing in common.
+    assert in_place.other_laws(s, DEAD_ZONE) == in_place.other_laws(s, SHAKING) == []
+
+
+def model(*locations: EffectLocation) -> ValidatedHypothesis:
+    """A structure, without numbers."""
+    h: Any = SimpleNamespace(locations=locations)
+    v = ValidatedHypothesis(h, np.zeros(1), h, np.ones(1))
+    return dataclasses.replace(v, free_run=v)
+
+
+def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch):
+    """What was found elsewhere takes no place, what was fitted before is known, a line has passed already."""
+    final, known = model(STRIBECK, DELAY), model(DAHL, DELAY)
+    begun: dict[EffectLocation, tuple] = {}
+    asked: list[EffectLocation] = []
+
+    def refit(state, less, starts, runs_starts):
+        assert starts is runs_starts
+        for c in starts:
+            begun[c.location] = (less.hypothesis.locations, less.free_run.hypothesis.locations, c)
+        return [dataclasses.replace(model(), location=c.location) for c in starts]
+
+    def decides(found, rival, left, data):
+        assert found.location in (STRIBECK, DELAY)
+        assert (found.parameter_count, left, data) == (3, 70.0, "data")
+        asked.append(rival.location)
+        return rival.location in (COULOMB, DAHL, DEAD_ZONE)
+
+    def less(s, h, p):
+        return SimpleNamespace(locations=tuple(x for x in h.locations if x != p))
+
+    monkeypatch.setattr(in_place, "refit_and_validate", refit)
+    monkeypatch.setattr(in_place, "undecided", decides)
+    monkeypatch.setattr(in_place, "without", less)
+    monkeypatch.setattr(in_place, "parameter_count", lambda s, h, p: 3)
+    monkeypatch.setattr(in_place, "nats_left", lambda at, found: 70.0 if at == "predictions" else 0.0)
+    monkeypatch.setattr(in_place, "describe", lambda rival, found: str(rival.location))
+    lines: list[str] = []
+    state: Any = SimpleNamespace(
+        problem=SimpleNamespace(supermodel=supermodel(), dataset=SimpleNamespace(data="data")),
+        horizons=SimpleNamespace(prediction="predictions"),
+        current=final,
+        scores={STRIBECK: 1.0, DELAY: 2.0, ARM: 3.0},  # the last was left out again
+        rivals={STRIBECK: [DEAD_ZONE, COULOMB, DELAY, SHAKING], DELAY: [], ARM: [COULOMB]},
+        tried=[final, known],
+        say=lines.append,
+    )
+    remaining = in_place.undecided_rivals(state)
+    assert remaining == {STRIBECK: [SHAKING, DAHL, COULOMB, DEAD_ZONE], DELAY: []}
+    assert set(begun) == {COULOMB, LUGRE, DEAD_ZONE, LAG}
+    assert sorted(asked) == sorted([*begun, DAHL])
+    for location, (left, runs_left, c) in begun.items():
+        assert left == runs_left == ((STRIBECK,) if location == LAG else (DELAY,))
+        # The largest of each number in a shape; all shapes.
+        np.testing.assert_array_equal([c.values, *c.others], [[1.0, 2.0], [3.0, 4.0]])
+    assert len(lines) == len(asked)
+
+
+LAWS = [(fx.Coulomb, "hub"), (fx.Stribeck, "hub"), (fx.Dahl, "hub")]
+LAW, BESIDE = ("stribeck", "hub"), ("slack_cable", "hub")
+
+
+def found_beside(size: float) -> Discovery:
+    """A search on a machine with Stribeck friction and a cable of some size that nothing describes."""
+    hidden = {LAW: {"level": 0.02, "excess": 0.02, "speed": 0.5}}
+    record = make_record(hidden | ({BESIDE: size} if size else {}), seed=2100, seconds=7.0, fs=500.0)
+    train, validation = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"]).split(0.7)
+    return rf.discover(rf.joints.paper(), train, validation, candidates=LAWS)
+
+
+@pytest.mark.slow
+def test_a_law_is_decided_where_nothing_else_is_missing_and_open_where_much_is():
+    (alone,) = found_beside(0.0).rounds
+    assert (alone.effect, alone.port) == LAW and not alone.equivalent and alone.status == "established"
+    beside = {r.effect: r for r in found_beside(3.0).rounds}
+    law = beside["stribeck"]
+    assert law.equivalent == (COULOMB,) and law.status == "provisional"
+    assert law.certain == law.to_dict()["certain"] == "dry friction at the hub"
+    said = "dry friction at the hub is certain, but not whether it is Stribeck friction or Coulomb friction"
+    assert law.doubt == said and status_sentence(law) == f"Provisional as a law: {said}."
