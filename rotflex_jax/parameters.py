@@ -5,6 +5,7 @@ An effect declares its parameters with `parameter(...)`; a fit varies unconstrai
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -57,10 +58,14 @@ def specifications(owner: Any) -> dict[str, Specification]:
     own = getattr(owner, "own_specifications", None)
     if own and not isinstance(owner, type):
         return own()
-    found = {f.name: f.metadata["parameter"] for f in dataclasses.fields(owner) if "parameter" in f.metadata}
     if isinstance(owner, type):
-        return found
-    return {name: spec for name, spec in found.items() if getattr(owner, name) is not None}
+        return dict(_declared(owner))
+    return {name: spec for name, spec in _declared(type(owner)).items() if getattr(owner, name) is not None}
+
+
+@functools.cache
+def _declared(owner: type) -> dict[str, Specification]:
+    return {f.name: f.metadata["parameter"] for f in dataclasses.fields(owner) if "parameter" in f.metadata}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -286,7 +286,7 @@ def test_a_refit_is_not_stopped_on_its_way(monkeypatch, plain, gains, alternatio
         return [dataclasses.replace(x, densities=x.densities + more / 2) for x in hypotheses]
 
     monkeypatch.setattr(refit_module, "levenberg_marquardt", fitted)
-    monkeypatch.setattr(refit_module, "choose_process_noise", lambda problem, h, wide: h)
+    monkeypatch.setattr(refit_module, "choose_process_noises", lambda problem, starts, wide: starts)
     end = refit(problem, [start], alternations=alternations)[0]
     assert len(calls) - 1 == taken
     assert end.log_likelihood == sum(gains[:taken])

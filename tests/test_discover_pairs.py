@@ -24,6 +24,7 @@ from rotflex_jax.discover.score_test import (
     MAX_THRESHOLD_AMPLITUDE,
     Score,
     ScoreTest,
+    _Column,
     _Projected,
     _score,
     score_test,
@@ -47,9 +48,8 @@ def candidate(name: str, port: str, probes, one_sided=False, threshold=False) ->
 
 def made(candidates: list[Candidate], slopes: dict, r: np.ndarray) -> ScoreTest:
     """A test with slopes made by hand, of which the hypothesis explains none."""
-    columns = {key: [row[None, :, None] for row in rows] for key, rows in slopes.items()}
-    orthogonal = lambda J: np.asarray(J).reshape(len(J), -1)  # noqa: E731
-    projected = _Projected(r, orthogonal, columns, float(SAMPLES), 1.0)
+    columns = {key: [_Column(float(np.linalg.norm(x)), x) for x in rows] for key, rows in slopes.items()}
+    projected = _Projected(r, columns, float(SAMPLES), 1.0)
     listed = sorted((_score(c, projected) for c in candidates), key=lambda s: -s.nats)
     return ScoreTest(listed, {c.location: c for c in candidates}, projected)
 
@@ -211,7 +211,7 @@ def test_a_pair_of_a_model_is_dense_least_squares_too(small):
         for location in p.locations:
             c = test.candidates[location]
             assert len(c.probes) == 1
-            slopes.append(test.projected.orthogonal(np.array(test.projected.columns[(location, 0)])))
+            slopes.append(test.projected.of(location, 0))
             lower += [0.0 if c.one_sided else -np.inf] * len(c.probes[0])
         options = dense(slopes, test.projected.r, lower, [np.inf] * len(lower))
         assert p.gain == pytest.approx(options, rel=1e-5)

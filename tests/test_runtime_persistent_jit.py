@@ -32,6 +32,7 @@ from rotflex_jax.runtime.persistent_jit import (
     PersistentJit,
     clear_compilation_caches,
     keep_programs,
+    loaded_ahead,
     make_ahead,
     performance,
     program_counts,
@@ -202,6 +203,61 @@ def test_programs_are_counted_and_one_that_is_loaded_runs_once(
     found = program_counts()
     assert (found.compiled - before.compiled, found.loaded - before.loaded) == (1, 1)
     assert found.seconds > before.seconds and len(runs) == 3  # one of them to see whether it can
+
+
+@pytest.fixture
+def loads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Thread and file of each program that is read."""
+    read, found = persistent_jit._stored_program, []
+
+    def watched(file: Path) -> Any:
+        found.append((threading.current_thread().name.partition("_")[0], file.name))
+        return read(file)
+
+    monkeypatch.setattr(persistent_jit, "_stored_program", watched)
+    return found
+
+
+def test_programs_of_the_last_block_alike_are_loaded_on_threads(
+    folder: Path, loads: list[tuple[str, str]]
+) -> None:
+    # Slopes of their own: what JAX has compiled before cannot be stored.
+    slopes, first = (6.125, 5.125, 4.125), new()
+    with loaded_ahead("a search", (1, 2)):
+        for slope in slopes:
+            first(slope, X)
+    loads.clear()
+    second = new()
+    with loaded_ahead("another", (1, 2)):
+        assert not persistent_jit._coming
+    release_programs()
+    with loaded_ahead("a search", (1, 2)):
+        for future in list(persistent_jit._coming.values()):
+            assert future.result(30.0) is not None
+        for slope in slopes[1:]:
+            np.testing.assert_array_equal(second(slope, X), slope * X)
+    assert traced == [*slopes] and not persistent_jit._coming
+    assert len(loads) == 3 and {thread for thread, _ in loads} == {"loading"}
+    loads.clear()
+    with loaded_ahead("a search", (1, 2)):  # both that were used are in memory
+        assert not persistent_jit._coming
+    assert not loads
+
+
+def test_a_list_of_programs_that_is_damaged_or_names_none_does_no_harm(
+    folder: Path, loads: list[tuple[str, str]]
+) -> None:
+    with loaded_ahead("a search"):
+        new()(3.375, X)
+    (listed,) = folder.glob("programs/*/used/*")
+    (name,) = listed.read_text().split()
+    for text in (b"\xff\xfe", b"../../passwords", f"{'0' * 64}\n{name}\n{name[:-1]}".encode()):
+        listed.write_bytes(text)
+        release_programs()
+        with loaded_ahead("a search"):
+            np.testing.assert_array_equal(new()(3.375, X), 3.375 * X)
+        assert listed.read_text() == name
+    assert traced == [3.375] and performance().programs == 1
 
 
 def test_programs_not_used_for_longest_leave_the_memory(

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,8 @@ PARAMETER_SETS_PER_CALL = 4
 
 # Windows of a program, at least.
 LEAST_WINDOWS = 16
+
+Used = TypeVar("Used")
 
 
 class ProgramSamples(NamedTuple):
@@ -136,7 +138,7 @@ def _slopes(
 def _stacked(parameter_sets: list[ParameterSet]) -> ParameterSet:
     """Leading axis over parameter sets; a short batch is filled up with copies of its last one."""
     full = parameter_sets + [parameter_sets[-1]] * (PARAMETER_SETS_PER_CALL - len(parameter_sets))
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *full)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *full)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,23 +186,35 @@ class BatchedPredictor:
         self, parameter_sets: list[ParameterSet], window: Int[np.ndarray, "R N"]
     ) -> Float[np.ndarray, "L R N C"]:
         """Innovations of any number of parameter sets; `window` has the window of each sample."""
+        return np.stack(self.of_innovations(lambda _, e: e, parameter_sets, window))
 
-        def run(job: tuple[ReducedModel, list[int]]) -> np.ndarray:
+    def of_innovations(
+        self,
+        use: Callable[[int, Float[np.ndarray, "R N C"]], Used],
+        parameter_sets: list[ParameterSet],
+        window: Int[np.ndarray, "R N"],
+    ) -> list[Used]:
+        """What a function gives for each parameter set by its number and its innovations.
+
+        It is called on the thread that has run the program.
+        """
+
+        def run(job: tuple[ReducedModel, list[int]]) -> list[Used]:
             model, indices = job
             with double_precision():
                 batch = _stacked([self.restrict(parameter_sets[i], model) for i in indices])
                 e = _innovations(model.mechanism.structure, self.solver, batch, self.on_device(window))
-                return np.asarray(e)[: len(indices), :, : window.shape[1]]
+            return [use(i, x[:, : window.shape[1]]) for i, x in zip(indices, np.asarray(e), strict=False)]
 
         size = PARAMETER_SETS_PER_CALL
         jobs: list[tuple[ReducedModel, list[int]]] = []
         for model, indices in self._by_structure([p.gates for p in parameter_sets]):
             jobs += [(model, indices[i : i + size]) for i in range(0, len(indices), size)]
-        out = np.empty((len(parameter_sets), *self.data.y.shape))
         results = self.run_jobs(run, jobs, lambda job: ("innovations", job[0].effects))
-        for (_, indices), e in zip(jobs, results, strict=True):
-            out[indices] = e
-        return out
+        found: dict[int, Used] = {}
+        for (_, indices), used in zip(jobs, results, strict=True):
+            found.update(zip(indices, used, strict=True))
+        return [found[i] for i in range(len(parameter_sets))]
 
     def slopes(
         self,
@@ -212,24 +226,37 @@ class BatchedPredictor:
 
         The number D is that of the parameter set with the most; slopes of the others end in zeros.
         """
+        found = self.of_slopes(lambda _, e, J: (e, J), parameter_sets, directions, window)
+        slopes = np.zeros((len(found), max(len(d.x0) for d in directions), *self.data.y.shape))
+        for filled, (_, J) in zip(slopes, found, strict=True):
+            filled[: len(J)] = J
+        return np.stack([e for e, _ in found]), slopes
 
-        def run(job: tuple[ReducedModel, list[int]]) -> tuple[np.ndarray, np.ndarray]:
-            model, (i,) = job
+    def of_slopes(
+        self,
+        use: Callable[[int, Float[np.ndarray, "R N C"], Float[np.ndarray, "D R N C"]], Used],
+        parameter_sets: list[ParameterSet],
+        directions: list[Directions],
+        window: Int[np.ndarray, "R N"],
+    ) -> list[Used]:
+        """What a function gives for each parameter set by its number, its innovations and their slopes.
+
+        It is called on the thread that has run the program, and no slopes are kept.
+        """
+
+        def run(job: tuple[ReducedModel, int]) -> Used:
+            model, i = job
             along = directions[i].restrict(model)
             with double_precision():
                 structure, inputs = model.mechanism.structure, self.restrict(parameter_sets[i], model)
                 e, J = _slopes(structure, self.solver, inputs, along, self.on_device(window))
-                return np.asarray(e)[:, : window.shape[1]], np.asarray(J)[:, :, : window.shape[1]]
+            return use(i, np.asarray(e)[:, : window.shape[1]], np.asarray(J)[:, :, : window.shape[1]])
 
         gates = [np.vstack([p.gates, d.gates]) for p, d in zip(parameter_sets, directions, strict=True)]
-        jobs = [(model, [i]) for model, indices in self._by_structure(gates) for i in indices]
-        counts = [len(d.x0) for d in directions]
-        results = self.run_jobs(run, jobs, lambda job: ("slopes", counts[job[1][0]], job[0].effects))
-        e = np.empty((len(parameter_sets), *self.data.y.shape))
-        J = np.zeros((len(parameter_sets), max(counts), *self.data.y.shape))
-        for (_, (i,)), found in zip(jobs, results, strict=True):
-            e[i], J[i, : counts[i]] = found
-        return e, J
+        jobs = [(model, i) for model, indices in self._by_structure(gates) for i in indices]
+        results = self.run_jobs(run, jobs, lambda job: ("slopes", len(directions[job[1]].x0), job[0].effects))
+        found = {i: x for (_, i), x in zip(jobs, results, strict=True)}
+        return [found[i] for i in range(len(parameter_sets))]
 
     def _by_structure(self, gates: list[np.ndarray]) -> list[tuple[ReducedModel, list[int]]]:
         """Which parameter sets run on which reduced model."""
@@ -251,7 +278,7 @@ class BatchedPredictor:
         new = {name: i for i, name in enumerate(names) if name not in self.compiled}
         done: dict[int, Any] = {}
         for batch in (list(new.values()), [i for i in range(len(jobs)) if i not in new.values()]):
-            done.update(zip(batch, _on_threads(run, [jobs[i] for i in batch]), strict=True))
+            done.update(zip(batch, on_threads(run, [jobs[i] for i in batch]), strict=True))
         self.compiled.update(new)
         return [done[i] for i in range(len(jobs))]
 
@@ -270,7 +297,7 @@ class BatchedPredictor:
         return found[1]
 
 
-def _on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
+def on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
     """Results of independent calls, on as many threads as there are cores.
 
     A scan keeps one core busy however many parameter sets it carries; compiled code runs outside of Python's
@@ -282,7 +309,13 @@ def _on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
     """
     if len(jobs) == 1:
         return [run(jobs[0])]
-    return list(_threads().map(run, jobs))
+    settings = np.geterr()  # a thread has its own
+
+    def on_thread(job: Any) -> Any:
+        with np.errstate(**settings):
+            return run(job)
+
+    return list(_threads().map(on_thread, jobs))
 
 
 @functools.cache

@@ -316,7 +316,7 @@ def candidate_sensitivities(
         listed = [p for group in own for p in group]
         effects = tuple(s.mechanism.structure.effects[c.effect] for c in family)
         with double_precision():
-            at_ports, laws = responses.torques, jax.tree.map(jnp.asarray, _laws(own))
+            at_ports, laws = responses.torques, _laws(own)
             if kind == "friction":
                 at_ports = _friction_responses(structure, solver, ports, inputs, samples, responses.run.X)
             return Slopes(
@@ -334,9 +334,9 @@ def candidate_sensitivities(
         points += [predictor.restrict(current, model)] * (count - len(points))
         along = _directions(current, listed, count).restrict(model)
         with double_precision():
-            values, gates = (jnp.array([getattr(p, what) for p in points]) for what in ("values", "gates"))
+            values, gates = (np.array([getattr(p, what) for p in points]) for what in ("values", "gates"))
             own = [active.states.index(i) for i in model.states]
-            run = responses.run._replace(X=jnp.asarray(np.asarray(responses.run.X)[..., own]))
+            run = responses.run._replace(X=np.asarray(responses.run.X)[..., own])
             given = (values, gates, along, samples, responses._replace(run=run, torques=None))
             return Slopes(listed, cut(_signal_slopes(model.mechanism.structure, of_signals, *given), listed))
 
@@ -346,7 +346,7 @@ def candidate_sensitivities(
         inputs = predictor.restrict(_with_probes(current, listed), model)
         inactive = tuple(model.effects.index(c.effect) for c in family)
         with double_precision():
-            present = jnp.array([model.states.index(i) for i in active.states])
+            present = np.array([model.states.index(i) for i in active.states])
             given = (inputs, present, responses.run, along, samples)
             return Slopes(
                 listed, cut(_inactive_slopes(model.mechanism.structure, solver, inactive, *given), listed)

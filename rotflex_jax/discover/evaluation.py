@@ -65,7 +65,9 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
         own = early.with_likelihood(own)
         if not np.isfinite(own.log_likelihood):
             return start
-        own = adapted_to_recordings(early, own, prior)
+        before, own = own, adapted_to_recordings(early, own, prior)
+        if np.array_equal(own.x0, before.x0) and np.array_equal(own.local_z, before.local_z):
+            break  # as every further fit would
     return own
 
 

@@ -8,12 +8,12 @@ only, and gains of it count by their scatter between blocks of time.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rotflex_jax.discover.batched_predictor import BatchedPredictor, ParameterSet
+from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, Used
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener, fit_whitener
 from rotflex_jax.discover.supermodel import SuperModel
 from rotflex_jax.fit.coordinates import FitCoordinates
@@ -179,10 +179,22 @@ class LikelihoodProblem:
         Directions are filled up to the same few numbers, whatever else is fitted beside a hypothesis: each
         number is compiled once.
         """
+        return self.predictor.slopes(*self._with_directions(hypotheses), self.windows.index)
+
+    def of_slopes(
+        self,
+        use: Callable[[int, Float[np.ndarray, "R N C"], Float[np.ndarray, "D R N C"]], Used],
+        hypotheses: Sequence[Hypothesis],
+    ) -> list[Used]:
+        """What a function gives for each hypothesis by its number, its innovations and their slopes."""
+        return self.predictor.of_slopes(use, *self._with_directions(hypotheses), self.windows.index)
+
+    def _with_directions(
+        self, hypotheses: Sequence[Hypothesis]
+    ) -> tuple[list[ParameterSet], list[Directions]]:
         s = self.supermodel
         directions = [h.directions(s, self.directions_of(h)) for h in hypotheses]
-        parameter_sets = [h.parameter_set(s) for h in hypotheses]
-        return self.predictor.slopes(parameter_sets, directions, self.windows.index)
+        return [h.parameter_set(s) for h in hypotheses], directions
 
     def whitener(self, e: Float[np.ndarray, "R N C"]) -> Whitener:
         """The whitener that innovations give; of free runs the scale of each channel alone."""
@@ -199,7 +211,9 @@ class LikelihoodProblem:
 
     def log_likelihoods(self, hypotheses: Sequence[Hypothesis]) -> Float[np.ndarray, " H"]:
         """Log-likelihoods of hypotheses as they are [nat], each with the whitener that it gives."""
-        return np.array([self.log_likelihood(e) for e in self.innovations(hypotheses)])
+        parameter_sets = [h.parameter_set(self.supermodel) for h in hypotheses]
+        each = self.predictor.of_innovations
+        return np.array(each(lambda _, e: self.log_likelihood(e), parameter_sets, self.windows.index))
 
     def with_likelihood(self, h: Hypothesis) -> Hypothesis:
         """The hypothesis as it is, run once, with the whitener and the likelihood that it has."""
@@ -269,11 +283,6 @@ class _Point:
     hypothesis: Hypothesis
     innovations: Float[np.ndarray, "R N C"] | None = None
 
-    def whitened(self, e: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Whitened innovations; the innovations are kept."""
-        self.innovations = e
-        return self.hypothesis.whitener(e, seen)
-
 
 def levenberg_marquardt(
     problem: LikelihoodProblem, hypotheses: list[Hypothesis], max_steps: int = MAX_STEPS
@@ -286,12 +295,13 @@ def levenberg_marquardt(
         return FitCoordinates.of(h, problem.windows)
 
     def linearise(points: list[_Point]) -> list[NormalEquations]:
-        equations = []
-        for p, e, J in zip(points, *problem.slopes([p.hypothesis for p in points]), strict=True):
-            h, w = p.hypothesis, p.whitened(e, seen)
+        def equations(i: int, e: np.ndarray, J: np.ndarray) -> NormalEquations:
+            h, points[i].innovations = points[i].hypothesis, e
+            w = h.whitener(e, seen)
             H, g = coordinates(h).sums(w, h.whitener(J[: h.moved], seen))
-            equations.append(NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H))
-        return equations
+            return NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H)
+
+        return problem.of_slopes(equations, [p.hypothesis for p in points])
 
     found = minimise_together(
         linearise,
@@ -324,35 +334,57 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
     Zero is a free run, a large intensity follows the data within a few samples. Where the model is right, the
     smallest value of the grid is the likeliest; where another one is, something is missing.
     """
+    return choose_process_noises(problem, [h], wide)[0]
+
+
+def choose_process_noises(
+    problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], wide: bool = False
+) -> list[Hypothesis]:
+    """The same for several hypotheses, which are run side by side."""
     if problem.free_run:
-        return h
+        return list(hypotheses)
     least, most = problem.process_noise_range
-    tried: list[dict[str, float]] = []
+    chosen = [_ProcessNoise(h) for h in hypotheses]
     if wide:
         levels = np.geomspace(least, most, 4) / most
-        h = _likeliest(problem, h, _grid(dict.fromkeys(problem.ports, most), levels), tried)
+        grid = _grid(dict.fromkeys(problem.ports, most), levels)
+        _try_process_noises(problem, chosen, [grid] * len(chosen))
     for factor in (10.0, 10**0.5):
-        trials = _grid(h.process_noise, (1 / factor, 1.0, factor))
-        trials = [{p: min(max(v, least), most) for p, v in t.items()} for t in trials]
-        h = _likeliest(problem, h, trials, tried)
-    return h
+        trials = [_grid(c.best.process_noise, (1 / factor, 1.0, factor)) for c in chosen]
+        trials = [[{p: min(max(v, least), most) for p, v in t.items()} for t in each] for each in trials]
+        _try_process_noises(problem, chosen, trials)
+    return [c.best for c in chosen]
 
 
-def _likeliest(
-    problem: LikelihoodProblem, h: Hypothesis, trials: list[dict[str, float]], tried: list[dict[str, float]]
-) -> Hypothesis:
-    """The likeliest process noise; `h` has the best of those tried before, none of which is run again."""
-    new = [t for k, t in enumerate(trials) if t not in (*trials[:k], *tried)]
-    if not new:
-        return h
-    gains, parameter_set = problem.gains(h, new), h.parameter_set(problem.supermodel)
-    es = problem.innovations_of([parameter_set._replace(K=K) for K in gains])
-    likelihoods = [problem.log_likelihood(e) for e in es]
-    best, first = int(np.argmax(likelihoods)), not tried
-    tried += new
-    if not first and likelihoods[best] <= h.log_likelihood:
-        return h
-    return problem.evaluated(dataclasses.replace(h, K=gains[best], process_noise=new[best]), es[best])
+@dataclasses.dataclass
+class _ProcessNoise:
+    """A hypothesis with the likeliest process noise of those tried."""
+
+    best: Hypothesis
+    tried: list[dict[str, float]] = dataclasses.field(default_factory=list)
+
+
+def _try_process_noises(
+    problem: LikelihoodProblem, chosen: list[_ProcessNoise], trials: list[list[dict[str, float]]]
+) -> None:
+    """Runs each hypothesis with further process noises; none is run again."""
+    runs: list[tuple[_ProcessNoise, Hypothesis]] = []
+    parameter_sets: list[ParameterSet] = []
+    for c, each in zip(chosen, trials, strict=True):
+        if new := [t for k, t in enumerate(each) if t not in (*each[:k], *c.tried)]:
+            as_it_is = c.best.parameter_set(problem.supermodel)
+            for intensity, K in zip(new, problem.gains(c.best, new), strict=True):
+                runs.append((c, dataclasses.replace(c.best, K=K, process_noise=intensity)))
+                parameter_sets.append(as_it_is._replace(K=K))
+    evaluated = problem.predictor.of_innovations(
+        lambda i, e: problem.evaluated(runs[i][1], e), parameter_sets, problem.windows.index
+    )
+    for c in chosen:
+        new = [h for (of, _), h in zip(runs, evaluated, strict=True) if of is c]
+        found = max(new, key=lambda h: h.log_likelihood, default=c.best)
+        if not c.tried or found.log_likelihood > c.best.log_likelihood:
+            c.best = found
+        c.tried += [h.process_noise for h in new]
 
 
 def refit(
@@ -371,7 +403,7 @@ def refit(
         moving = [i for i in range(len(current)) if not converged[i]]
         if not moving:
             break
-        chosen = [choose_process_noise(problem, current[i], wide and k == 0) for i in moving]
+        chosen = choose_process_noises(problem, [current[i] for i in moving], wide and k == 0)
         new = levenberg_marquardt(problem, chosen)
         for i, h in zip(moving, new, strict=True):
             gain = h.log_likelihood - current[i].log_likelihood

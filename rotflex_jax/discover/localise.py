@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Bool, Float, Int, Real
 
 from rotflex_jax.checks import positive
@@ -17,6 +16,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import single
+from rotflex_jax.recording.smoothing import local_polynomial, smoothed
 from rotflex_jax.text.numbers import as_read
 
 # Angles are smoothed over this half width before they are differentiated [s].
@@ -73,10 +73,10 @@ def missing_acceleration(
     if not half:
         return np.zeros(len(error)), ~seen
     window = 2 * half + 1
-    smooth = scipy.signal.savgol_filter(error, window, 2, deriv=order, delta=recording.Ts)
+    smooth = smoothed(error, window, 2, order, recording.Ts)
     for k in (0, *starts, len(error)):
         seen[max(0, k - half) : k + half + 1] = False
-    return np.asarray(smooth), seen
+    return smooth, seen
 
 
 def condition_sets(
@@ -102,7 +102,7 @@ def condition_sets(
     turning, bending = channels[0], channels[min(1, len(channels) - 1)]
     speed, error, unit = _speed(recording, turning, noise.get(turning, 0.0), mechanism)
     what = _subject(turning, mechanism)
-    position = np.asarray(scipy.signal.savgol_filter(recording.channel(bending), 2 * half + 1, 2))
+    position = smoothed(recording.channel(bending).astype(float), 2 * half + 1, 2)
     subject = "the deflection" if _subject(bending, mechanism) == "the joint" else bending
     found = (
         _sides("speed", speed, unit, error, _turning(what, unit)),
@@ -134,9 +134,9 @@ def _speed(
     # The reading of a machine says what it is; without one its unit tells a speed.
     is_speed = known[channel].derivative > 0 if channel in known else unit.endswith("/s")
     order = 0 if is_speed else 1
-    weights = scipy.signal.savgol_coeffs(window, 2, deriv=order, delta=recording.Ts)
+    weights = local_polynomial(window, 2, order, recording.Ts)[window // 2]
     y = recording.channel(channel).astype(float)
-    speed = np.asarray(scipy.signal.savgol_filter(y, window, 2, deriv=order, delta=recording.Ts))
+    speed = smoothed(y, window, 2, order, recording.Ts)
     return speed, noise * float(np.linalg.norm(weights)), unit if is_speed else f"{unit}/s"
 
 

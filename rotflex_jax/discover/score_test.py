@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.batched_predictor import ParameterSet
-from rotflex_jax.discover.candidate_slopes import MOST_LINES, candidate_sensitivities
+from rotflex_jax.discover.batched_predictor import ParameterSet, on_threads
+from rotflex_jax.discover.candidate_slopes import MOST_LINES, Slopes, candidate_sensitivities
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ErrorLine
@@ -111,15 +111,19 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
     orthogonal = coordinates.orthogonal_to(h.whitener(J[0, : h.moved], seen))
     smooth = [c for c in candidates if not c.threshold]
     found = candidate_sensitivities(problem.predictor, h.parameter_set(s), smooth, problem.windows.index)
-    columns: dict[tuple[EffectLocation, int], list[np.ndarray]] = {}
-    for probes, J in found:
-        for p, column in zip(probes, h.whitener(J, seen), strict=True):
-            columns.setdefault((p.candidate.location, p.shape), []).append(column)
-    for key, change in _changes(problem, h, e[0], thresholds):
-        columns[key] = [h.whitener(change, seen)]
+    found = [slopes for slopes in found if slopes.probes]
+    keys = [[(p.candidate.location, p.shape) for p in probes] for probes, _ in found]
+    if changes := list(_changes(problem, h, e[0], thresholds)):
+        keys.append([key for key, _ in changes])
+        found.append(Slopes((), np.stack([change for _, change in changes])))
+    columns: dict[tuple[EffectLocation, int], list[_Column]] = {}
+    project = lambda slopes: _columns(h.whitener(slopes.J, seen), orthogonal)  # noqa: E731
+    for group, projected in zip(keys, on_threads(project, found), strict=True):
+        for key, column in zip(group, projected, strict=True):
+            columns.setdefault(key, []).append(column)
     headroom = float(np.exp(h.whitener.log_det / (2 * e.shape[-1])) / np.exp(np.mean(np.log(problem.noise))))
     r = orthogonal(w[None])[0]
-    projected = _Projected(r, orthogonal, columns, problem.measured_values, max(headroom, 1.0))
+    projected = _Projected(r, columns, problem.measured_values, max(headroom, 1.0))
     listed = sorted((_score(c, projected) for c in candidates), key=lambda found: -found.nats)
     return ScoreTest(listed, {c.location: c for c in candidates}, projected)
 
@@ -141,23 +145,44 @@ def _changes(
         yield from zip(keys, problem.innovations_of(parameter_sets) - e, strict=True)
 
 
+class _Column(NamedTuple):
+    """Whitened slopes along one probe.
+
+    Attributes:
+        size: Their norm; not finite where a run diverges.
+        left: What the hypothesis cannot explain of them.
+    """
+
+    size: float
+    left: Float[np.ndarray, " M"]
+
+
+def _columns(whitened: Float[np.ndarray, "K R N C"], orthogonal: Projection) -> list[_Column]:
+    sizes = np.sqrt(np.einsum("krnc,krnc->k", whitened, whitened))
+    whitened[~np.isfinite(sizes)] = 0.0
+    return [_Column(float(size), left) for size, left in zip(sizes, orthogonal(whitened), strict=True)]
+
+
 @dataclasses.dataclass(frozen=True)
 class _Projected:
     """The innovations less what the hypothesis can still explain, and the slopes of all candidates.
 
     Attributes:
         r: Whitened innovations less what the hypothesis can still explain.
-        orthogonal: Takes what the hypothesis can still explain away.
-        columns: (location, shape) -> whitened slopes, one per probe.
+        columns: (location, shape) -> slopes, one per probe.
         samples: How many values were measured.
         headroom: Innovations over sensor noise: how much smaller they would be if the model were right.
     """
 
     r: Float[np.ndarray, " M"]
-    orthogonal: Projection
-    columns: dict[tuple[EffectLocation, int], list[Float[np.ndarray, "R N C"]]]
+    columns: dict[tuple[EffectLocation, int], list[_Column]]
     samples: float
     headroom: float
+
+    def of(self, location: EffectLocation, shape: int) -> Float[np.ndarray, "k M"] | None:
+        """What is left of the slopes of a shape; None where they are not finite."""
+        found = self.columns[(location, shape)]
+        return np.array([c.left for c in found]) if all(np.isfinite(c.size) for c in found) else None
 
 
 def _score(c: Candidate, projected: _Projected) -> Score:
@@ -170,14 +195,12 @@ def _score(c: Candidate, projected: _Projected) -> Score:
 
 def _score_of_shape(c: Candidate, shape: int, projected: _Projected) -> Score:
     group = np.array(c.probes[shape], float)
-    J = np.array(projected.columns[(c.location, shape)])
-    values = group[0].copy()
-    if not np.all(np.isfinite(J)):
+    rows, values = projected.of(c.location, shape), group[0].copy()
+    if rows is None:
         start = CandidateStart(c.location, values, expected_gain=-np.inf)
         return Score(start, -np.inf, False, 0.0, np.inf)
-    full = np.linalg.norm(J.reshape(len(J), -1), axis=1)
-    J = projected.orthogonal(J).T
-    left = np.linalg.norm(J, axis=0)
+    full = np.array([column.size for column in projected.columns[(c.location, shape)]])
+    J, left = rows.T, np.linalg.norm(rows, axis=1)
     a = _amplitudes(J, projected.r, c)
     a = np.minimum(a, MAX_THRESHOLD_AMPLITUDE) if c.threshold else a
     explained = J @ a
@@ -322,9 +345,8 @@ def _shapes(c: Candidate, projected: _Projected) -> list[_Shape]:
     """The shapes of a candidate whose slopes are finite."""
     found = []
     for shape in range(len(c.probes)):
-        J = np.array(projected.columns[(c.location, shape)])
-        if np.all(np.isfinite(J)):
-            found.append(_Shape(c, shape, np.asarray(projected.orthogonal(J))))
+        if (rows := projected.of(c.location, shape)) is not None:
+            found.append(_Shape(c, shape, rows))
     return found
 
 

@@ -4,10 +4,12 @@ import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rotflex_jax import checks
+from rotflex_jax.discover.batched_predictor import LEAST_WINDOWS
 from rotflex_jax.discover.checkpoint import beginning, digest_of_search
 from rotflex_jax.discover.conclusion import with_proposal
 from rotflex_jax.discover.discovery import Discovery
@@ -39,10 +41,10 @@ from rotflex_jax.fit.dataset import padded_length, prepare, process_noise_ports
 from rotflex_jax.fit.plausibility import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
-from rotflex_jax.models.model import Model
+from rotflex_jax.models.model import Model, program_length
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, listed
-from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
+from rotflex_jax.runtime.persistent_jit import clear_compilation_caches, loaded_ahead
 from rotflex_jax.runtime.xla import one_thread
 
 
@@ -114,25 +116,35 @@ def discover(
     evaluation = Evaluation.of(model, horizons, tested, calibrate_seconds)
     supermodel = horizons.prediction.problem.supermodel
     digest = digest_of_search(model, supermodel, window_seconds, trained, held_back)
-    # 2. The baseline, or what a search that was stopped had found.
-    if resume is None:
-        state = fit_as_it_is(model, horizons, say, digest)
-    else:
-        state = as_it_was(model, horizons, say, digest, resume)
-    while len(state.scores) < rounds:
-        # 3. Score all candidates.
-        promising = score_candidates(state)
-        # 4. Refit the best and decide; where none is worth it alone, two together may be.
-        if not add_best(state, promising) and not add_pair(state, rounds):
-            break
-    # 5. Leave out what is not needed, and see whether steps of one effect have passed by a pair.
-    _make_ahead(state, evaluation)
-    _simplify(state)
-    _check_pairs(state)
-    # 6. Evaluate every nested model, and localise what the baseline leaves.
-    evaluated = evaluate_models(state, evaluation)
-    # 7. The verdict, and what to record next where it is open.
-    return with_proposal(conclude(state, evaluated, started))
+    with loaded_ahead(*_kind_of_programs(horizons)):
+        # 2. The baseline, or what a search that was stopped had found.
+        if resume is None:
+            state = fit_as_it_is(model, horizons, say, digest)
+        else:
+            state = as_it_was(model, horizons, say, digest, resume)
+        while len(state.scores) < rounds:
+            # 3. Score all candidates.
+            promising = score_candidates(state)
+            # 4. Refit the best and decide; where none is worth it alone, two together may be.
+            if not add_best(state, promising) and not add_pair(state, rounds):
+                break
+        # 5. Leave out what is not needed, and see whether steps of one effect have passed by a pair.
+        _make_ahead(state, evaluation)
+        _simplify(state)
+        _check_pairs(state)
+        # 6. Evaluate every nested model, and localise what the baseline leaves.
+        evaluated = evaluate_models(state, evaluation)
+        # 7. The verdict, and what to record next where it is open.
+        return with_proposal(conclude(state, evaluated, started))
+
+
+def _kind_of_programs(horizons: Horizons) -> tuple[Any, ...]:
+    """What searches have in common that use the same programs, the effects found apart."""
+    sets = (horizons.prediction.problem, horizons.prediction.validation.problem)
+    shapes = tuple((program_length(p.seen.shape[1]), *p.dataset.data.y.shape[::2]) for p in sets)
+    problem = sets[0]
+    windows = program_length(problem.windows.number, LEAST_WINDOWS)
+    return problem.supermodel.mechanism.structure, problem.predictor.solver, shapes, windows
 
 
 def _several(recordings: Recording | Sequence[Recording] | None, name: str) -> tuple[Recording, ...]:

@@ -164,6 +164,7 @@ class SuperModel:
         candidates: By location.
         reduced: Reduced models formed so far, by the effects left out.
         switched: Those of `active`, by what is on.
+        known_gates: Those of `gates`, by what is on.
     """
 
     baseline: Mechanism
@@ -172,6 +173,7 @@ class SuperModel:
     candidates: dict[EffectLocation, Candidate]
     reduced: dict[frozenset[int], ReducedModel] = dataclasses.field(default_factory=dict)
     switched: dict[bytes, ReducedModel] = dataclasses.field(default_factory=dict)
+    known_gates: dict[frozenset[EffectLocation], np.ndarray] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def transform(self) -> Transform:
@@ -270,11 +272,14 @@ class SuperModel:
         return frozenset(locations) - set(self.calibrations)
 
     def gates(self, switched_on: Iterable[EffectLocation]) -> Float[np.ndarray, " E"]:
-        """One where an effect is on: those of the baseline and those named."""
-        on = set(switched_on)
-        base = len(self.baseline.effects)
-        effects = self.mechanism.effects
-        return np.array([1.0 if i < base or (e.name, e.at) in on else 0.0 for i, e in enumerate(effects)])
+        """One where an effect is on: those of the baseline and those named; not to be written to."""
+        on = frozenset(switched_on)
+        if on not in self.known_gates:  # asked for at every run
+            base, effects = len(self.baseline.effects), self.mechanism.effects
+            found = np.array([float(i < base or (e.name, e.at) in on) for i, e in enumerate(effects)])
+            found.flags.writeable = False
+            self.known_gates[on] = found
+        return self.known_gates[on]
 
     def clean(self, values: Float[np.ndarray, " P"], locations: Iterable[EffectLocation]) -> Mechanism:
         """The user's mechanism with fitted parameters and the named effects, nothing else."""

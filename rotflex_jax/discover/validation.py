@@ -23,8 +23,8 @@ from rotflex_jax.metrics import window_starts, windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
 
-# Of the fit of a window's first state to a few samples, which determine it well.
-FIRST_STATE_RULES = Rules(enough_share=1e-9, least=1e-6)
+# Of the fit of a window's first state to a few samples, which determine it well: hardly damped.
+FIRST_STATE_RULES = Rules(enough_share=1e-9, damping=1e-6, least=1e-6)
 MAX_FIRST_STATE_STEPS = 12
 
 
@@ -79,10 +79,12 @@ class ShortRuns:
             return run._replace(x0=x0)
 
         def linearise(points: list[_FirstState]) -> list[NormalEquations]:
+            def equations(_: int, e: np.ndarray, J: np.ndarray) -> list[NormalEquations]:
+                heads = ((J[:size, p.recording, p.samples], e[p.recording, p.samples]) for p in points)
+                return [NormalEquations.of(slopes.reshape(size, -1).T, w.ravel()) for slopes, w in heads]
+
             # Windows share each run.
-            e, J = self.predictor.slopes([started_at(points)], [ways], self.windows.index)
-            heads = ((J[0, :size, p.recording, p.samples], e[0, p.recording, p.samples]) for p in points)
-            return [NormalEquations.of(slopes.reshape(size, -1).T, w.ravel()) for slopes, w in heads]
+            return self.predictor.of_slopes(equations, [started_at(points)], [ways], self.windows.index)[0]
 
         found = minimise_together(
             linearise,
@@ -367,9 +369,12 @@ def adapted_to_recordings(
 
     def linearise(points: list[_OwnStep]) -> list[NormalEquations]:
         here = joined(points)
-        e, J = problem.slopes([here])
-        w = h.whitener(e[0], seen)
-        H, g = coordinates.sums(w, h.whitener(J[0, first : h.moved], seen))
+
+        def whitened(_: int, e: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            w = h.whitener(e, seen)
+            return w, *coordinates.sums(w, h.whitener(J[first : h.moved], seen))
+
+        w, H, g = problem.of_slopes(whitened, [here])[0]
         equations = []
         for p in points:
             r, row = p.recording, own[p.recording]

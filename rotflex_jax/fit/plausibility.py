@@ -5,7 +5,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Float
 
 from rotflex_jax.effects.base import Effect, Linear
@@ -15,6 +14,7 @@ from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, Transform, specifications
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.smoothing import smoothed
 
 
 def motion(
@@ -32,8 +32,10 @@ def motion(
     width = max(2 * round(smooth / Ts / 2) + 1, 5)
     width = min(width, len(y) - 1 + len(y) % 2)
     C = rows[is_position, : layout.n]
-    position = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, axis=0))
-    speed = np.asarray(scipy.signal.savgol_filter(y[:, is_position], width, 3, deriv=1, delta=Ts, axis=0))
+    position, speed = (
+        np.stack([smoothed(column, width, 3, order, Ts) for column in y[:, is_position].T], axis=1)
+        for order in (0, 1)
+    )
     back, out = np.linalg.pinv(C), {}
     for port, vector in mechanism.port_vectors.items():
         p = np.array(vector) @ back

@@ -93,7 +93,7 @@ def periodic_torques(
     if M < 2 * NEIGHBOURS:
         return ()
     t, found = Ts * np.arange(N), []
-    left = scipy.signal.detrend(np.asarray(torque, float))
+    left = _without_trend(np.asarray(torque, float))
     for _ in range(MOST_LINES):
         power = _periodogram(left)
         level = _level(power)
@@ -137,7 +137,7 @@ def drift(torque: Float[np.ndarray, " N"], Ts: float) -> Drift | None:
 def _usable(u: Float[np.ndarray, " N"], f: Float[np.ndarray, " F"], Ts: float) -> Bool[np.ndarray, " F"]:
     """Frequencies at which a line is none of the input: where it has no line, nor multiples of its period."""
     usable = (f * len(u) * Ts >= LEAST_PERIODS) & (f < BELOW_NYQUIST / (2 * Ts))
-    power = _periodogram(scipy.signal.detrend(u))
+    power = _periodogram(_without_trend(u))
     lines = power > _level(power) * math.log(len(f) / FALSE_ALARM)
     # The taper widens a line to its neighbours.
     usable &= ~(scipy.ndimage.maximum_filter1d(lines.astype(int), 5) > 0)
@@ -162,9 +162,16 @@ def _period(u: Float[np.ndarray, " N"]) -> int:
     return k if share[k] > REPEATS else 0
 
 
+def _without_trend(x: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """A signal less its regression line."""
+    t = np.arange(len(x)) - (len(x) - 1) / 2
+    centred = x - x.mean()
+    return centred - t * (t @ centred) / max(t @ t, 1e-300)
+
+
 def _periodogram(x: Float[np.ndarray, " N"]) -> Float[np.ndarray, " F"]:
     """Of a tapered signal; of white noise the variance, in the mean."""
-    w = scipy.signal.get_window("hann", len(x))
+    w = np.sin(np.pi * np.arange(len(x)) / len(x)) ** 2
     return np.abs(np.fft.rfft(w * x)) ** 2 / np.sum(w**2)
 
 

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Float
@@ -106,8 +105,8 @@ def _equations(structure: Mechanism, values: jax.Array, gates: jax.Array) -> tup
 def _linear_part(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`A`, `B` and the inverse mass matrix."""
     with double_precision():
-        gates = jnp.ones(len(mechanism.effects))
-        eq = EquationsOfMotion(*_equations(mechanism.structure, jnp.asarray(mechanism.values), gates))
+        gates = np.ones(len(mechanism.effects))
+        eq = EquationsOfMotion(*_equations(mechanism.structure, mechanism.values, gates))
         return np.asarray(eq.A), np.asarray(eq.B), np.asarray(eq.inverse_mass)
 
 
@@ -121,13 +120,18 @@ def linearise(mechanism: Mechanism) -> StateSpace:
 
     Dry friction and a dead zone have no slope at rest, so the linear model of a joint has none of them.
     """
+    return _linearised(mechanism)[0]
+
+
+def _linearised(mechanism: Mechanism) -> tuple[StateSpace, np.ndarray]:
+    """State space of the linear effects, and the inverse mass matrix."""
     check_mechanism(mechanism)
     check_movable(mechanism)
     layout = Layout.of(mechanism.structure)
-    A, B, _ = _linear_part(mechanism)
+    A, B, Minv = _linear_part(mechanism)
     C = np.zeros((len(mechanism.channels), layout.linear))
     C[:, : 2 * layout.n] = layout.output_rows
-    return StateSpace(A, B, C)
+    return StateSpace(A, B, C), Minv
 
 
 def kalman_gains(
@@ -154,10 +158,11 @@ def kalman_gains(
     Returns:
         Gains with zero rows for memories.
     """
-    layout, ss = Layout.of(mechanism.structure), linearise(mechanism)
+    layout, (ss, Minv) = Layout.of(mechanism.structure), _linearised(mechanism)
     n, size = layout.n, layout.linear
-    Minv = inverse_mass(mechanism)
-    covariance = {port: process_covariance(ss.A, Minv @ np.array(p), n, Ts) for port, p in mechanism.ports}
+    names, vectors = zip(*mechanism.ports, strict=True)
+    covariances = process_covariance(ss.A, np.array(vectors) @ Minv.T, n, Ts)
+    covariance = dict(zip(names, covariances, strict=True))
     Ad, _ = ss.discretise(Ts)
     Q = np.array(
         [sum((q * covariance[p] for p, q in i.items()), np.zeros((size, size))) for i in intensities]
@@ -184,20 +189,20 @@ def kalman_gains(
 
 
 def process_covariance(
-    A: Float[np.ndarray, "m m"], push: Float[np.ndarray, " n"], n: int, Ts: float, doublings: int = 14
-) -> Float[np.ndarray, "m m"]:
-    """Covariance of the state after one sample of a white torque of unit intensity.
+    A: Float[np.ndarray, "m m"], push: Float[np.ndarray, "*batch n"], n: int, Ts: float, doublings: int = 14
+) -> Float[np.ndarray, "*batch m m"]:
+    """Covariance of the state after one sample of a white torque of unit intensity; of several at once.
 
     `Q(2 h) = Q(h) + E Q(h) E'` from a Simpson rule over the smallest step; this has, in contrast to the
     usual block exponential, no growing mode, so a fast electrical pole costs no accuracy.
     """
-    g = np.zeros(len(A))
-    g[n : 2 * n] = push
+    g = np.zeros((*np.shape(push)[:-1], len(A)))
+    g[..., n : 2 * n] = push
     h = Ts / 2**doublings
     half = _exponential(A * (h / 2))
-    middle, end = half @ g, half @ half @ g
-    Q = h / 6 * (np.outer(g, g) + 4 * np.outer(middle, middle) + np.outer(end, end))
     E = half @ half
+    outer = lambda g: g[..., :, None] * g[..., None, :]  # noqa: E731
+    Q = h / 6 * (outer(g) + 4 * outer(g @ half.T) + outer(g @ E.T))
     for _ in range(doublings):
         Q, E = Q + E @ Q @ E.T, E @ E
     return Q

@@ -391,7 +391,17 @@ class Mechanism:
             part = {n: listed[start + i] for i, n in enumerate(names)}
             effects.append(e.replace(**part))
             start += len(names)
-        return dataclasses.replace(self, effects=tuple(effects))
+        return self._with_numbers(tuple(effects), self.trusted)
+
+    def _with_numbers(self, effects: tuple[Effect, ...], trusted: frozenset[str]) -> "Mechanism":
+        """The same mechanism where only numbers of its effects differ: what was checked need not be again."""
+        rebuilt = object.__new__(type(self))
+        # What follows from the structure alone, where it is known, is that of the other one too.
+        known = ("structure", "parameter_names", "followers", "parameter_specifications")
+        rebuilt.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        rebuilt.__dict__.update(fields | {"effects": effects, "trusted": trusted})
+        return rebuilt
 
     def trust(self, *names: str) -> "Mechanism":
         """The mechanism with these parameters held constant in fits."""
@@ -427,17 +437,7 @@ class Mechanism:
             part = {n: leaves[start + i] for i, n in enumerate(e.values)}
             effects.append(e.replace(**part))
             start += len(part)
-        rebuilt = object.__new__(cls)
-        for field, value in (
-            ("coordinates", structure.coordinates),
-            ("ports", structure.ports),
-            ("effects", tuple(effects)),
-            ("outputs", structure.outputs),
-            ("trusted", trusted),
-            ("units", structure.units),
-        ):
-            object.__setattr__(rebuilt, field, value)
-        return rebuilt
+        return structure._with_numbers(tuple(effects), trusted)
 
     def _status(self, name: str) -> str:
         if name in self.followers:

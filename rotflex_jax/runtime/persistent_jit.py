@@ -69,13 +69,20 @@ _recent_lock = threading.Lock()
 _thread = threading.local()
 
 
+# Names of the files of programs that are used inside of each `loaded_ahead`, in order of their first use.
+_notes: list[dict[str, None]] = []
+# Programs that threads load from their files before they are needed.
+_coming: dict[Path, Future[Callable[..., Any] | None]] = {}
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Held:
-    """A program in memory, and where it is held."""
+    """A program in memory, where it is held, and its file if it has one."""
 
     program: Callable[..., Any]
     place: dict[Any, "_Held"]
     key: Any
+    file: Path | None
 
 
 class _Paused:
@@ -159,8 +166,9 @@ class PersistentJit:
             return held.program(*leaves)
         _thread.may_stop = False
         try:
-            program, result = self._made(known, tree, leaves, self._file(known, tree, kinds, settings))
-            held = self._held[key] = _Held(program, self._held, key)
+            file = self._file(known, tree, kinds, settings)
+            program, result = self._made(known, tree, leaves, file)
+            held = self._held[key] = _Held(program, self._held, key, file)
         finally:  # where it failed, the next thread that waits makes it itself
             with _recent_lock:
                 self._in_work.pop(key).set_result(None)
@@ -267,6 +275,58 @@ class _NothingToMakeError(Exception):
 @functools.cache
 def _ahead() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, thread_name_prefix="programs")
+
+
+@contextlib.contextmanager
+def loaded_ahead(*like: Any) -> Iterator[None]:
+    """Inside, programs that the last such block has used are loaded on threads before they are needed.
+
+    Loading is machine code that is linked, outside of Python: it goes on beside the first fits. What is not
+    used in the end is let go of.
+
+    Args:
+        like: Static values; blocks with equal ones count as alike.
+    """
+    names, folder = [static_key(x) for x in like], programs_folder()
+    if folder is None or not all(names) or not _unchanged():
+        yield
+        return
+    here = folder / _surroundings()
+    listed = here / "used" / hashlib.sha256(str(names).encode()).hexdigest()
+    with contextlib.suppress(OSError, UnicodeError):
+        found = re.findall("^[0-9a-f]{64}$", listed.read_text(), re.MULTILINE)
+        _load_ahead([here / name for name in found])
+    used: dict[str, None] = {}
+    with _recent_lock:
+        _notes.append(used)
+    try:
+        yield
+    finally:
+        with _recent_lock:
+            _notes[:] = [note for note in _notes if note is not used]
+        for file in list(_coming):
+            if (future := _coming.pop(file, None)) is not None:
+                future.cancel()
+    with contextlib.suppress(OSError):
+        listed.parent.mkdir(parents=True, exist_ok=True)
+        _write_file(listed, "\n".join(used).encode())
+
+
+def _load_ahead(files: list[Path]) -> None:
+    """Begin to load programs that are not in memory, in this order."""
+    with _recent_lock:
+        held = {held.file for held in _recent}
+    wanted = [file for file in files if file not in held and file not in _coming]
+    if wanted:
+        with _storage.lock:
+            _prepare_loading()
+        with contextlib.suppress(RuntimeError):  # while the interpreter ends nothing more is taken
+            _coming.update({file: _loaders().submit(_stored_program, file) for file in wanted})
+
+
+@functools.cache
+def _loaders() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cores(), thread_name_prefix="loading")
 
 
 def keep_programs(folder: str | Path | bool = True) -> None:
@@ -405,6 +465,8 @@ def _used(held: _Held) -> None:
     with _recent_lock:
         _recent[held] = None
         _recent.move_to_end(held)
+        for note in _notes if held.file is not None else ():
+            note[held.file.name] = None
         if len(_recent) <= MOST_HELD:
             return
         released = [_recent.popitem(last=False)[0] for _ in range(len(_recent) - LEFT_HELD)]
@@ -510,13 +572,10 @@ def _prepare_loading() -> None:
 def _read(file: Path, leaves: list[Any]) -> tuple[Callable[..., Any], Any] | None:
     """The program in a file and what it gives for arguments; None without one that runs with these."""
     try:
-        data = file.read_bytes()
-        digest, content = data[:32], data[32:]
-        if hashlib.sha256(content).digest() != digest:
+        coming = _coming.pop(file, None)
+        program = _stored_program(file) if coming is None or coming.cancel() else coming.result()
+        if program is None:
             return None
-        with _storage.lock:
-            _prepare_loading()
-        program = serialize_executable.deserialize_and_load(*pickle.loads(content))
         # What JAX had loaded from its own cache, and not compiled, may be stored without its functions.
         result = jax.block_until_ready(program(*leaves))
         os.utime(file)  # what was used last is deleted last
@@ -526,6 +585,17 @@ def _read(file: Path, leaves: list[Any]) -> tuple[Callable[..., Any], Any] | Non
         return None
 
 
+def _stored_program(file: Path) -> Callable[..., Any] | None:
+    """The program in a file; None where it is damaged."""
+    data = file.read_bytes()
+    digest, content = data[:32], data[32:]
+    if hashlib.sha256(content).digest() != digest:
+        return None
+    with _storage.lock:
+        _prepare_loading()
+    return serialize_executable.deserialize_and_load(*pickle.loads(content))
+
+
 def _write(program: Any, file: Path) -> None:
     """Stores a program; where that fails, the next process compiles it again."""
     with contextlib.suppress(Exception):  # the disk is full, or this JAX cannot store this program
@@ -533,18 +603,23 @@ def _write(program: Any, file: Path) -> None:
         if not file.parent.exists():
             _clear(file.parent.parent)
             file.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=file.parent)
-        try:
-            with os.fdopen(handle, "wb") as out:
-                out.write(hashlib.sha256(content).digest() + content)
-            os.replace(name, file)  # complete or not at all, also with several processes
-        except OSError:
-            os.unlink(name)
-            raise
+        _write_file(file, hashlib.sha256(content).digest() + content)
         with _storage.lock:
             _storage.written += 1
             if _storage.written % _CHECK_EVERY == 1:
                 _shrink(file.parent, MOST_BYTES)
+
+
+def _write_file(file: Path, content: bytes) -> None:
+    """Writes a file completely or not at all, also with several processes."""
+    handle, name = tempfile.mkstemp(dir=file.parent)
+    try:
+        with os.fdopen(handle, "wb") as out:
+            out.write(content)
+        os.replace(name, file)
+    except OSError:
+        os.unlink(name)
+        raise
 
 
 def _shrink(folder: Path, most: int) -> None:
@@ -560,6 +635,8 @@ def _stored(folder: Path) -> Iterator[tuple[float, int, Path]]:
     """When each program in a folder was used last, its size, and its file."""
     for file in folder.glob("*"):
         with contextlib.suppress(FileNotFoundError):  # another process has deleted it
+            if file.is_dir():
+                continue
             yield file.stat().st_mtime, file.stat().st_size, file
 
 
