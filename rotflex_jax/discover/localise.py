@@ -61,7 +61,7 @@ def missing_acceleration(
     """Smoothed acceleration of an error: what the model lacks at that time, not what earlier errors left.
 
     Args:
-        error: Of one channel [unit].
+        error: Of one channel that measures a motion [unit].
         recording: Gives the sampling.
         starts: Samples at which the free run started again; a jump there is no physics.
         order: Of the derivative; 1 for a channel that measures a speed.
@@ -79,6 +79,33 @@ def missing_acceleration(
     return np.asarray(smooth), seen
 
 
+def derivative_of(channel: str, unit: str, mechanism: Mechanism | None = None) -> int:
+    """Order of the derivative of a position that a channel measures; 2 for a reading of the motor.
+
+    Args:
+        channel: Its name.
+        unit: Of the channel; without a mechanism that has it, this tells a speed and a current.
+        mechanism: Says what the channel measures.
+
+    >>> derivative_of("theta", "rad"), derivative_of("gyro", "rad/s"), derivative_of("current", "A")
+    (0, 1, 2)
+    """
+    known = dict(zip(mechanism.channels, mechanism.quantities, strict=True)) if mechanism is not None else {}
+    if channel in known:
+        return known[channel].derivative
+    return 1 if unit.endswith("/s") else 2 if unit == "A" else 0
+
+
+def motion_channels(units: Mapping[str, str], mechanism: Mechanism | None = None) -> tuple[str, ...]:
+    """Channels that measure a position or a speed, in their order.
+
+    Args:
+        units: Channel -> its unit.
+        mechanism: Says what the channels measure.
+    """
+    return tuple(c for c, unit in units.items() if derivative_of(c, unit, mechanism) < 2)
+
+
 def condition_sets(
     recording: Recording,
     channels: Sequence[str],
@@ -87,8 +114,8 @@ def condition_sets(
 ) -> tuple[ConditionSet, ...]:
     """The sets of conditions that the motion of the recording allows; none for a recording at rest.
 
-    The first channel is taken for what turns and the second for what deflects; a single channel
-    for both.
+    The first channel that measures a motion is taken for what turns and the second for what deflects; a
+    single one for both.
 
     Args:
         recording: Measured outputs.
@@ -97,9 +124,10 @@ def condition_sets(
         mechanism: Says what the channels measure; by their names if None.
     """
     half = half_width(recording)
-    if not half:
+    moving = motion_channels({c: _unit(recording, c) for c in channels}, mechanism)
+    if not half or not moving:
         return ()
-    turning, bending = channels[0], channels[min(1, len(channels) - 1)]
+    turning, bending = moving[0], moving[min(1, len(moving) - 1)]
     speed, error, unit = _speed(recording, turning, noise.get(turning, 0.0), mechanism)
     what = _subject(turning, mechanism)
     position = np.asarray(scipy.signal.savgol_filter(recording.channel(bending), 2 * half + 1, 2))
@@ -109,13 +137,17 @@ def condition_sets(
         _sides(
             "deflection",
             position,
-            recording.units[recording.channels.index(bending)],
+            _unit(recording, bending),
             noise.get(bending, 0.0),
             _beyond(subject),
         ),
         _reversals(speed, error, recording.Ts, what),
     )
     return tuple(conditions for conditions in found if conditions is not None)
+
+
+def _unit(recording: Recording, channel: str) -> str:
+    return recording.units[recording.channels.index(channel)]
 
 
 def _subject(channel: str, mechanism: Mechanism | None) -> str:
@@ -129,15 +161,12 @@ def _speed(
 ) -> tuple[np.ndarray, float, str]:
     """Smoothed speed of a channel, the standard deviation of its error, and its unit."""
     window = 2 * half_width(recording) + 1
-    unit = recording.units[recording.channels.index(channel)]
-    known = dict(zip(mechanism.channels, mechanism.quantities, strict=True)) if mechanism is not None else {}
-    # The reading of a machine says what it is; without one its unit tells a speed.
-    is_speed = known[channel].derivative > 0 if channel in known else unit.endswith("/s")
-    order = 0 if is_speed else 1
+    unit = _unit(recording, channel)
+    order = 1 - derivative_of(channel, unit, mechanism)
     weights = scipy.signal.savgol_coeffs(window, 2, deriv=order, delta=recording.Ts)
     y = recording.channel(channel).astype(float)
     speed = np.asarray(scipy.signal.savgol_filter(y, window, 2, deriv=order, delta=recording.Ts))
-    return speed, noise * float(np.linalg.norm(weights)), unit if is_speed else f"{unit}/s"
+    return speed, noise * float(np.linalg.norm(weights)), f"{unit}/s" if order else unit
 
 
 def _turning(what: str, unit: str) -> dict[str, str]:
@@ -417,7 +446,8 @@ def locate(
     corrects for having tried several; quantities are compared by the rule of Benjamini and Hochberg.
 
     A free run carries an error on long after it was made. Speed, deflection and reversals are
-    therefore also compared with the acceleration of the error, which shows where it *arises*.
+    therefore also compared with the acceleration of the error, which shows where it *arises*. The error of
+    a current or a duty is not carried on; these channels tell neither speed nor deflection.
     Frequencies are compared with white sensor noise, time with an error that stays the same.
 
     Not for a few correlation lengths of data: there shifts prove nothing, and nothing is found.
@@ -459,10 +489,12 @@ def locate(
     for channel, error in zip(channels, e.T, strict=True):
         if np.sum(error**2) <= 0.0:
             continue
-        unit = recording.units[recording.channels.index(channel)]
+        unit = _unit(recording, channel)
         found.append(in_time(channel, error, recording))
         found.append(in_frequency(channel, error, recording, unit))
-        energies = {"lies": error**2, "arises": _acceleration_energy(error, recording, window_seconds)}
+        order = 2 - derivative_of(channel, unit, mechanism)
+        lacking = _acceleration_energy(error, recording, window_seconds, order) if order else None
+        energies = {"lies": error**2, "arises": lacking}
         found += [in_conditions(channel, energies, conditions) for conditions in sets]
     notable = [
         f for f in _significant(found) if f.share >= max(f.expected + MIN_EXCESS, MIN_RATIO * f.expected)
@@ -472,11 +504,11 @@ def locate(
 
 
 def _acceleration_energy(
-    error: np.ndarray, recording: Recording, window_seconds: float | None
+    error: np.ndarray, recording: Recording, window_seconds: float | None, order: int
 ) -> np.ndarray | None:
     """Squared acceleration of an error (N,): where it is made, wherever it is carried to."""
     starts = [] if window_seconds is None else window_starts(recording, window_seconds)[0].tolist()
-    acceleration, seen = missing_acceleration(error, recording, starts)
+    acceleration, seen = missing_acceleration(error, recording, starts, order)
     squared = acceleration**2
     if not np.sum(squared[seen]) > 0.0:
         return None

@@ -195,7 +195,7 @@ def least_squares(
         channel: Output to model; may be left out where there is one.
         ridge: Penalty on the squared weights, as they are; "cv" takes the one with the least error on
             contiguous blocks left out in turn. An interval does not contain the bias of a ridge.
-        skip: RecordingSamples at the start of each recording to leave out; its `n_init` if None.
+        skip: Samples at the start of each recording to leave out; its `n_init` if None.
         blocks: How many, for "cv".
 
     Raises:
@@ -274,7 +274,7 @@ def forward_regression(
         channel: Output to model; may be left out where there is one.
         terms: How many to choose; decided on validation blocks if None.
         most: Most that are tried.
-        skip: RecordingSamples at the start of each recording to leave out; its `n_init` if None.
+        skip: Samples at the start of each recording to leave out; its `n_init` if None.
         blocks: How many, to decide.
 
     Returns:
