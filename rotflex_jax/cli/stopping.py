@@ -2,8 +2,8 @@
 
 An exception would arrive in the middle of an import, in a callback of the garbage collector, or only after a
 minute of compiled code, and end with a traceback in some of these. Files are written whole or not at all and
-results as soon as they are there, so that an end at any moment costs only what was not finished. What this module imports is loaded before the
-signal is heard: the least that there is.
+results as soon as they are there, so that an end at any moment costs only what was not finished. This module
+imports as little as it can, since the signal is not heard before it is loaded.
 """
 
 import os

@@ -3,13 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int, Real
 
-from rotflex_jax.checks import positive
+from rotflex_jax.checks import names, positive, real, shown
 from rotflex_jax.discover.result import Where
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.inference import correlation_length
@@ -472,9 +472,16 @@ def locate(
         Hochberg 1995.
     """
     recording = single(recording, "recording")
+    channels = names(channels, "channels")
+    for channel in channels:
+        recording.channel(channel)
+    if mechanism is not None and not isinstance(mechanism, Mechanism):
+        raise InputError(
+            f"Argument `mechanism` must be a Mechanism, but is {shown(mechanism)}; leave it out."
+        )
     if window_seconds is not None:
         positive(window_seconds, "window_seconds")
-    e = np.asarray(residual, dtype=float)
+    e = _numbers(residual)
     e = e[:, None] if e.ndim == 1 else e
     if e.shape != (recording.N, len(channels)) or not np.isfinite(e).all():
         raise InputError(
@@ -483,7 +490,14 @@ def locate(
             f"{np.sum(~np.isfinite(e))} of them not finite; give measured minus simulated outputs."
         )
     if not isinstance(noise, Mapping):
-        noise = dict(zip(channels, np.asarray(noise, float).tolist(), strict=True))
+        listed = np.ravel(_numbers(noise)).tolist()
+        complete = len(listed) == len(channels)
+        noise = dict(zip(channels, listed if complete else [math.nan] * len(channels), strict=True))
+    if not all(0 <= real(noise.get(c, 0.0)) < math.inf for c in channels):
+        raise InputError(
+            "Argument `noise` must have a finite number from 0 for each of the channels "
+            f"{', '.join(channels)}; give standard deviations by name or in this order."
+        )
     sets = condition_sets(recording, channels, noise, mechanism)
     found: list[ErrorShare] = []
     for channel, error in zip(channels, e.T, strict=True):
@@ -501,6 +515,15 @@ def locate(
     ]
     notable.sort(key=lambda f: (f.where.kind == "frequency", -float(relative_entropy(f.share, f.expected))))
     return tuple(f.where for f in notable) or (_nothing_stands_out(e, channels, noise),)
+
+
+def _numbers(given: Any) -> Float[np.ndarray, "..."]:
+    """Real numbers as an array; one nan for anything else."""
+    try:
+        array = np.asarray(given)
+    except ValueError:  # rows of unequal length
+        return np.array(math.nan)
+    return array.astype(float) if array.dtype.kind in "iuf" else np.array(math.nan)
 
 
 def _acceleration_energy(

@@ -430,7 +430,7 @@ def sequential_experiment(
         max_seconds,
         bool(continues),
         bool(improve),
-        checks.whole(seed, "seed", 0),
+        checks.whole(seed, "seed", 0, math.inf),
     )
     return SequentialExperiment(rivals, settings, _prior(probabilities, rivals.labels))
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rotflex_jax.basis import Basis
-from rotflex_jax.checks import whole
+from rotflex_jax.checks import real, shown, whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.inference import Combination, by_recording, curvature, estimates, sandwich
 from rotflex_jax.fit.linear import (
@@ -215,11 +215,12 @@ def least_squares(
     'rad/V^2'
     """
     listed, channel = checked_recordings(recordings, channel)
-    if ridge != "cv" and not (isinstance(ridge, (int, float, np.floating)) and 0 <= ridge < np.inf):
-        raise InputError(f"Argument `ridge` must be 0 or more, or 'cv', but is {ridge!r}; correct it.")
+    tuned = isinstance(ridge, str) and ridge == "cv"
+    if not tuned and not 0 <= real(ridge) < np.inf:
+        raise InputError(f"Argument `ridge` must be 0 or more, or 'cv', but is {shown(ridge)}; correct it.")
     rows = RegressionRows.of(basis, listed, channel, skip)
     joined = np.concatenate([rows.phi, rows.y[:, None]], axis=1)
-    if ridge == "cv":
+    if tuned:
         block = rows.blocks(whole(blocks, "blocks", 2))
         if block[-1] < 1:
             raise InputError(

@@ -50,7 +50,7 @@ def worst_channel(discovery: SearchResult) -> str:
 
 
 def _grid(discovery: SearchResult, s: Shown) -> tuple[list[np.ndarray], list[str]]:
-    """What the maps are drawn over: speed and deflection, or speed and time of a single channel of a motion."""
+    """What the maps are drawn over: speed and deflection, speed and time if one channel alone moves."""
     by_channel, channels = channel_units(discovery), _moving(discovery)
     columns = [list(by_channel).index(c) for c in channels]
     unit = by_channel[channels[0]]
