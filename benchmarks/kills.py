@@ -42,7 +42,7 @@ def search(folder: Path) -> None:
     from spindle import PAIRS, SPINDLE, spun
 
     import rotflex_jax as rf
-    from rotflex_jax.cli.stopping import RoundsSoFar
+    from rotflex_jax.cli.rounds import RoundsSoFar
     from rotflex_jax.text.files import write_file
 
     rounds = RoundsSoFar(folder / "found.json")

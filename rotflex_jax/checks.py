@@ -38,6 +38,10 @@ def real(value: Any) -> float:
         return math.nan
 
 
+SMALLEST, LARGEST = 1e-100, 1e100
+"""Numbers beyond these are no quantity of anything; products of them overflow."""
+
+
 def number(
     value: Any,
     name: str,
@@ -69,11 +73,13 @@ def number(
 give for instance 2.0.
     """
     found = real(value)
-    if math.isfinite(found) and found > above and least <= found < below:
+    sized = abs(found) <= LARGEST and (found == 0 or abs(found) >= SMALLEST)
+    if sized and found > above and least <= found < below:
         return found
     limits = [f"above {above:g}"] * (above > -math.inf) + [f"from {least:g}"] * (least > -math.inf)
     limits += [f"below {below:g}"] * (below < math.inf)
-    what = " ".join(["a finite number", *[" and ".join(limits)] * bool(limits), *[f"[{unit}]"] * bool(unit)])
+    size = "a finite number" if sized or not math.isfinite(found) else "a number of usual size"
+    what = " ".join([size, *[" and ".join(limits)] * bool(limits), *[f"[{unit}]"] * bool(unit)])
     raise InputError(f"Argument `{name}` must be {what}, but is {shown(value)}; give for instance {example}.")
 
 
@@ -82,8 +88,12 @@ def positive(value: Any, name: str, unit: str = "s", example: str = "2.0") -> fl
     return number(value, name, above=0, unit=unit, example=example)
 
 
-def whole(value: Any, name: str, least: int) -> int:
-    """A whole number that is not too small.
+LARGEST_COUNT = 2**31 - 1
+"""Of anything that is counted."""
+
+
+def whole(value: Any, name: str, least: int, most: float = LARGEST_COUNT) -> int:
+    """A whole number that is neither too small nor too large.
 
     >>> whole(2.5, "memory", 1)
     Traceback (most recent call last):
@@ -92,12 +102,45 @@ def whole(value: Any, name: str, least: int) -> int:
 give for instance 1.
     """
     found = real(value)
-    if not math.isfinite(found) or found != int(found) or found < least:
+    if not math.isfinite(found) or found != int(found) or not least <= found <= most:
+        limit = f" to {most:g}" if found > most else ""
         raise InputError(
-            f"Argument `{name}` must be a whole number from {least}, but is {shown(value)}; "
+            f"Argument `{name}` must be a whole number from {least}{limit}, but is {shown(value)}; "
             f"give for instance {least}."
         )
     return int(value)
+
+
+def vector(values: Any, name: str, count: int | None = None, *, example: str) -> Float[np.ndarray, " N"]:
+    """Finite real numbers in a row.
+
+    Args:
+        values: What was given.
+        name: Of the argument.
+        count: How many there must be; any number of them for None.
+        example: What the sentence offers.
+
+    Raises:
+        InputError: They are none.
+    """
+    try:
+        found = np.asarray(values)
+    except (TypeError, ValueError):  # of unequal length
+        found = np.asarray(None)
+    plain = found.dtype.kind in "biuf" and found.ndim == 1 and count in (None, len(found))
+    if plain and np.all(np.isfinite(found)):
+        return found.astype(float)
+    many = "numbers" if count is None else "one number" if count == 1 else f"{count} numbers"
+    raise InputError(
+        f"Argument `{name}` must be {many}, finite and in a row, but is {shown(values)}"
+        f"{f' of shape {found.shape}' if found.dtype.kind in 'iuf' else ''}; give for instance {example}."
+    )
+
+
+def instance(value: Any, kind: type, name: str, hint: str) -> None:
+    """Refuses what is not of a class of this package; `hint` says where to get one."""
+    if not isinstance(value, kind):
+        raise InputError(f"Argument `{name}` must be a {kind.__name__}, but is {shown(value)}; {hint}.")
 
 
 def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
@@ -111,12 +154,28 @@ def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
     )
 
 
+def yes_or_no(value: Any, name: str) -> bool:
+    """True or False; nothing else that may be taken for one of them."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    raise InputError(f"Argument `{name}` must be True or False, but is {shown(value)}; give one of them.")
+
+
+def entries(value: Any) -> tuple[Any, ...] | None:
+    """What a sequence holds; None for a text, for names with values and for what is no sequence."""
+    if isinstance(value, str | bytes | Mapping):
+        return None
+    try:
+        return tuple(value)
+    except TypeError:
+        return None
+
+
 def names(value: Any, name: str) -> tuple[str, ...]:
     """Several names in a sequence; one alone is none of these, as its letters would count."""
-    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
-        listed = tuple(value)
-        if all(isinstance(entry, str) for entry in listed):
-            return listed
+    listed = entries(value)
+    if listed is not None and all(isinstance(entry, str) for entry in listed):
+        return listed
     hint = f"write [{value!r}]" if isinstance(value, str) else "give for instance ['hub']"
     raise InputError(f"Argument `{name}` must be a list of names, but is {shown(value)}; {hint}.")
 
@@ -135,7 +194,7 @@ def progress(given: Any) -> Callable[[str], Any]:
 
 def seed(value: Any) -> Any:
     """A whole number from 0, or a generator of NumPy."""
-    return value if isinstance(value, np.random.Generator) else whole(value, "seed", 0)
+    return value if isinstance(value, np.random.Generator) else whole(value, "seed", 0, math.inf)
 
 
 def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:

@@ -197,7 +197,7 @@ def window_starts(recording: Sampled, seconds: float) -> tuple[Int[np.ndarray, "
             last.
     """
     N, m, seconds = recording.N, recording.n_init, positive(seconds, "seconds")
-    width = min(N, max(round(seconds / recording.Ts), 2 * m))
+    width = min(N, max(round(min(seconds / recording.Ts, N)), 2 * m))
     starts = np.arange(0, max(N - 2 * m, 1), width)
     return starts, max(width, N - int(starts[-1]))
 

@@ -1,6 +1,7 @@
 """A strict JAX session, types checked at run time, and the measured recordings where they are available."""
 
 import contextlib
+import gc
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,12 @@ enable_compilation_cache(Path(__file__).resolve().parents[1] / ".pytest_cache" /
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 if BESIDE.is_dir():
     os.environ.setdefault(FOLDER_VARIABLE, str(BESIDE))
+
+
+def pytest_collection_finish() -> None:
+    """What is there before the first test stays, so that no search of garbage need go through it."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -280,9 +280,11 @@ def test_a_cluster_finishes_though_a_worker_is_killed(scheduler, tmp_path) -> No
     running = lambda: (room / "running").read_text().split() if (room / "running").exists() else []  # noqa: E731
 
     def kill() -> None:
-        until(lambda: len(set(running())) == 2)
-        os.kill(int(running()[0]), signal.SIGKILL)
-        (room / "go").touch()
+        try:
+            until(lambda: len(set(running())) == 2)
+            os.kill(int(running()[0]), signal.SIGKILL)
+        finally:  # nobody waits for a thread that has failed
+            (room / "go").touch()
 
     killer = threading.Thread(target=kill)
     killer.start()
@@ -305,8 +307,10 @@ def test_a_scheduler_that_dies_is_said_in_one_sentence(moment, scheduler, tmp_pa
     capfd.readouterr()
 
     def kill() -> None:
-        until((room / "running").exists)
-        os.kill(number, signal.SIGKILL)
+        try:
+            until((room / "running").exists)
+        finally:  # nobody waits for a thread that has failed
+            os.kill(number, signal.SIGKILL)
 
     if moment == "between recordings":
         (room / "go").touch()

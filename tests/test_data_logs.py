@@ -14,6 +14,7 @@ import pytest
 
 from rotflex_jax.cli import main
 from rotflex_jax.data import load
+from rotflex_jax.data.matlab import StoredObjects
 from rotflex_jax.errors import InputError
 
 N = 80
@@ -162,7 +163,9 @@ def test_a_timeseries_without_its_step_is_left_out_and_named(tmp_path):
     refused(path, r"objects that only MATLAB reads .* \(timeseries\): save")
 
 
-def dataset(path: Path, names=tuple(SIGNALS), deep: bool = False, within: bool = False) -> Path:
+def dataset(
+    path: Path, names=tuple(SIGNALS), deep: bool = False, within: bool = False, again: int = 0
+) -> Path:
     """A file with a Simulink Dataset as another implementation of MATLAB's objects writes it.
 
     Args:
@@ -170,6 +173,7 @@ def dataset(path: Path, names=tuple(SIGNALS), deep: bool = False, within: bool =
         names: Of the signals.
         deep: Whether the signals stand in an object of the Dataset's own.
         within: Whether the Dataset stands in an object with the outputs of a simulation.
+        again: How many objects, one in the other, lead to the Dataset twice each.
     """
     matio = pytest.importorskip("matio")
     from matio.utils import MatlabOpaque
@@ -188,6 +192,8 @@ def dataset(path: Path, names=tuple(SIGNALS), deep: bool = False, within: bool =
     if deep:
         elements = {"Storage_": MatlabOpaque(elements, f"{kind}.Storage.RamDatasetStorage")}
     found = MatlabOpaque({"Name": "logsout", **elements}, f"{kind}.Dataset")
+    for _ in range(again):
+        found = MatlabOpaque({"First": found, "Second": found}, f"{kind}.Dataset")
     variables = {"log": found}
     if within:
         variables = {"out": MatlabOpaque(variables, "Simulink.SimulationOutput")}
@@ -203,6 +209,21 @@ def test_a_dataset_of_simulink_is_read_by_the_names_of_its_signals(tmp_path, dee
     start = "out" if within else "log"
     exact(load(path, input=f"{start}.voltage.Data", outputs=(f"{start}.theta.Data", f"{start}.alpha.Data")))
     refused(path, rf"{start}\.voltage\.Data", input="volts", outputs=("theta", "alpha"))
+
+
+@pytest.mark.parametrize("again", [1, 12])
+def test_a_signal_that_is_reached_twice_is_one_signal(tmp_path, again, monkeypatch):
+    """Twelve objects that lead twice each to the next are 4096 ways to each signal."""
+    path = dataset(tmp_path / "run.mat", again=again)
+    read, properties = [], StoredObjects.properties
+
+    def counted(objects, reference):
+        read.append(reference)
+        return properties(objects, reference)
+
+    monkeypatch.setattr(StoredObjects, "properties", counted)
+    exact(load(path, input="log.voltage.Data", outputs=("log.theta.Data", "log.alpha.Data")))
+    assert len(read) < 200
 
 
 def test_a_dataset_with_two_signals_of_one_name_is_left_out_and_named(tmp_path):

@@ -13,7 +13,7 @@ from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
 from rotflex_jax.cli import main, terminal
-from rotflex_jax.cli.stopping import RoundsSoFar
+from rotflex_jax.cli.rounds import RoundsSoFar
 from rotflex_jax.discover.checkpoint import TimeLeft, beginning, digest_of_search
 from rotflex_jax.discover.validation import Horizons
 from rotflex_jax.errors import InputError

@@ -1,13 +1,16 @@
 """Errors that are put somewhere are found there, and errors that are nowhere are found nowhere."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
+import rotflex_jax as rf
 from rotflex_jax.discover import locate
-from rotflex_jax.discover.localise import condition_sets
+from rotflex_jax.discover.localise import condition_sets, missing_acceleration
 from rotflex_jax.errors import InputError
-from rotflex_jax.joints import paper
+from rotflex_jax.joints import paper, xl330_pendulum
 from rotflex_jax.recording import Recording
 
 NOISE = {"theta": 1e-4, "alpha": 1e-4}
@@ -224,6 +227,52 @@ def test_one_channel_and_noise_as_an_array() -> None:
     told = locate(rec, e, ("theta",), np.array([1e-4]))
     assert told[0].kind == "deflection"
     assert "while theta is beyond ±" in told[0].statement
+
+
+@pytest.mark.parametrize("named", [True, False], ids=["by the machine", "by its unit"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_current_is_no_motion(place: int, named: bool) -> None:
+    """Beside a current, wherever it stands among the channels, the angle alone tells speed and deflection."""
+    both = recording()
+    rng = np.random.default_rng(5)
+    current, theta = smooth(rng, both.N, 3.0, both.Ts), both.channel("theta")
+    order = [theta, current] if place else [current, theta]
+    names, units = ("theta", "current"), ("rad", "A")
+    names, units = (names, units) if place else (names[::-1], units[::-1])
+    rec = Recording(u=both.u, y=np.column_stack(order), Ts=both.Ts, channels=names, units=units)
+    e = 1e-3 * rng.standard_normal((rec.N, 2))
+    slow = np.abs(np.gradient(theta, rec.Ts)) < 0.5
+    e[slow] *= 6.0
+    machine = xl330_pendulum() + rf.effects.CurrentMeter("hub")
+    outputs = {c: ("hub", "current") if c == "current" else "hub" for c in names}
+    machine = dataclasses.replace(machine, outputs=outputs) if named else None
+    told = locate(rec, e, names, dict.fromkeys(names, 1e-4), machine)
+    conditions = [v for v in told if v.kind in ("speed", "deflection", "reversal")]
+    assert {v.channel for v in conditions} == set(names)
+    for v in conditions:
+        assert " A" not in v.statement and "current moves" not in v.statement
+        assert v.channel != "current" or "arises" not in v.statement  # its error is not carried on
+    assert any("while the hub turns slower than" in v.statement for v in conditions)
+    # Of a recording of readings alone nothing turns or deflects.
+    alone = Recording(u=both.u, y=current, Ts=both.Ts, channels="current", units="A")
+    assert condition_sets(alone, ("current",), {"current": 1e-4}, None) == ()
+
+
+def test_the_error_of_a_speed_arises_with_its_first_derivative() -> None:
+    """Kicks to the speed at reversals decay slowly, so that the error lies everywhere and arises there."""
+    both = recording()
+    speed = smooth(np.random.default_rng(6), both.N, 0.8, both.Ts)
+    rec = Recording(u=both.u, y=speed, Ts=both.Ts, channels="tacho", units="rad/s")
+    kicks = np.zeros(rec.N)
+    kicks[np.flatnonzero(speed[1:] * speed[:-1] < 0) + 5] = 1e-3 * np.random.default_rng(7).choice(
+        [-1.0, 1.0]
+    )
+    error = lfilter([1.0], [1.0, -0.999], kicks)
+    (told, *_) = locate(rec, error, ("tacho",), [1e-6])
+    assert told.kind == "reversal" and "arises within" in told.statement
+    energy, seen = missing_acceleration(error, rec, order=1)
+    share = np.sum(energy[seen] ** 2 * (np.abs(speed[seen]) < 0.3)) / np.sum(energy[seen] ** 2)
+    assert share > 0.9
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-3])

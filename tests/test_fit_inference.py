@@ -282,3 +282,11 @@ def test_one_residual_more_than_parameters_has_the_textbook_variance() -> None:
     J = np.linalg.svd(e[:, None])[0][:, 1:]  # orthonormal, and orthogonal to the residuals
     variance = robust_covariance(J[:, None], e[:, None], np.zeros(5, int))
     np.testing.assert_allclose(variance, e @ e * np.eye(4), atol=1e-12)
+
+
+@pytest.mark.parametrize("N", range(1, 20))
+def test_few_residuals_are_taken_for_uncorrelated(N: int) -> None:
+    e = np.random.default_rng(N).normal(size=(N, 2))
+    assert correlation_length(e) == correlation_length(np.zeros((N, 2))) == 1
+    H = np.eye(1)
+    assert np.isfinite(sandwich(by_recording(np.ones((N, 2, 1)), e, np.zeros(N)), N * H)).all()

@@ -170,6 +170,7 @@ NO_RECORDINGS = [
     (3, "is 3; read a file"),
     ([], "No recording was given"),
     ([RUN, None], "has None as entry 2"),
+    (np.array(None), "is an? ndarray; read a file"),
     ([Path("a.csv"), RUN], "has a PosixPath as entry 1"),
     (U, "as entry 1"),
 ]
@@ -187,6 +188,8 @@ PROCESS_NOISE = [
 NO_NUMBER = [(NAN, "nan"), ("a", "'a'"), (None, "None")]
 NO_COUNT = [(0.5, ""), (True, ""), ("many", ""), (NAN, ""), ([1], "")]
 COUNTS = [(0, "is 0"), (1.5, "is 1.5"), (NAN, "is nan"), (-1, "is -1"), ("many", "is 'many'")]
+COUNTS += [(1e308, "from [0-9]+ to 2.14748e[+]09, but is 1e[+]308")]
+NO_DEVICES = [(True, "a list of devices, but is True"), ("cpu", "but is 'cpu'"), ([1], "but is a list")]
 
 BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("fit", "mechanism"): NO_MODEL,
@@ -200,7 +203,11 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         (("x",), "'x' was to be local"),
         ("hub.inertia.inertia", "list of names"),
         (3, "is 3"),
+        (np.array(None), "is an? ndarray"),
     ],
+    ("fit", "throw"): [(np.zeros(2), "True or False, but is an? ndarray"), (1, "but is 1")],
+    ("fit", "devices"): NO_DEVICES,
+    ("many_starts", "devices"): NO_DEVICES,
     ("fit", "minimiser"): [(3, "a solver of optimistix, but is 3")],
     ("fit", "progress"): NO_PROGRESS,
     ("many_starts", "mechanism"): NO_MODEL,
@@ -259,7 +266,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         ),
         ([(rf.effects.SensorBias, "hub")], "SensorBias .* at 'hub', but .*'theta', 'alpha'"),
         ([("coulomb", "hub")], "pairs of an effect's class and a port, but has a tuple"),
-        ("coulomb", "but has 'c'"),
+        ("coulomb", "but has 'coulomb'"),
         ([rf.effects.Coulomb], "has the class Coulomb"),
         (3, "has 3"),
     ],
@@ -288,7 +295,13 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("least_squares", "basis"): [(3, "but int was given")],
     ("least_squares", "recordings"): NO_RECORDINGS,
     ("least_squares", "channel"): [("x", "no channel 'x'")],
-    ("least_squares", "ridge"): [(NAN, "is nan"), (-1, "is -1"), ("x", "is 'x'")],
+    ("least_squares", "ridge"): [
+        (NAN, "is nan"),
+        (-1, "is -1"),
+        ("x", "is 'x'"),
+        (np.zeros(2), "an? ndarray"),
+    ],
+    ("forward_regression", "channel"): [(np.zeros(2), "no channel an? ndarray"), (3, "no channel 3")],
     ("least_squares", "skip"): [(-1, "is -1"), (NAN, "is nan"), ("a", "is 'a'"), (10**9, "are left out")],
     ("forward_regression", "recordings"): NO_RECORDINGS,
     ("forward_regression", "terms"): COUNTS,
@@ -352,10 +365,28 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("credible_models", "fit"): [(None, "is None"), (3, "is 3")],
     ("controller_to_c", "prefix"): [("1a", "begins no name in C"), (3, "begins no name in C")],
     ("locate", "recording"): NO_RECORDINGS[:3],
-    ("locate", "residual"): [(Y[:5], "a finite number for each"), (np.full_like(Y, NAN), "400 of them")],
+    ("locate", "residual"): [
+        (Y[:5], "a finite number for each"),
+        (np.full_like(Y, NAN), "400 of them"),
+        *((value, "a finite number for each") for value in (None, "x", 1j, [[1, 2], [3]])),
+    ],
+    ("locate", "channels"): [
+        (None, "is None"),
+        ("theta", "write .'theta'."),
+        (("x", "alpha"), "no channel 'x'"),
+    ],
+    ("locate", "noise"): [
+        *((value, "from 0 for each of the channels theta, alpha") for value in (None, [1e-3], "x", [-1, 1])),
+        ({"theta": NAN}, "from 0 for each"),
+    ],
+    ("locate", "mechanism"): [("paper", "must be a Mechanism, but is 'paper'"), (MODEL, "is a Model")],
     ("locate", "window_seconds"): NO_SECONDS,
     ("next_experiment", "model"): NO_MODEL,
-    ("next_experiment", "a"): [("x", "'x'"), ("delay@input", "delay")],
+    ("next_experiment", "a"): [
+        ("x", "'x'"),
+        ("delay@input", "delay"),
+        (np.zeros(2), "an? ndarray, but needs"),
+    ],
     ("next_experiment", "limits"): [(5.0, r"must be Limits\(voltage=...\), but is 5.0")],
     ("next_experiment", "seconds"): [(NAN, "of nan s"), (0, "of 0 s"), ("a", "of 'a' s")],
     ("next_experiment", "Ts"): [(NAN, "of nan s"), (0, "period of 0 s")],
@@ -420,6 +451,17 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("arena.score", "progress"): NO_PROGRESS,
     ("fleet", "degres"): [(True, "did you mean degrees")],
     ("load", "source"): [(None, "NoneType was given"), (3, "int was given")],
+    ("load", "accept"): [(np.zeros(2), "has an? ndarray"), (3, "has 3")],
+    ("load, from a frame", "input"): [(3, "`input` must be a word, but is 3"), (np.zeros(2), "an? ndarray")],
+    ("load, from a frame", "time"): [(True, "must be a word, but is True"), (b"x", "a bytes")],
+    ("load, from a frame", "time_unit"): [([], "must be a word, but is a list"), ("h", "one of s, ms, us")],
+    ("load, from a frame", "degrees"): [(np.zeros(2), "True or False"), ("yes", "is 'yes'")],
+    ("load, from a frame", "arm_absolute"): [(np.zeros(2), "True or False"), (1, "is 1")],
+    ("load, from a frame", "units"): [
+        (True, "by the names of channels, but is True"),
+        ({"theta": 3}, "is a dict"),
+    ],
+    ("load, from a frame", "resample"): [(np.zeros(2), "an? ndarray"), (-1, "is -1")],
     ("load, from a frame", "counts"): [(c, "`counts` must be the counts of one turn") for c, _ in NO_COUNT],
     ("load, resampled", "Ts"): [(0.02, "`resample` and Ts=0.02 were both given"), (NAN, "both given")],
     ("enable_fast_loops", "limit"): COUNTS,
@@ -445,7 +487,12 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("Mechanism", "trusted"): [(("x",), "'x' was named"), ((3,), "a list of names")],
     ("Model", "mechanism"): [*NO_MODEL, (joints.paper(arm_inertia=0.0), "inertia")],
     ("Model", "solver"): [(3, "`solver` must be .* but is 3")],
-    ("Model", "gates"): [((1.0,), "for each of the 6 effects"), ((NAN,) * 6, "a finite number")],
+    ("Model", "gates"): [
+        ((1.0,), r"be 6 numbers, finite and in a row, but is a tuple of shape \(1,\)"),
+        ((NAN,) * 6, "finite"),
+        (True, "is True"),
+        (U, r"of shape \(200,\)"),
+    ],
     ("Recording", "n_init"): [(NAN, "is nan"), (INF, "is inf"), ("a", "is 'a'"), ([1, 2], "is a list")],
     ("Recording", "Ts"): [([[1, 2], [3]], "is a list"), ([0.1, 0.2], "is 2 values"), (True, "is True")],
     ("Recording", "start"): [(NAN, "is nan"), ("a", "is 'a'"), (None, "is None")],
@@ -467,7 +514,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("Recording", "u"): [(None, "`u` must hold real numbers"), ({}, "must hold real numbers")],
     ("Recording.split", "share"): [(NAN, "is nan"), ("a", "is 'a'"), (INF, "is inf"), (2, "between 0 and 1")],
     ("Recording.split", "seconds"): [(NAN, "is nan"), (0, "would have 0 of 200")],
-    ("Recording.decimate", "k"): [*COUNTS, (None, "is None"), (INF, "is inf")],
+    ("Recording.decimate", "k"): [*COUNTS[:-1], (None, "is None"), (INF, "is inf")],
     ("Recording.slice", "i"): [
         (0.5, "from 0.5 to 60"),
         (NAN, "from nan"),
@@ -502,6 +549,12 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("export.text", "model"): NO_MODEL,
     ("export.state_space", "model"): NO_MODEL,
     ("export.state_space", "Ts"): NO_SECONDS,
+    ("export.state_space", "positions"): [
+        ([1.0], "be 2 numbers"),
+        (1j, "is 1j"),
+        ("", "is ''"),
+        ([0, NAN], "list"),
+    ],
     ("export.state_space", "voltage"): NO_NUMBER,
     **{
         (f"export.to_{form}", argument): rows
@@ -528,7 +581,18 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("kernels.local_kernels", "model"): NO_MODEL,
     ("kernels.local_kernels", "channel"): [("x", "'x' were requested")],
     ("kernels.local_kernels", "memory"): COUNTS,
-    ("kernels.local_kernels", "Ts"): [(0, "."), (NAN, ".")],
+    ("kernels.local_kernels", "Ts"): NO_SECONDS,
+    ("kernels.local_kernels", "settle"): [(-1, "is -1"), ("a", "'a'"), (1e99, "settle / Ts")],
+    ("kernels.local_kernels", "voltage"): NO_NUMBER,
+    ("kernels.average_kernels", "data"): [
+        (None, "NoneType|None"),
+        (1j, "complex"),
+        (U, "`Ts` must be a finite number above 0 .s., but is None; give for instance 0.002, or a recording"),
+    ],
+    ("kernels.average_kernels", "autocovariance"): [
+        ("x", "10 numbers.* is 'x'"),
+        (U, "10 numbers.*lags 0 to 9"),
+    ],
     ("kernels.average_kernels", "model"): NO_MODEL,
     ("kernels.average_kernels", "blocks"): COUNTS,
     ("kernels.average_kernels", "reach"): COUNTS,
@@ -546,9 +610,15 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("noise", "bandwidth"): NO_SECONDS,
     ("noise", "seed"): [(-1, "is -1"), ("a", "is 'a'"), (0.5, "is 0.5")],
     ("multisine", "band"): [((NAN, 3), "nan to 3 Hz"), (3, "is 3"), ("ab", "is 'ab'"), ((3, 1), "3 to 1 Hz")],
-    ("multisine", "periods"): [(0, "is 0"), (NAN, "is nan"), (1.5, "a multiple of `periods`")],
-    ("prbs", "hold"): NO_SECONDS,
-    ("steps", "hold"): NO_SECONDS,
+    ("multisine", "periods"): [
+        (0, "is 0"),
+        (NAN, "is nan"),
+        (1.5, "is 1.5"),
+        (None, "is None"),
+        (7, "a multiple"),
+    ],
+    ("prbs", "hold"): [*NO_SECONDS, (1e308, "a number of usual size above 0, but is 1e[+]308")],
+    ("steps", "hold"): [*NO_SECONDS, ([], "is a list")],
     ("steps", "amplitude"): NO_SECONDS,
     ("sweep", "band"): [((NAN, 1), "nan to 1 Hz"), (None, "is None")],
     ("pulse", "amplitude"): NO_NUMBER,
@@ -582,6 +652,15 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         ("theta+theta", "but is 'theta.theta'"),
     ],
     ("joints.paper", "tied"): [("yes", "needs True or False"), (1, "needs True or False")],
+    ("close_loop", "controller"): [
+        (None, "must be a Controller, but is None; make one"),
+        (JOINT, "a Mechanism"),
+    ],
+    ("assess", "controller"): [(None, "must be a Controller, but is None")],
+    ("controller_to_c", "controller"): [("x", "must be a Controller, but is 'x'")],
+    ("adaptive.identify", "filter"): [(None, "must be a AdaptiveFilter, but is None"), ("rls", "is 'rls'")],
+    ("joints.quanser_2010", "arm"): [([], "given a list"), (4, "given 4")],
+    ("joints.quanser_2010", "spring"): [([], "given a list"), ("x", "given 'x'")],
     ("joints.quanser_2010", "sensors"): [(["x"], "but is 'x'")],
     ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
 }
@@ -621,6 +700,12 @@ def test_whole_numbers_may_be_floats() -> None:
     assert RUN.decimate(2.0).N == RUN.decimate(2).N == 100
     assert RUN.slice(np.int64(0), 60).N == 60
     assert rf.Recording(u=U, y=Y, Ts=np.array([[0.002]]), n_init=np.float64(20)).n_init == 20
+
+
+def test_windows_longer_than_any_recording_are_the_whole_recording() -> None:
+    for seconds in (1e308, 1e9):
+        starts, longest = metrics.window_starts(RUN, seconds)
+        assert (starts.tolist(), longest) == ([0], N)
 
 
 def test_counts_may_be_a_number_of_numpy() -> None:

@@ -20,7 +20,7 @@ from rotflex_jax.batch import storage
 from rotflex_jax.batch.result import Fleet, RecordingRow
 from rotflex_jax.batch.task import record
 from rotflex_jax.cli import app, terminal
-from rotflex_jax.cli.stopping import RoundsSoFar
+from rotflex_jax.cli.rounds import RoundsSoFar
 from rotflex_jax.data import save_csv
 from rotflex_jax.discover.checkpoint import milestone
 from rotflex_jax.errors import InputError
@@ -247,6 +247,59 @@ def test_stopped_at_any_moment_with_the_rounds_that_were_finished(where: str, tm
     ]
     assert (tmp_path / "found.json").read_text() == "of an earlier search"
     assert not (tmp_path / "half.part").exists()
+
+
+STOPPED_IN_MAIN_THREAD = """
+import hashlib, importlib.machinery, os, signal, sys, threading
+from rotflex_jax.cli import main
+from rotflex_jax.cli.stopping import STOP
+
+def without_end():
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 20_000_000)  # takes no signal for some seconds
+    while True: pass
+
+heard = STOP.listen
+def listen():
+    heard()
+    HOLD
+STOP.listen = listen
+sys.argv = ["rotflex", "effects"]
+main()
+"""
+# What the main thread holds while the other one ends the process.
+HELD = {
+    "a module that is imported": """
+    import multiprocessing
+    import rotflex_jax.text.files as files
+    loader = importlib.machinery.SourceFileLoader("multiprocessing", multiprocessing.__file__)
+    execute = loader.exec_module
+    loader.exec_module = lambda module: (execute(module), without_end())
+    spec = importlib.machinery.ModuleSpec("multiprocessing", loader, is_package=True)
+    finder = type("Finder", (), {"find_spec": lambda name, *_: spec if name == "multiprocessing" else None})
+    sys.meta_path.insert(0, finder)
+    del sys.modules["multiprocessing"]
+    import multiprocessing""",
+    "an output that nobody reads": """
+    sys.stdout = type("Full", (), {"flush": lambda self: threading.Event().wait()})()
+    without_end()""",
+}
+
+
+@pytest.mark.parametrize("held", HELD)
+def test_stopped_while_the_main_thread_holds(held: str, tmp_path: Path) -> None:
+    done = in_a_process(STOPPED_IN_MAIN_THREAD.replace("HOLD", HELD[held]), tmp_path)
+    assert (done.returncode, done.stderr) == (130, "rotflex: stopped\n")
+
+
+def test_the_signal_is_heard_before_anything_large_is_loaded(tmp_path: Path) -> None:
+    loaded = in_a_process(
+        "import sys, rotflex_jax.cli.stopping\nprint(*sys.modules)", tmp_path
+    ).stdout.split()
+    assert "rotflex_jax.cli.stopping" in loaded
+    own = {name for name in loaded if name.startswith("rotflex_jax")}
+    assert own == {"rotflex_jax", "rotflex_jax.cli", "rotflex_jax.cli.stopping"}
+    assert not {"numpy", "jaxtyping", "asyncio", "importlib.metadata", "json"} & set(loaded)
 
 
 def test_stopped_while_it_is_loaded(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from rotflex_jax.adaptive.filter import AdaptiveFilter, as_samples, finite, regr
 from rotflex_jax.adaptive.lattice import VolterraLattice
 from rotflex_jax.basis import Basis, Delays, Volterra
 from rotflex_jax.basis.bank import require_basis
-from rotflex_jax.checks import signal
+from rotflex_jax.checks import instance, signal
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.series import Series
 from rotflex_jax.recording import Recording
@@ -305,6 +305,7 @@ def identify(
         InputError: no such channel, or a basis that is not the one that the filter is made for.
     """
     recording = single(recording, "recording")
+    instance(filter, AdaptiveFilter, "filter", "give for instance rotflex_jax.adaptive.RLS()")
     y, n = recording.channel(channel), recording.n_init
     if filter.from_input:
         done = run(filter, _own_input(filter, basis, recording)[n:], y[n:], keep_every=keep_every)

@@ -452,7 +452,7 @@ def score(
     if twice:
         raise InputError(f"The method {shown(twice[0])} was given twice; give each once.")
     records = whole(records, "records", 1)
-    seed = secrets.randbits(31) if seed is None else whole(seed, "seed", 0)
+    seed = secrets.randbits(31) if seed is None else whole(seed, "seed", 0, math.inf)
     seconds = number(seconds, "seconds", least=4.0, unit="s", example="20.0")
     limit = number(limit, "limit", above=0, unit="s", example="600.0")
     say = checked_progress(progress)

@@ -125,8 +125,7 @@ def _pickled(model: Model, search: Search) -> bytes:
 def _sources(recordings: Any) -> list[Source]:
     """Recordings and paths of files."""
     wrong = [recordings]
-    if isinstance(recordings, Iterable) and not isinstance(recordings, str | bytes):
-        found = list(recordings)
+    if (found := checks.entries(recordings)) is not None:
         wrong = [r for r in found if not isinstance(r, Recording | str | os.PathLike)]
         if not wrong:
             return [r if isinstance(r, Recording) else Path(r) for r in found]
@@ -143,10 +142,7 @@ def _check(
     if not sources:
         raise InputError("No recording was given, but a fleet needs one or more; give files or recordings.")
     checks.number(split, "split", above=0, below=1, example="0.7")
-    if not isinstance(pages, bool):
-        raise InputError(
-            f"Argument `pages` must be True or False, but is {shown(pages)}; say whether each has a page."
-        )
+    checks.yes_or_no(pages, "pages")
     if workers is not None:
         checks.whole(workers, "workers", 0)
     if not (scheduler is None or isinstance(scheduler, str)):

@@ -21,7 +21,8 @@ from rotflex_jax.cli.experiment import experiment
 from rotflex_jax.cli.models import export, simulate
 from rotflex_jax.cli.recordings import Columns, joint_for, reads_files
 from rotflex_jax.cli.reproduce import reproduce
-from rotflex_jax.cli.stopping import STOPPED, RoundsSoFar
+from rotflex_jax.cli.rounds import RoundsSoFar
+from rotflex_jax.cli.stopping import STOPPED
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file

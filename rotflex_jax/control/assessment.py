@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from rotflex_jax.checks import number, seed as checked_seed, shown, whole
+from rotflex_jax.checks import instance, number, seed as checked_seed, shown, whole
 from rotflex_jax.control.closed_loop import ClosedLoop, run_loop
 from rotflex_jax.control.design import Controller
 from rotflex_jax.errors import InputError
@@ -158,6 +158,7 @@ def assess(
                 f"The model {name!r} is {shown(model)}, but a controller is assessed on models; give a "
                 "Model, a mechanism or a fit."
             )
+    instance(controller, Controller, "controller", "make one with rotflex_jax.controller")
     motion = controller.plan(reference)
     longer = np.append(motion.reference, np.full(round(hold / controller.Ts), motion.reference[-1]))
     motion = controller.plan(longer)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from rotflex_jax.checks import shown
+from rotflex_jax.checks import instance, shown
 from rotflex_jax.control.design import Controller
 from rotflex_jax.errors import InputError
 from rotflex_jax.export.c_code import in_c_comment
@@ -41,6 +41,7 @@ def controller_to_c(
         raise InputError(
             f"The prefix {shown(prefix)} begins no name in C; give letters, digits and underscores."
         )
+    instance(controller, Controller, "controller", "make one with rotflex_jax.controller")
     c, big = controller, prefix.upper()
     m, channels = len(c.B), len(c.C)
     mechanism = c.model.mechanism

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from rotflex_jax.checks import number, seed as checked_seed, shown
+from rotflex_jax.checks import instance, number, seed as checked_seed, shown
 from rotflex_jax.control.design import Controller, PlannedMotion
 from rotflex_jax.effects.base import Actuation
 from rotflex_jax.errors import InputError
@@ -274,6 +274,7 @@ def close_loop(
             is no signal.
     """
     noise = number(noise, "noise", least=0.0, unit="rad", example="0.001")
+    instance(controller, Controller, "controller", "make one with rotflex_jax.controller")
     return run_loop(controller, plant, controller.plan(reference), noise, seed)
 
 

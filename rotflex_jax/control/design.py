@@ -442,9 +442,9 @@ def _placed(A: np.ndarray, B: np.ndarray, poles: Any, Ts: float) -> np.ndarray:
     """Gains for poles in continuous time."""
     try:
         wanted = np.asarray(poles, complex)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         wanted = np.zeros(0, complex)
-    pairs = np.sort_complex(wanted)
+    pairs = np.sort_complex(wanted.ravel())
     if wanted.shape != (len(A),) or not np.all(np.isfinite(wanted)) or np.any(np.real(wanted) >= 0):
         raise InputError(
             f"Argument `poles` must be {len(A)} poles with negative real parts [1/s], one for each state, "

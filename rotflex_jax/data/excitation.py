@@ -13,7 +13,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.checks import number, positive, real, seed as checked_seed, shown
+from rotflex_jax.checks import (
+    LARGEST,
+    LARGEST_COUNT,
+    SMALLEST,
+    number,
+    positive,
+    real,
+    seed as checked_seed,
+    shown,
+    whole,
+)
 from rotflex_jax.errors import InputError
 
 Voltage = Float[np.ndarray, " N"]
@@ -79,12 +89,12 @@ def multisine(
     1.0
     """
     _check_grid(N, Ts)
-    _check_positive(rms=rms, periods=float(periods))
+    _check_positive(rms=rms)
     _check_band(band, Ts)
-    if int(periods) != periods or N % periods:
+    if N % whole(periods, "periods", 1):
         raise InputError(
-            f"Argument `N` must be a multiple of `periods`, a whole number, but is {N} for "
-            f"{periods} periods; change one of them."
+            f"Argument `N` must be a multiple of `periods`, but is {N} for {periods} periods; change one "
+            "of them."
         )
     P = int(N // periods)
     harmonics = np.arange(np.ceil(band[0] * P * Ts - 1e-9), np.floor(band[1] * P * Ts + 1e-9) + 1)
@@ -129,7 +139,7 @@ def prbs(N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed:
 
     _check_grid(N, Ts)
     _check_positive(amplitude=amplitude, hold=hold)
-    samples = max(1, round(hold / Ts))
+    samples = max(1, round(min(hold / Ts, N)))
     order = max(6, int(np.ceil(np.log2(-(-N // samples) + 1))))
     bits, _ = max_len_seq(order)
     bits = np.roll(bits, np.random.default_rng(checked_seed(seed)).integers(len(bits)))
@@ -159,11 +169,11 @@ def steps(
     5
     """
     _check_grid(N, Ts)
-    times = tuple(hold) if isinstance(hold, Sequence) and not isinstance(hold, str) else (hold,)
+    times = tuple(hold) if isinstance(hold, Sequence) and not isinstance(hold, str) and hold else (hold,)
     shortest, longest = sorted(positive(time, "hold", "s", "(0.15, 0.8)") for time in (times * 2)[:2])
     _check_positive(amplitude=amplitude)
     rng = np.random.default_rng(checked_seed(seed))
-    most = -(-N // max(1, round(shortest / Ts)))
+    most = -(-N // max(1, round(min(shortest / Ts, N))))
     times = np.maximum(1, np.round(rng.uniform(shortest, longest, most) / Ts)).astype(int)
     return np.repeat(rng.uniform(-amplitude, amplitude, most), times)[:N]
 
@@ -227,7 +237,7 @@ INPUTS: dict[str, Callable[..., Voltage]] = {
 
 def _check_grid(N: int, Ts: float) -> None:
     count, period = real(N), real(Ts)
-    if not (1 <= count < np.inf and count == int(count) and 0 < period < np.inf):
+    if not (1 <= count <= LARGEST_COUNT and count == int(count) and SMALLEST <= period <= LARGEST):
         raise InputError(
             "Arguments `N` and `Ts` must be a number of samples and a sampling period in seconds, "
             f"but are {shown(N)} and {shown(Ts)}; give for instance 5000 and 0.002."

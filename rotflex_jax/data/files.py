@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rotflex_jax.checks import shown
+from rotflex_jax.checks import positive, shown, yes_or_no
 from rotflex_jax.data.binary import (
     table_from_frame,
     table_from_mat,
@@ -184,6 +184,26 @@ def readable_file(source: Any) -> Path:
     return path
 
 
+def _check_options(words: Mapping[str, Any], choices: Mapping[str, Any], units: Any, resample: Any) -> None:
+    """Refuses options of `load` that are no words, no choices, no units by name and no period."""
+    for name, word in words.items():
+        if not (word is None or isinstance(word, str)):
+            raise InputError(
+                f"Argument `{name}` must be a word, but is {shown(word)}; give for instance "
+                f"{name}={'ms' if name == 'time_unit' else 't'!r}."
+            )
+    for name, choice in choices.items():
+        yes_or_no(choice, name)
+    pairs = units.items() if isinstance(units, Mapping) else [(None, None)] * (units is not None)
+    if not all(isinstance(word, str) for pair in pairs for word in pair):
+        raise InputError(
+            f"Argument `units` must be units by the names of channels, but is {shown(units)}; give for "
+            "instance units={'theta': 'rad'}."
+        )
+    if not (resample is None or isinstance(resample, str)):
+        positive(resample, "resample", "s", "'auto'")
+
+
 def load(
     source: Any,
     *,
@@ -248,6 +268,12 @@ def load(
     array([0.01745329])
     """
     accepted = acceptable(accept)
+    _check_options(
+        {"input": input, "time": time, "time_unit": time_unit},
+        {"degrees": degrees, "arm_absolute": arm_absolute},
+        units,
+        resample,
+    )
     if resample is not None and Ts is not None:
         raise InputError(
             f"Argument `resample` and Ts={shown(Ts)} were both given, but resampling "

@@ -78,6 +78,8 @@ class StoredObjects:
         )
         self.of_object = of_object
         self.records = _records(saved), _records(plain)
+        self._signals: dict[int, Any] = {}
+        self._logged: dict[tuple[int, str], dict[str, Any]] = {}
 
     def properties(self, reference: Any) -> dict[str, Any]:
         """Values of the properties of an object that are stored with it."""
@@ -168,12 +170,18 @@ class StoredObjects:
             return _joined(self.logged(part, name, seen) for part in parts) if nested else {}
         if number in seen or len(seen) > DEEPEST_NESTING:
             raise ValueError("objects hold each other")
+        # What several ways lead to is read once: each object may refer twice to the next.
         if (kind := self.kind(value)) in self.signals:
-            return {name: self.signals[kind](value)}
+            if number not in self._signals:
+                self._signals[number] = self.signals[kind](value)
+            return {name: self._signals[number]}
         inside = self.properties(value)
         own = inside.get("Name")
         name = own if isinstance(own, str) and own else name
-        return _joined(self.logged(part, name, (*seen, number)) for part in inside.values())
+        if (number, name) not in self._logged:
+            parts = inside.values()
+            self._logged[number, name] = _joined(self.logged(part, name, (*seen, number)) for part in parts)
+        return self._logged[number, name]
 
     @property
     def signals(self) -> dict[str, Callable[[Any], Any]]:
@@ -236,7 +244,8 @@ def _joined(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
     """Signals of several objects."""
     found: dict[str, Any] = {}
     for part in parts:
-        if twice := found.keys() & part.keys():
+        # One signal may be reached by several ways.
+        if twice := {name for name in found.keys() & part.keys() if found[name] is not part[name]}:
             raise ValueError(f"two signals have the name {min(twice)!r}")
         found |= part
     return found

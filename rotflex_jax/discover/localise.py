@@ -3,12 +3,12 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
-from rotflex_jax.checks import positive
+from rotflex_jax.checks import names, positive, real, shown
 from rotflex_jax.discover.result import Where
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.inference import correlation_length
@@ -61,7 +61,7 @@ def missing_acceleration(
     """Smoothed acceleration of an error: what the model lacks at that time, not what earlier errors left.
 
     Args:
-        error: Of one channel [unit].
+        error: Of one channel that measures a motion [unit].
         recording: Gives the sampling.
         starts: Samples at which the free run started again; a jump there is no physics.
         order: Of the derivative; 1 for a channel that measures a speed.
@@ -79,6 +79,33 @@ def missing_acceleration(
     return smooth, seen
 
 
+def derivative_of(channel: str, unit: str, mechanism: Mechanism | None = None) -> int:
+    """Order of the derivative of a position that a channel measures; 2 for a reading of the motor.
+
+    Args:
+        channel: Its name.
+        unit: Of the channel; without a mechanism that has it, this tells a speed and a current.
+        mechanism: Says what the channel measures.
+
+    >>> derivative_of("theta", "rad"), derivative_of("gyro", "rad/s"), derivative_of("current", "A")
+    (0, 1, 2)
+    """
+    known = dict(zip(mechanism.channels, mechanism.quantities, strict=True)) if mechanism is not None else {}
+    if channel in known:
+        return known[channel].derivative
+    return 1 if unit.endswith("/s") else 2 if unit == "A" else 0
+
+
+def motion_channels(units: Mapping[str, str], mechanism: Mechanism | None = None) -> tuple[str, ...]:
+    """Channels that measure a position or a speed, in their order.
+
+    Args:
+        units: Channel -> its unit.
+        mechanism: Says what the channels measure.
+    """
+    return tuple(c for c, unit in units.items() if derivative_of(c, unit, mechanism) < 2)
+
+
 def condition_sets(
     recording: Recording,
     channels: Sequence[str],
@@ -87,8 +114,8 @@ def condition_sets(
 ) -> tuple[ConditionSet, ...]:
     """The sets of conditions that the motion of the recording allows; none for a recording at rest.
 
-    The first channel is taken for what turns and the second for what deflects; a single channel
-    for both.
+    The first channel that measures a motion is taken for what turns and the second for what deflects; a
+    single one for both.
 
     Args:
         recording: Measured outputs.
@@ -97,9 +124,10 @@ def condition_sets(
         mechanism: Says what the channels measure; by their names if None.
     """
     half = half_width(recording)
-    if not half:
+    moving = motion_channels({c: _unit(recording, c) for c in channels}, mechanism)
+    if not half or not moving:
         return ()
-    turning, bending = channels[0], channels[min(1, len(channels) - 1)]
+    turning, bending = moving[0], moving[min(1, len(moving) - 1)]
     speed, error, unit = _speed(recording, turning, noise.get(turning, 0.0), mechanism)
     what = _subject(turning, mechanism)
     position = smoothed(recording.channel(bending).astype(float), 2 * half + 1, 2)
@@ -109,13 +137,17 @@ def condition_sets(
         _sides(
             "deflection",
             position,
-            recording.units[recording.channels.index(bending)],
+            _unit(recording, bending),
             noise.get(bending, 0.0),
             _beyond(subject),
         ),
         _reversals(speed, error, recording.Ts, what),
     )
     return tuple(conditions for conditions in found if conditions is not None)
+
+
+def _unit(recording: Recording, channel: str) -> str:
+    return recording.units[recording.channels.index(channel)]
 
 
 def _subject(channel: str, mechanism: Mechanism | None) -> str:
@@ -129,15 +161,12 @@ def _speed(
 ) -> tuple[np.ndarray, float, str]:
     """Smoothed speed of a channel, the standard deviation of its error, and its unit."""
     window = 2 * half_width(recording) + 1
-    unit = recording.units[recording.channels.index(channel)]
-    known = dict(zip(mechanism.channels, mechanism.quantities, strict=True)) if mechanism is not None else {}
-    # The reading of a machine says what it is; without one its unit tells a speed.
-    is_speed = known[channel].derivative > 0 if channel in known else unit.endswith("/s")
-    order = 0 if is_speed else 1
+    unit = _unit(recording, channel)
+    order = 1 - derivative_of(channel, unit, mechanism)
     weights = local_polynomial(window, 2, order, recording.Ts)[window // 2]
     y = recording.channel(channel).astype(float)
     speed = smoothed(y, window, 2, order, recording.Ts)
-    return speed, noise * float(np.linalg.norm(weights)), unit if is_speed else f"{unit}/s"
+    return speed, noise * float(np.linalg.norm(weights)), f"{unit}/s" if order else unit
 
 
 def _turning(what: str, unit: str) -> dict[str, str]:
@@ -417,7 +446,8 @@ def locate(
     corrects for having tried several; quantities are compared by the rule of Benjamini and Hochberg.
 
     A free run carries an error on long after it was made. Speed, deflection and reversals are
-    therefore also compared with the acceleration of the error, which shows where it *arises*.
+    therefore also compared with the acceleration of the error, which shows where it *arises*. The error of
+    a current or a duty is not carried on; these channels tell neither speed nor deflection.
     Frequencies are compared with white sensor noise, time with an error that stays the same.
 
     Not for a few correlation lengths of data: there shifts prove nothing, and nothing is found.
@@ -442,9 +472,16 @@ def locate(
         Hochberg 1995.
     """
     recording = single(recording, "recording")
+    channels = names(channels, "channels")
+    for channel in channels:
+        recording.channel(channel)
+    if mechanism is not None and not isinstance(mechanism, Mechanism):
+        raise InputError(
+            f"Argument `mechanism` must be a Mechanism, but is {shown(mechanism)}; leave it out."
+        )
     if window_seconds is not None:
         positive(window_seconds, "window_seconds")
-    e = np.asarray(residual, dtype=float)
+    e = _numbers(residual)
     e = e[:, None] if e.ndim == 1 else e
     if e.shape != (recording.N, len(channels)) or not np.isfinite(e).all():
         raise InputError(
@@ -453,16 +490,25 @@ def locate(
             f"{np.sum(~np.isfinite(e))} of them not finite; give measured minus simulated outputs."
         )
     if not isinstance(noise, Mapping):
-        noise = dict(zip(channels, np.asarray(noise, float).tolist(), strict=True))
+        listed = np.ravel(_numbers(noise)).tolist()
+        complete = len(listed) == len(channels)
+        noise = dict(zip(channels, listed if complete else [math.nan] * len(channels), strict=True))
+    if not all(0 <= real(noise.get(c, 0.0)) < math.inf for c in channels):
+        raise InputError(
+            "Argument `noise` must have a finite number from 0 for each of the channels "
+            f"{', '.join(channels)}; give standard deviations by name or in this order."
+        )
     sets = condition_sets(recording, channels, noise, mechanism)
     found: list[ErrorShare] = []
     for channel, error in zip(channels, e.T, strict=True):
         if np.sum(error**2) <= 0.0:
             continue
-        unit = recording.units[recording.channels.index(channel)]
+        unit = _unit(recording, channel)
         found.append(in_time(channel, error, recording))
         found.append(in_frequency(channel, error, recording, unit))
-        energies = {"lies": error**2, "arises": _acceleration_energy(error, recording, window_seconds)}
+        order = 2 - derivative_of(channel, unit, mechanism)
+        lacking = _acceleration_energy(error, recording, window_seconds, order) if order else None
+        energies = {"lies": error**2, "arises": lacking}
         found += [in_conditions(channel, energies, conditions) for conditions in sets]
     notable = [
         f for f in _significant(found) if f.share >= max(f.expected + MIN_EXCESS, MIN_RATIO * f.expected)
@@ -471,12 +517,21 @@ def locate(
     return tuple(f.where for f in notable) or (_nothing_stands_out(e, channels, noise),)
 
 
+def _numbers(given: Any) -> Float[np.ndarray, "..."]:
+    """Real numbers as an array; one nan for anything else."""
+    try:
+        array = np.asarray(given)
+    except ValueError:  # rows of unequal length
+        return np.array(math.nan)
+    return array.astype(float) if array.dtype.kind in "iuf" else np.array(math.nan)
+
+
 def _acceleration_energy(
-    error: np.ndarray, recording: Recording, window_seconds: float | None
+    error: np.ndarray, recording: Recording, window_seconds: float | None, order: int
 ) -> np.ndarray | None:
     """Squared acceleration of an error (N,): where it is made, wherever it is carried to."""
     starts = [] if window_seconds is None else window_starts(recording, window_seconds)[0].tolist()
-    acceleration, seen = missing_acceleration(error, recording, starts)
+    acceleration, seen = missing_acceleration(error, recording, starts, order)
     squared = acceleration**2
     if not np.sum(squared[seen]) > 0.0:
         return None

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from rotflex_jax.checks import shown
+from rotflex_jax.checks import entries, shown
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect, Scale
 from rotflex_jax.errors import InputError
@@ -296,7 +296,7 @@ def checked_candidates(mechanism: Mechanism, candidates: Any) -> list[tuple[type
     Raises:
         InputError: Anything else.
     """
-    found = list(candidates) if isinstance(candidates, Iterable) else [candidates]
+    found = [candidates] if (given := entries(candidates)) is None else list(given)
     for pair in found:
         given = pair if isinstance(pair, tuple | list) and len(pair) == 2 else (pair, None)
         if not (isinstance(given[0], type) and issubclass(given[0], Effect) and isinstance(given[1], str)):

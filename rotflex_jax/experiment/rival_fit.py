@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.checks import shown
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
@@ -87,7 +88,7 @@ def effect_location(effect: Any) -> tuple[str, str]:
     pair = effect.split("@") if isinstance(effect, str) else effect
     if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(p, str) for p in pair)):
         raise InputError(
-            f"An effect was given as {effect!r}, but needs a name and a port; write for instance "
+            f"An effect was given as {shown(effect)}, but needs a name and a port; write for instance "
             '"delay@input", or give an effect with its parameters.'
         )
     name, port = pair

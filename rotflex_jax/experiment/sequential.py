@@ -472,7 +472,7 @@ def sequential_experiment(
         max_seconds,
         bool(continues),
         bool(improve),
-        checks.whole(seed, "seed", 0),
+        checks.whole(seed, "seed", 0, math.inf),
         check_seconds if continues else None,
     )
     return SequentialExperiment(rivals, settings, _prior(probabilities, rivals.labels))

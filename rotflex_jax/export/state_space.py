@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rotflex_jax.checks import number, positive
+from rotflex_jax.checks import number, positive, vector
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout, equations, rest_state
@@ -146,12 +146,7 @@ def state_space(
 
 
 def _point(given: Sequence[float] | None, n: int, what: str) -> np.ndarray:
-    values = np.zeros(n) if given is None else np.asarray(given, dtype=float)
-    if values.shape != (n,):
-        raise InputError(
-            f"{values.size} {what} were given, but the model has {n} coordinates; give one for each."
-        )
-    return values
+    return np.zeros(n) if given is None else vector(given, what, n, example=str([0.0] * n))
 
 
 def _steady_memories(slope: Any, x: Array, u: Array, start: int) -> Array:

@@ -227,7 +227,7 @@ def fit(
     if process_noise is not None:
         process_noise = process_noise_of(m, process_noise)
     checks.one_of(first, "first", get_args(FirstState))
-    max_steps = checks.whole(max_steps, "max_steps", 1)
+    max_steps, throw = checks.whole(max_steps, "max_steps", 1), checks.yes_or_no(throw, "throw")
     if minimiser is not None and not hasattr(minimiser, "init"):
         raise InputError(
             f"Argument `minimiser` must be a solver of optimistix, but is {checks.shown(minimiser)}; leave "
@@ -313,12 +313,12 @@ def _problem(
     progress: Callable[[str], None] | None,
 ) -> GreyBoxProblem:
     m = model.mechanism
-    mesh = mesh_of(devices) if len(recordings) > 1 else None
+    mesh = mesh_of(devices)
     states = 2 * len(m.coordinates) if first == "fitted" else 0
     return GreyBoxProblem(
         model,
         prepare(model, recordings),
-        RunLayout(m.structure, model.solver, states, mesh),
+        RunLayout(m.structure, model.solver, states, mesh if len(recordings) > 1 else None),
         physical_ranges(m),
         max_steps,
         minimiser,

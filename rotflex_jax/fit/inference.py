@@ -13,8 +13,10 @@ UNDETERMINED_CURVATURE = 1e-11
 
 
 def correlation_length(e: Float[np.ndarray, "N C"]) -> int:
-    """RecordingSamples after which the autocorrelation of residuals stays small; at most N / 10."""
+    """Samples after which the autocorrelation of residuals stays small; at most N / 10, and 1 at least."""
     N = len(e)
+    if N < 20:
+        return 1  # a tenth of so few is no more
     longest = 1
     for column in (e - e.mean(axis=0)).T:
         spectrum = np.abs(np.fft.rfft(column, 2 * N)) ** 2
@@ -26,7 +28,7 @@ def correlation_length(e: Float[np.ndarray, "N C"]) -> int:
         gaps = np.flatnonzero(np.diff(large) > 1)
         last = large[gaps[0]] if len(gaps) else large[-1]
         longest = max(longest, int(last) + 1)
-    return max(1, min(2 * longest, N // 10))
+    return min(2 * longest, N // 10)
 
 
 def bandwidth(e: Float[np.ndarray, "N C"]) -> int:

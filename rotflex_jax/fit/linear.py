@@ -126,7 +126,7 @@ class RegressionRows:
             basis: Applied to each recording from its start.
             recordings: At least one.
             channel: Output.
-            skip: RecordingSamples at the start of each recording to leave out; its `n_init` if None.
+            skip: Samples at the start of each recording to leave out; its `n_init` if None.
         """
         require_basis(basis)
         parts = []

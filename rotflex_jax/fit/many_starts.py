@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -281,7 +282,7 @@ def many_starts(
     """
     model, say = Model.of(mechanism), checks.progress(progress)
     given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
-    m, seed = model.mechanism, checks.whole(seed, "seed", 0)
+    m, seed = model.mechanism, checks.whole(seed, "seed", 0, math.inf)
     if not m.free_names:
         raise InputError("All parameters are trusted, but a fit needs a free one; release one.")
     starts, keep, max_steps = (
@@ -335,7 +336,7 @@ def _first_parts(recordings: list[Recording], seconds: float | None) -> list[Rec
     """Their first seconds; None where these are hardly shorter than the whole."""
     if seconds is None:
         return None
-    lengths = [max(round(seconds / r.Ts), 2 * r.n_init) for r in recordings]
+    lengths = [max(round(min(seconds / r.Ts, r.N)), 2 * r.n_init) for r in recordings]
     if sum(lengths) > 0.5 * sum(r.N for r in recordings):
         return None
     return [r.slice(0, min(n, r.N)) for r, n in zip(recordings, lengths, strict=True)]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rotflex_jax.basis import Basis
-from rotflex_jax.checks import whole
+from rotflex_jax.checks import real, shown, whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.inference import Combination, by_recording, curvature, estimates, sandwich
 from rotflex_jax.fit.linear import (
@@ -195,7 +195,7 @@ def least_squares(
         channel: Output to model; may be left out where there is one.
         ridge: Penalty on the squared weights, as they are; "cv" takes the one with the least error on
             contiguous blocks left out in turn. An interval does not contain the bias of a ridge.
-        skip: RecordingSamples at the start of each recording to leave out; its `n_init` if None.
+        skip: Samples at the start of each recording to leave out; its `n_init` if None.
         blocks: How many, for "cv".
 
     Raises:
@@ -215,11 +215,12 @@ def least_squares(
     'rad/V^2'
     """
     listed, channel = checked_recordings(recordings, channel)
-    if ridge != "cv" and not (isinstance(ridge, (int, float, np.floating)) and 0 <= ridge < np.inf):
-        raise InputError(f"Argument `ridge` must be 0 or more, or 'cv', but is {ridge!r}; correct it.")
+    tuned = isinstance(ridge, str) and ridge == "cv"
+    if not tuned and not 0 <= real(ridge) < np.inf:
+        raise InputError(f"Argument `ridge` must be 0 or more, or 'cv', but is {shown(ridge)}; correct it.")
     rows = RegressionRows.of(basis, listed, channel, skip)
     joined = np.concatenate([rows.phi, rows.y[:, None]], axis=1)
-    if ridge == "cv":
+    if tuned:
         block = rows.blocks(whole(blocks, "blocks", 2))
         if block[-1] < 1:
             raise InputError(
@@ -274,7 +275,7 @@ def forward_regression(
         channel: Output to model; may be left out where there is one.
         terms: How many to choose; decided on validation blocks if None.
         most: Most that are tried.
-        skip: RecordingSamples at the start of each recording to leave out; its `n_init` if None.
+        skip: Samples at the start of each recording to leave out; its `n_init` if None.
         blocks: How many, to decide.
 
     Returns:

@@ -86,9 +86,9 @@ def spring_stiffness(
         ("hub_anchor", hub_anchor, HUB_ANCHORS),
         ("arm_anchor", arm_anchor, ARM_ANCHORS),
     ):
-        if value not in known:
+        if not isinstance(value, str | int) or value not in known:
             raise InputError(
-                f"{what} was given {value!r}, but the kit has {', '.join(map(repr, known))}; "
+                f"{what} was given {shown(value)}, but the kit has {', '.join(map(repr, known))}; "
                 "choose one of these."
             )
     kit, d, R, r = SPRINGS[spring], HUB_ANCHORS[hub_anchor], ARM_ANCHORS[arm_anchor], SIDE
@@ -333,9 +333,9 @@ def arm_inertia(arm: int = 2) -> float:
     0.0038938
     """
     centres = {0: None, 1: 9 * INCH, 2: 10 * INCH, 3: 11 * INCH}
-    if arm not in centres:
+    if not isinstance(arm, int) or arm not in centres:
         raise InputError(
-            f"arm was given {arm!r}, but the short arm sits at 1, 2 or 3, or is left off (0); "
+            f"arm was given {shown(arm)}, but the short arm sits at 1, 2 or 3, or is left off (0); "
             "choose one of these."
         )
     main = 0.064 * (11.75 * INCH) ** 2 / 3

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Real
 
-from rotflex_jax.checks import whole
+from rotflex_jax.checks import positive, signal, vector, whole
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels, linear_size, quadratic_size, root_mean_square
@@ -75,12 +75,8 @@ class AveragingRun(NamedTuple):
                 start = initial_states(s.mechanism, s.solver, s.gates, u[None, :m], y[None, :m], Ts)[0]
                 x0[: len(start)] = start
         else:
-            u = np.asarray(data, float)
-        if Ts is None or not (np.isfinite(Ts) and Ts > 0) or u.ndim != 1 or not np.all(np.isfinite(u)):
-            raise InputError(
-                f"A voltage of shape {u.shape} with Ts = {Ts} was given, but finite values (N,) and a "
-                "positive sampling period are needed; give both, or a recording."
-            )
+            u = signal(data, "data").astype(float)
+        Ts = positive(Ts, "Ts", "s", "0.002, or a recording as data")
         width = (len(u) - skip) // max(blocks, 1)
         if reach < memory or blocks < 2 or width < memory:
             raise InputError(
@@ -171,12 +167,7 @@ def block_kernels(
     if autocovariance is None:
         whole = lagged.T @ lagged / N
     else:
-        known = np.asarray(autocovariance, float)
-        if known.shape != (L,):
-            raise InputError(
-                f"An autocovariance of shape {known.shape} was given, but it needs one value for each of the "
-                f"{L} lags; give lags 0 to {L - 1}."
-            )
+        known = vector(autocovariance, "autocovariance", L, example=f"lags 0 to {L - 1}")
         whole = scipy.linalg.toeplitz(known)
     R = whole[:M, :M]
     if not np.linalg.cond(R) < 1e12:

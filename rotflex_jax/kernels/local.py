@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Real
 
+from rotflex_jax.checks import LARGEST_COUNT, number, positive
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels
 from rotflex_jax.kernels.sensitivities import Modelled, lags_of, output_model
@@ -66,14 +67,13 @@ def local_kernels(
     [0.0, -0.0491, -0.0188, 0.0297]
     """
     s, memory = output_model(model, channel), lags_of(memory)
-    settle = 5 * memory * Ts if settle is None else settle
-    if not (np.isfinite(Ts) and Ts > 0 and np.isfinite(settle) and settle >= 0):
-        raise InputError(
-            f"A sampling period of {Ts:g} s and a settling time of {settle:g} s were given, but the first "
-            "must be positive and the second not negative; correct them."
-        )
+    Ts, voltage = positive(Ts, "Ts", "s", "0.002"), number(voltage, "voltage", unit="V", example="1.0")
+    settled = number(
+        5 * memory * Ts if settle is None else settle, "settle", least=0, unit="s", example="1.0"
+    )
+    before_pulse = number(settled / Ts, "settle / Ts", below=LARGEST_COUNT, example="1000")
     with double_precision():
-        before = jnp.full(max(1, round(settle / Ts)), float(voltage))
+        before = jnp.full(max(1, round(before_pulse)), voltage)
         h0, h1, h2, h3 = _derivatives(
             s.mechanism.structure,
             s.solver,

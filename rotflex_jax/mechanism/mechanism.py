@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -44,22 +44,24 @@ def outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
             'write for instance {"encoder": "motor", "tacho": ("drum", "speed")}.'
         )
     each = {
-        k: (v, Quantity.POSITION.value) if isinstance(v, str) else tuple(v) for k, v in dict(given).items()
+        k: (v, Quantity.POSITION.value) if isinstance(v, str) else checks.entries(v)
+        for k, v in dict(given).items()
     }
     for channel, pair in each.items():
-        if len(pair) != 2:
+        if pair is None or len(pair) != 2:
             raise InputError(
-                f"Output {channel!r} was given as {pair}, but it needs a port, or a port and 'speed'; write "
-                f'for instance {{"{channel}": ("drum", "speed")}}.'
+                f"Output {channel!r} was given as {describe(pair)}, but needs a port, or a port and 'speed'; "
+                f'write for instance {{"{channel}": ("drum", "speed")}}.'
             )
-    return tuple((k, (v[0], v[1])) for k, v in each.items())
+    return tuple((k, (v[0], v[1])) for k, v in each.items() if v is not None)
 
 
 def effects(given: Any) -> tuple[Effect, ...]:
     """Effects in order."""
-    if not isinstance(given, Iterable | Effect | type):
+    sequence = checks.entries(given)
+    if sequence is None and not isinstance(given, Effect | type):
         raise InputError(f"The effects were given as {describe(given)}, but a list is needed; give one.")
-    listed: tuple[Any, ...] = (given,) if isinstance(given, Effect | type) else tuple(given)
+    listed: tuple[Any, ...] = (given,) if sequence is None else sequence
     for e in listed:
         if not isinstance(e, Effect):
             name = e.__name__ if isinstance(e, type) else repr(e)
@@ -377,7 +379,8 @@ class Mechanism:
                 if own != old[name] and own != values.get(self.followers[name]):
                     self._refuse_follower(name)
             values = list((old | dict(values)).values())
-        if not hasattr(values, "__len__") or len(values) != len(self.parameter_names):
+        sized = hasattr(values, "__len__") and getattr(values, "ndim", 1) > 0
+        if not sized or len(values) != len(self.parameter_names):
             raise InputError(
                 f"Argument `values` must have one number for each of the {len(self.parameter_names)} "
                 f"parameters, but is {shown(values)}; give them by name, {{'port.effect.parameter': value}}."

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
-from rotflex_jax.checks import number, shown
+from rotflex_jax.checks import number, shown, vector
 from rotflex_jax.effects.base import Actuation, Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver, free_run, kalman_gains, predictor_run
@@ -81,14 +81,9 @@ class Model:
                 f"Argument `solver` must be Exponential(...) or SmoothRK4(...), but is {shown(self.solver)}; "
                 "leave it out for the default."
             )
-        gates = self.gates
-        if gates is not None and not (
-            len(gates) == len(self.mechanism.effects) and np.all(np.isfinite(np.array(gates, float)))
-        ):
-            raise InputError(
-                f"Argument `gates` must have a finite number for each of the {len(self.mechanism.effects)} "
-                f"effects, but is {tuple(gates)}; give 1 for each that is on, or None."
-            )
+        if self.gates is not None:
+            count = len(self.mechanism.effects)
+            vector(self.gates, "gates", count, example=f"{[1] * count}, 1 for what is on")
         check_movable(self.mechanism)
 
     @classmethod

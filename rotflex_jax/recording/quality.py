@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 
 
@@ -267,11 +268,11 @@ def acceptable(accept: str | Sequence[str]) -> tuple[str, ...]:
     ('saturated',)
     """
     kinds = tuple(accept) if isinstance(accept, Sequence) and not isinstance(accept, str) else (accept,)
-    unknown = [kind for kind in kinds if kind not in ACCEPTABLE]
+    unknown = [kind for kind in kinds if not isinstance(kind, str) or kind not in ACCEPTABLE]
     if unknown:
         raise InputError(
             f"Argument `accept` must name faults among {', '.join(ACCEPTABLE)}, "
-            f"but has {unknown[0]!r}; correct it or leave it out."
+            f"but has {shown(unknown[0])}; correct it or leave it out."
         )
     return kinds
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.checks import number, real, shown
+from rotflex_jax.checks import entries, number, real, shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import quality
 from rotflex_jax.recording.quality import Finding, quantisation_step
@@ -185,8 +185,9 @@ class Recording:
 
     def channel(self, name: str) -> Float[np.ndarray, " N"]:
         """One output by name."""
-        if name not in self.channels:
-            raise InputError(f"The recording has no channel {name!r}; it has {', '.join(self.channels)}.")
+        if not isinstance(name, str) or name not in self.channels:
+            given = repr(name) if isinstance(name, str) else shown(name)
+            raise InputError(f"The recording has no channel {given}; it has {', '.join(self.channels)}.")
         return self.y[:, self.channels.index(name)]
 
     def slice(self, i: int, j: int) -> "Recording":
@@ -233,7 +234,7 @@ class Recording:
             wanted = number(seconds, "seconds", unit="s", example="10.0") / self.Ts
         else:
             wanted = self.N * (0.7 if share is None else number(share, "share", example="0.7"))
-        if not 1 <= round(wanted) < self.N:
+        if not 1 <= round(min(max(wanted, 0.0), self.N)) < self.N:
             raise InputError(
                 f"Both parts of a split must have samples, but the first would have {wanted:.6g} "
                 f"of {self.N}; give a share between 0 and 1, or fewer than {self.duration:g} s."
@@ -450,10 +451,8 @@ read a file with rotflex_jax.load.
     """
     if isinstance(recordings, Recording):
         found: tuple[Any, ...] = (recordings,)
-    elif isinstance(recordings, Iterable) and not isinstance(recordings, str | bytes):
-        found = tuple(recordings)
     else:
-        found = (None,)
+        found = (None,) if (given := entries(recordings)) is None else given
     wrong = [(k, r) for k, r in enumerate(found, 1) if not isinstance(r, Recording)]
     if wrong:
         number, entry = wrong[0]

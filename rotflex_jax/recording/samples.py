@@ -2,13 +2,13 @@
 
 import math
 import numbers
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Real
 
-from rotflex_jax.checks import positive, real, shown
+from rotflex_jax.checks import entries, positive, real, shown
 from rotflex_jax.errors import InputError
 
 # Longest step that resampling bridges, in median steps.
@@ -227,7 +227,7 @@ def labels(
 
 
 def _tuple(words: Any) -> tuple[Any, ...]:
-    return tuple(words) if isinstance(words, Iterable) and not isinstance(words, str) else (words,)
+    return (words,) if (given := entries(words)) is None else given
 
 
 def known_resolution(

@@ -221,7 +221,12 @@ def mesh_of(devices: Sequence[Any] | None = None) -> Mesh | None:
     """
     if devices is None and jax.config.values["jax_default_device"] is not None:
         return None
-    chosen = jax.local_devices() if devices is None else list(devices)
+    chosen = jax.local_devices() if devices is None else checks.entries(devices)
+    if chosen is None or not all(isinstance(device, jax.Device) for device in chosen):
+        raise InputError(
+            f"Argument `devices` must be a list of devices, but is {checks.shown(devices)}; give for "
+            "instance jax.devices()."
+        )
     return Mesh(np.array(chosen), (_ROWS,)) if len(chosen) > 1 else None
 
 

@@ -10,7 +10,12 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rotflex_jax.discover.localise import half_width, missing_acceleration
+from rotflex_jax.discover.localise import (
+    derivative_of,
+    half_width,
+    missing_acceleration,
+    motion_channels,
+)
 from rotflex_jax.discover.result import SearchResult, Where
 from rotflex_jax.discover.tables import channel_units
 from rotflex_jax.report.figures.registry import figure
@@ -32,28 +37,35 @@ _AXES = {
 }
 
 
+def _moving(discovery: SearchResult) -> tuple[str, ...]:
+    """Channels that measure a motion; all where none does."""
+    by_channel = channel_units(discovery)
+    return motion_channels(by_channel, discovery.baseline.model.mechanism) or tuple(by_channel)
+
+
 def worst_channel(discovery: SearchResult) -> str:
-    """The channel whose baseline error is the largest multiple of its noise."""
+    """The channel of a motion whose baseline error is the largest multiple of its noise."""
     errors, floor = discovery.baseline.held_out_rmse_windows, discovery.noise_floor
-    return max(errors, key=lambda c: errors[c] / (floor.get(c) or errors[c] or 1.0))
+    return max(_moving(discovery), key=lambda c: errors[c] / (floor.get(c) or errors[c] or 1.0))
 
 
 def _grid(discovery: SearchResult, s: Shown) -> tuple[list[np.ndarray], list[str]]:
-    """What the maps are drawn over: speed and deflection, or speed and time of a single channel."""
-    by_channel = channel_units(discovery)
-    channels = list(by_channel)
+    """What the maps are drawn over: speed and deflection, speed and time if one channel alone moves."""
+    by_channel, channels = channel_units(discovery), _moving(discovery)
+    columns = [list(by_channel).index(c) for c in channels]
     unit = by_channel[channels[0]]
-    is_speed = unit.endswith("/s")
+    is_speed = derivative_of(channels[0], unit, discovery.baseline.model.mechanism) > 0
     scale, read = readable(1.0, unit if is_speed else f"{unit}/s")
     window = 2 * (half_width(s.recording) or 3) + 1
     order = 0 if is_speed else 1
-    rate = scipy.signal.savgol_filter(s.measured[:, 0], window, 2, deriv=order, delta=s.recording.Ts)
+    turning = s.measured[:, columns[0]]
+    rate = scipy.signal.savgol_filter(turning, window, 2, deriv=order, delta=s.recording.Ts)
     values = [scale * np.asarray(rate)]
     labels = [f"{channels[0] if is_speed else f'speed of {channels[0]}'} [{read}]"]
     if len(channels) == 1:
         return [*values, s.recording.t], [*labels, "time [s]"]
     scale, read = readable(1.0, by_channel[channels[1]])
-    return [*values, scale * s.measured[:, 1]], [*labels, f"{channels[1]} [{read}]"]
+    return [*values, scale * s.measured[:, columns[1]]], [*labels, f"{channels[1]} [{read}]"]
 
 
 def _cells(over: list[np.ndarray]) -> list[np.ndarray]:
@@ -84,14 +96,14 @@ def profiles(discovery: SearchResult) -> Figure | None:
     figure = blank(10.0 if columns > 1 else 5.5, 2.5 * rows + 0.4)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax, place in zip(axes, places, strict=False):
-        _profile(ax, place, list(channel_units(discovery)))
+        _profile(ax, place, _moving(discovery))
     for ax in axes[len(places) :]:
         ax.remove()
     legend_above(figure, axes[: len(places)])
     return figure
 
 
-def _profile(ax: Axes, place: Where, channels: list[str]) -> None:
+def _profile(ax: Axes, place: Where, channels: tuple[str, ...]) -> None:
     names = {"turning": channels[0], "bending": channels[min(1, len(channels) - 1)]}
     scale, read = readable(1.0, place.unit)
     edges = scale * place.edges
@@ -168,7 +180,7 @@ def _maps(discovery: SearchResult) -> _Maps:
     c, unit = list(by_channel).index(channel), by_channel[channel]
     over, labels = _grid(discovery, s)
     scale, read = readable(1.0, unit)
-    order = 1 if unit.endswith("/s") else 2
+    order = 2 - min(1, derivative_of(channel, unit, discovery.baseline.model.mechanism))
     lacking = {}
     for run, label in ((s.baseline, "baseline"), (s.final, "final model")):
         if run is not None:
