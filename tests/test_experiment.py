@@ -13,7 +13,9 @@ from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.data.excitation import multisine, noise, prbs
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import rival_fit
+from rotflex_jax.experiment.design import _notes
 from rotflex_jax.experiment.discrimination import Discrimination, DiscriminationProblem, optimise_input
+from rotflex_jax.experiment.result import Rated
 from rotflex_jax.experiment.rival_fit import (
     RivalFit,
     effect_location,
@@ -325,3 +327,10 @@ def test_effects_may_be_given_in_three_ways():
         == effect_location(fx.Delay(time=0.1))
         == DELAY
     )
+
+
+def test_an_experiment_that_would_not_decide_says_so():
+    chosen = Rated("steps", "", 0.2, (0.2, 0.3), 1.0, 1.0, {"theta": 0.1}, True)
+    (note,) = _notes(rf.joints.paper(), chosen)
+    assert "0.2 nats" in note and "4.6" in note
+    assert _notes(rf.joints.paper(), dataclasses.replace(chosen, nats=4.7)) == ()

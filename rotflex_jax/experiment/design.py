@@ -1,6 +1,7 @@
 """The next experiment for two effects that a recording cannot distinguish: rank inputs, then optimise."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, overload
 
@@ -41,6 +42,8 @@ Progress = Callable[[str], None]
 DESIGN_PERIOD = 4.0
 # Uncertainty of a parameter without a standard deviation from a fit, as a share of its value.
 DEFAULT_UNCERTAINTY = 0.05
+# Evidence that makes one of two equally probable effects 99 % probable [nat].
+ENOUGH = math.log(99)
 
 
 @overload
@@ -226,6 +229,11 @@ def _notes(model: Fit | Model | Mechanism, chosen: Rated) -> tuple[str, ...]:
     if not chosen.settled:
         notes.append(
             "A fit of the rival has not converged; the expected evidence is its first-order estimate."
+        )
+    if chosen.nats < ENOUGH:
+        notes.append(
+            f"No input within these limits is expected to distinguish the two: {chosen.nats:.2g} nats, where "
+            f"{ENOUGH:.2g} make one of them 99 % probable."
         )
     return tuple(notes)
 

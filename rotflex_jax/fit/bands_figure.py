@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, MEASURED, NOISE
+from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MEASURED, NOISE
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, styled, thinned
 
@@ -27,7 +27,7 @@ def bands_figure(bands: "Bands") -> Figure:
         e = bands.recording.channel(bands.channels[c]).astype(float) - middle
         left.plot(*thinned(t, scale * e), color=MEASURED, lw=0.8, label="measured less free run")
         for end, label in ((low, f"band of {100 * bands.level:g} %"), (high, None)):
-            left.plot(*thinned(t, scale * end), color=FINAL, lw=1.0, label=label)
+            left.plot(*thinned(t, scale * end), color=INK, lw=1.0, label=label)
         most = 4 * scale * float(np.median(high - low))
         left.set_ylim(*np.clip(left.get_ylim(), -most, most))
         left.set_ylabel(f"{bands.channels[c]} [{unit}]")

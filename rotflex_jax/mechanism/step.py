@@ -451,7 +451,7 @@ class Exponential:
         """
         mechanism = structure.with_values(c.values)
         cut = gear_steps(structure)
-        if self.between == "switched":
+        if c.tilt is not None:  # the voltage is switched
             body = lambda _, state: _step(mechanism, state, v[0], c, self)  # noqa: E731
             end = body(0, x) if cut == 1 else jax.lax.fori_loop(0, cut, body, x)
             return end + scaled_vector(c.tilt, v[1])
