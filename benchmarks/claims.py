@@ -13,7 +13,7 @@ from typing import Any
 import scipy.stats
 
 from arena.probability import classes, credible, scatter_of_right, usable
-from arena.wrong_table import SEEN, fresh
+from arena.wrong_table import SEEN as SEEN_WORLDS, fresh
 from rotflex_jax.arena.scores import calibration_error
 from rotflex_jax.effects.labels import law_of
 from rotflex_jax.parameters import HALF_WIDTH_95
@@ -52,7 +52,7 @@ def _read(file: str) -> Any:
 def _worlds(marked: str, seen: bool = False) -> tuple[int, int]:
     """How many wrong worlds have a mark, and of how many; without a hidden effect some marks are None."""
     every = results("B0_wrong_worlds.json")["records"].values()
-    rows = [r for r in every if (r["world"] in SEEN) is seen and r.get(marked) is not None]
+    rows = [r for r in every if (r["world"] in SEEN_WORLDS) is seen and r.get(marked) is not None]
     return sum(bool(r[marked]) for r in rows), len(rows)
 
 

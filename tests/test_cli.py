@@ -316,6 +316,7 @@ class FakeSearch:
             parameters={"level": level},
             equivalent=(("stribeck", "hub"),),
             doubt="these recordings cannot distinguish it from stribeck at hub",
+            certain="",
             stage=stage,
         )
         return SimpleNamespace(

@@ -143,7 +143,9 @@ def test_an_effect_with_a_rival_or_a_reason_is_provisional():
     alone = dataclasses.replace(first, equivalent=(), doubts=())
     assert alone.status == alone.to_dict()["status"] == "established" and alone.doubt == ""
     rival = dataclasses.replace(alone, equivalent=(("dahl", "hub"),))
-    assert rival.status == "provisional" and "Dahl friction at the hub" in rival.doubt
+    assert rival.status == "provisional" and "Dahl friction" in rival.doubt
+    elsewhere = dataclasses.replace(alone, equivalent=(("dahl", "joint"),))
+    assert elsewhere.status == "provisional" and "Dahl friction at the joint" in elsewhere.doubt
     reason = dataclasses.replace(alone, doubts=("free runs are no better with it",))
     assert reason.to_dict()["status"] == "provisional" and reason.to_dict()["doubt"] == reason.doubts[0]
 

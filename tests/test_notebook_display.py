@@ -70,7 +70,7 @@ def test_a_discovery_shows_verdict_rounds_errors_and_doubts() -> None:
     for expected in (
         "Found, but not distinguished from others",
         "Coulomb friction at hub",
-        "cannot distinguish it from Stribeck friction at the hub",
+        "dry friction at the hub is certain, but not whether it is Coulomb friction or Stribeck friction",
         "τ = −stiffness · position³",
         "78 % of the theta error",
         "sensor noise",
