@@ -15,12 +15,13 @@ def test_the_filter_is_that_of_scipy_to_rounding_also_at_the_ends(
     width: int, degree: int, derivative: int
 ) -> None:
     y = np.cumsum(np.random.default_rng(3).standard_normal(300))
-    expected = scipy.signal.savgol_filter(y, width, degree, deriv=derivative, delta=0.002)
+    options = {"deriv": derivative, "delta": 0.002}
+    expected = np.asarray(scipy.signal.savgol_filter(y, width, degree, **options))
     found = smoothed(y, width, degree, derivative, 0.002)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
     weights = local_polynomial(width, degree, derivative, 0.002)[width // 2]
     # Of the same samples in the other order, as a filter takes them.
-    expected = scipy.signal.savgol_coeffs(width, degree, deriv=derivative, delta=0.002)[::-1]
+    expected = np.asarray(scipy.signal.savgol_coeffs(width, degree, **options))[::-1]
     np.testing.assert_allclose(weights, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 

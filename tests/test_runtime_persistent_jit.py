@@ -239,7 +239,11 @@ def test_programs_of_the_last_block_alike_are_loaded_on_threads(
     assert traced == [*slopes] and not persistent_jit._coming
     assert len(loads) == 3 and {thread for thread, _ in loads} == {"loading"}
     loads.clear()
-    with loaded_ahead("a search", (1, 2)):  # both that were used are in memory
+    second.release_programs()
+    with loaded_ahead("a search", (1, 2)):  # no second time in a process
+        assert not persistent_jit._coming
+    release_programs()
+    with loaded_ahead("a search", (1, 2)):  # nothing was used inside of the last one
         assert not persistent_jit._coming
     assert not loads
 

@@ -73,6 +73,8 @@ _thread = threading.local()
 _notes: list[dict[str, None]] = []
 # Programs that threads load from their files before they are needed.
 _coming: dict[Path, Future[Callable[..., Any] | None]] = {}
+# Lists by which programs were loaded ahead since programs were released last.
+_loaded_by: set[Path] = set()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -282,7 +284,8 @@ def loaded_ahead(*like: Any) -> Iterator[None]:
     """Inside, programs that the last such block has used are loaded on threads before they are needed.
 
     Loading is machine code that is linked, outside of Python: it goes on beside the first fits. What is not
-    used in the end is let go of.
+    used in the end is let go of. Only the first such block of a process loads: later ones have in memory what
+    they share, and would load what searches of other processes have found.
 
     Args:
         like: Static values; blocks with equal ones count as alike.
@@ -293,12 +296,15 @@ def loaded_ahead(*like: Any) -> Iterator[None]:
         return
     here = folder / _surroundings()
     listed = here / "used" / hashlib.sha256(str(names).encode()).hexdigest()
-    with contextlib.suppress(OSError, UnicodeError):
-        found = re.findall("^[0-9a-f]{64}$", listed.read_text(), re.MULTILINE)
-        _load_ahead([here / name for name in found])
     used: dict[str, None] = {}
     with _recent_lock:
+        first = listed not in _loaded_by
+        _loaded_by.add(listed)
         _notes.append(used)
+    with contextlib.suppress(OSError, UnicodeError):
+        if first:
+            found = re.findall("^[0-9a-f]{64}$", listed.read_text(), re.MULTILINE)
+            _load_ahead([here / name for name in found])
     try:
         yield
     finally:
@@ -427,6 +433,7 @@ def release_programs() -> None:
     """Releases all programs in memory; those on disk stay."""
     with _recent_lock:
         _recent.clear()
+        _loaded_by.clear()
     for program in _programs:
         program.release_programs()
     _return_memory()
@@ -465,8 +472,9 @@ def _used(held: _Held) -> None:
     with _recent_lock:
         _recent[held] = None
         _recent.move_to_end(held)
-        for note in _notes if held.file is not None else ():
-            note[held.file.name] = None
+        if (file := held.file) is not None:
+            for note in _notes:
+                note[file.name] = None
         if len(_recent) <= MOST_HELD:
             return
         released = [_recent.popitem(last=False)[0] for _ in range(len(_recent) - LEFT_HELD)]
