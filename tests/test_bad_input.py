@@ -164,7 +164,7 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     ),
     "too short": (text(lambda lines: lines[:50]), {}, "at least 50 samples, but has 49"),
     "one sample": (text(lambda lines: lines[:2]), {}, "has 1 time stamps"),
-    "input no name": (text(), {"input": ["voltage"]}, r"no column \['voltage'\]"),
+    "input no name": (text(), {"input": ["voltage"]}, "`input` must be a word, but is a list"),
     "output no name": (text(), {"outputs": 3}, "no column 3"),
     "output no names": (text(), {"outputs": {}}, "`outputs` must name the column of theta"),
     "unknown fault": (text(), {"accept": "noise"}, "faults among short, .* but has 'noise'"),

@@ -113,7 +113,7 @@ def test_python_control_takes_it():
 
 
 def test_refuses_a_point_of_another_size():
-    with pytest.raises(InputError, match="3 positions were given, but the model has 2 coordinates"):
+    with pytest.raises(InputError, match=r"`positions` must be 2 numbers, .* of shape \(3,\)"):
         state_space(Model(paper()), positions=(0, 0, 0))
     with pytest.raises(InputError, match="is in discrete time already"):
         state_space(Model(paper()), 0.01).discretise(0.01)

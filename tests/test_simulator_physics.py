@@ -562,6 +562,8 @@ LADEN = {
         fx.Heating("hub", rate=50.0, time=0.3),
     ],
 }
+# Each program runs a few times, so time spent on making it fast is lost.
+ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 # Cases whose derivatives are taken both ways: reverse mode is slow to compile, and `memory` has friction.
 BACKWARD = {"smooth", "memory"}
 
@@ -586,9 +588,9 @@ class Laden:
         def weighted(values, gates, u, x0, weights):
             return jnp.sum(weights * run(values, gates, u, x0))
 
-        self.run = jax.jit(run)
-        self.forward = jax.jit(jax.jacfwd(run, argnums=(0, 1)))
-        self.backward = jax.jit(jax.grad(weighted, argnums=(0, 1)))
+        self.run = jax.jit(run, compiler_options=ROUGH)
+        self.forward = jax.jit(jax.jacfwd(run, argnums=(0, 1)), compiler_options=ROUGH)
+        self.backward = jax.jit(jax.grad(weighted, argnums=(0, 1)), compiler_options=ROUGH)
 
 
 @functools.cache

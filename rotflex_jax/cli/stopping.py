@@ -46,7 +46,7 @@ class Stop:
 
     def _wait(self, source: int) -> None:
         while signal.SIGINT not in os.read(source, 64):
-            limit.start()
+            pass
         self()
 
     def __call__(self, *_: Any) -> NoReturn:

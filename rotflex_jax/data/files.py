@@ -187,10 +187,11 @@ def readable_file(source: Any) -> Path:
 def _check_options(words: Mapping[str, Any], choices: Mapping[str, Any], units: Any, resample: Any) -> None:
     """Refuses options of `load` that are no words, no choices, no units by name and no period."""
     for name, word in words.items():
+        example = {"input": "voltage", "time": "t"}.get(name, "ms")
         if not (word is None or isinstance(word, str)):
             raise InputError(
                 f"Argument `{name}` must be a word, but is {shown(word)}; give for instance "
-                f"{name}={'ms' if name == 'time_unit' else 't'!r}."
+                f"{name}={example!r}."
             )
     for name, choice in choices.items():
         yes_or_no(choice, name)
