@@ -695,6 +695,26 @@ def _best_kind() -> str:
     return names.get(kind, kind)
 
 
+def _medians() -> str:
+    """Median seconds of the best kind over the median seconds of the loop."""
+    summary = results("B4_sequential.json")["summary"]
+    return f"{summary['kind_seconds'] / summary['seconds']:.1f}"
+
+
+def _slow_ratio() -> str:
+    """Median ratio where the standard input that was fastest in hindsight took more than one second."""
+    ratios = []
+    for row in results("B4_sequential.json")["rows"]:
+        if not row["hopeless"]:
+            right = lambda how, r=row: how["best"] == r["truth"] and how.get("decided", True)  # noqa: E731
+            fastest = min((s["seconds"] for s in row["standard"] if right(s)), default=20.0)
+            if fastest > 1:
+                ratios.append(fastest / (row["seconds"] if right(row) else 20.0))
+    return f"{statistics.median(ratios):.1f}"
+
+
+NAMED["decided_medians"] = _medians
+NAMED["decided_slow"] = _slow_ratio
 NAMED["decided_kind"] = _best_kind
 for _kind in ("multisine", "prbs", "sweep", "steps", "noise"):
     NAMED[f"decided_{_kind}_seconds"] = functools.partial(_kind_seconds, _kind)

@@ -158,6 +158,8 @@ def test_a_segment_in_pieces_ends_where_it_is_decided(tmp_path):
     assert [len(r.u) for r in pieces.runs] == [len(r.u) for r in whole.runs] == [120]
     assert len(pieces.history) == len(whole.history) == 2
     assert pieces.history[1].seconds == pytest.approx(1.2)
+    still = dataclasses.replace(whole, runs=(RunData(np.full(60, 0.1), whole.runs[0].y[:60]),))
+    assert still.result().runs == () and "after 0.6 s" in still.result().standing
     soon = ran(0.1, 0.01)
     assert soon.verdict == "decided" and soon.planned is None
     assert soon.seconds < 1.15 and soon.seconds == pytest.approx(0.1 * round(10 * soon.seconds))

@@ -26,6 +26,7 @@ from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
 from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.models import model_json
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.quality import SHORTEST_RECORDING
 from rotflex_jax.text.files import write_file
 
 Progress = Callable[[str], None]
@@ -352,7 +353,7 @@ class SequentialExperiment:
         )
 
     def result(self) -> SequentialResult:
-        """What is known now, as a result."""
+        """What is known now, as a result. A first piece that is no recording yet is not among its runs."""
         r, s = self.rivals, self.settings
         notes = []
         if self.history and self.scale > 4:
@@ -373,6 +374,7 @@ class SequentialExperiment:
             runs=tuple(
                 Recording(u=x.u, y=x.y, Ts=r.Ts, channels=r.structure.channels, accept=_ANYTHING)
                 for x in self.runs
+                if np.ptp(x.u) > 0 and len(x.u) >= SHORTEST_RECORDING
             ),
             limits=s.limits,
             reason=self.reason,
