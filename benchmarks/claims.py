@@ -13,7 +13,7 @@ from typing import Any
 import scipy.stats
 
 from arena.probability import classes, credible, scatter_of_right, usable
-from arena.wrong_table import SEEN as SEEN_WORLDS, fresh
+from arena.wrong_table import SEEN as SEEN_WORLDS
 from rotflex_jax.arena.scores import calibration_error
 from rotflex_jax.effects.labels import law_of
 from rotflex_jax.parameters import HALF_WIDTH_95
@@ -89,8 +89,9 @@ def worlds_seen_wrong() -> str:
 
 @named
 def worlds_other_law() -> str:
-    """Of the others, those in which another law of the same friction was named."""
-    missed = [r for r in _fresh_worlds() if r.get("named") is False]
+    """Of the others of these, those in which another law of the same friction was named."""
+    found = results("B0_wrong_worlds.json")["records"].values()
+    missed = [r for r in found if r["world"] in SEEN_WORLDS and r.get("named") is False]
     friction = [r for r in missed if law_of(r["hidden"][0]) == "dry friction"]
     alike = [
         r
@@ -106,12 +107,8 @@ def worlds_wrong() -> str:
     return "{} of {}".format(*_worlds("wrong_established"))
 
 
-def _fresh_worlds() -> list[dict[str, Any]]:
-    return fresh(results("B0_wrong_worlds.json")["records"].values())
-
-
 def _worlds_with_probabilities() -> list[dict[str, Any]]:
-    return usable(_fresh_worlds())
+    return usable(results("B0_wrong_worlds.json")["records"].values())
 
 
 @named

@@ -200,8 +200,9 @@ def told(
         held_out_rmse_windows=errors, process_noise_nats=noise_nats, window_seconds=2.0
     )
     found: Any = [
-        SimpleNamespace(effect="coulomb", port="hub", equivalent=others, phrase="dry friction at the hub")
+        SimpleNamespace(effect="coulomb", port="hub", equivalent=others, phrase=noun + " at the hub")
         for others in rounds
+        for noun in ("dry friction" if others else "Coulomb friction",)
     ]
     ranking: Any = [SimpleNamespace(excited=k < excited) for k in range(candidates)]
     recordings: Any = [SimpleNamespace(N=SAMPLES // 2)] * 2
