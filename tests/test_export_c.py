@@ -248,3 +248,9 @@ def test_refuses_a_sampling_period_that_is_none(period):
 def test_refuses_a_prefix_that_begins_no_name():
     with pytest.raises(InputError, match="begins no name in C"):
         to_c(Model(paper()), Ts, prefix="2fast; int")
+
+
+@pytest.mark.parametrize("between", ["smooth", "switched"])
+def test_c_code_takes_a_voltage_that_is_held(between):
+    with pytest.raises(InputError, match=f"{between} between samples"):
+        to_c(Model(paper(), Exponential(between=between)), Ts=0.002)

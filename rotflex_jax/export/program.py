@@ -227,12 +227,12 @@ def sample_program(model: Model, Ts: float) -> SampleProgram:
     """The step of a model as scalar expressions.
 
     Raises:
-        InputError: An effect that C code cannot express, by name.
+        InputError: An effect that C code cannot express, by name, or a voltage that is not held.
     """
-    if getattr(model.solver, "between", "held") == "smooth":
+    if (between := getattr(model.solver, "between", "held")) != "held":
         raise InputError(
-            "The model's voltage is smooth between samples, which needs samples that are still in the future "
-            'for a controller; export it with between="held".'
+            f"The model's voltage is {between} between samples, but C code takes a voltage that is held; "
+            'export it with between="held".'
         )
     try:
         return _program(model, Ts)

@@ -81,10 +81,10 @@ def output_model(model: Mechanism | Modelled, channel: str) -> OutputModel:
             f"Kernels of {channel!r} were requested, but the mechanism has the outputs "
             f"{', '.join(mechanism.channels)}; choose one of these."
         )
-    if getattr(solver, "between", "held") != "held":
+    if (between := getattr(solver, "between", "held")) != "held":
         raise InputError(
-            "Kernels were requested of a model whose voltage is smooth between its samples, but then each "
-            'sample acts before its time; use a solver with between="held".'
+            f"Kernels were requested of a model whose voltage is {between} between its samples, but they "
+            'are of a voltage that is held; use a solver with between="held".'
         )
     gates = np.ones(len(mechanism.effects)) if given is None else np.array(given, float)
     return OutputModel(mechanism, solver, gates, mechanism.channels.index(channel))
