@@ -22,6 +22,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, SmoothRK4, free_run, linearise, simulate, simulate_states
 from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision
 
 NUMBERS = json.loads((Path(__file__).parent / "paper_numbers.json").read_text(encoding="utf-8"))
@@ -145,6 +146,16 @@ def test_a_delay_within_the_sample_is_that_of_the_switched_linear_system():
         np.testing.assert_allclose(moved, plain, rtol=0, atol=1e-12)
     with pytest.raises(InputError, match="substeps"):
         Exponential(between="switched", substeps=2)
+
+
+def test_a_switched_voltage_is_refused_beside_what_sticks():
+    """Only where both are on: models of several rivals have gates."""
+    solver, late = Exponential(between="switched"), paper() + fx.Delay(time=1e-3)
+    both = late + fx.Coulomb("hub")
+    with pytest.raises(InputError, match="input delay and Coulomb friction"):
+        Model(both, solver)
+    assert Model(both, solver, (*[1.0] * (len(both.effects) - 1), 0.0)).gates
+    assert Model(paper() + fx.Coulomb("hub"), solver)
 
 
 # -- symmetries ---------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
 from rotflex_jax.checks import number, shown, vector
-from rotflex_jax.effects.base import Actuation, Effect
+from rotflex_jax.effects.base import Actuation, DryFriction, Effect, Gear
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver, free_run, kalman_gains, predictor_run
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, rest_state
@@ -85,6 +85,20 @@ class Model:
             count = len(self.mechanism.effects)
             vector(self.gates, "gates", count, example=f"{[1] * count}, 1 for what is on")
         check_movable(self.mechanism)
+        self._check_switched()
+
+    def _check_switched(self) -> None:
+        """Refuses voltages that are switched within a sample beside what sticks: it would creep at rest."""
+        if not isinstance(self.solver, Exponential) or self.solver.between != "switched":
+            return
+        on = [e for i, e in enumerate(self.mechanism.effects) if self.gates is None or self.gates[i]]
+        late = [e for e in on if isinstance(e, Actuation) and e.changes_within_samples]
+        sticks = [e for e in on if isinstance(e, DryFriction | Gear)]
+        if late and sticks:
+            raise InputError(
+                f'The model has {late[0].title} and {sticks[0].title}, but between="switched" is for '
+                'machines without dry friction and play; use between="held".'
+            )
 
     @classmethod
     def of(cls, given: "Mechanism | Model") -> "Model":
