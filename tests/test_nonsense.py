@@ -470,10 +470,10 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("Limits", "voltage"): [(NAN, "given as nan"), ("a", "given as 'a'"), (INF, "given as inf")],
     ("Limits", "slew"): [(NAN, "given as nan"), (0, "given as 0")],
     ("Limits", "margin"): [(NAN, "is nan"), (1, "is 1")],
-    ("Exponential", "order"): [(3, "2 or 4, but is 3")],
+    ("Exponential", "order"): [(3, "2 or 4, but is 3"), (np.array([2, 4]), "2 or 4, but is a ndarray")],
     ("Exponential", "substeps"): COUNTS,
     ("Exponential", "passes"): COUNTS,
-    ("Exponential", "between"): [("linear", "one of 'held', 'smooth', but is 'linear'")],
+    ("Exponential", "between"): [("linear", "one of 'held', 'smooth', 'switched', but is 'linear'")],
     ("SmoothRK4", "width"): NO_SECONDS,
     ("SmoothRK4", "substeps"): COUNTS,
     ("Mechanism", "coordinates"): [
@@ -644,7 +644,11 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("joints.servo", "integral"): [(-1.0, "from 0, but is -1"), (NAN, "nan"), ("a", "'a'")],
     ("joints.servo", "inertia"): [(-1.0, "between 0 and inf"), ("a", "'a'")],
     ("joints.servo", "sensors"): [("alpha", "one of 'theta'.* but is 'alpha'"), (3, "is 3")],
-    ("LoadFriction", "of"): [("load", "given of='load', but the load is of 'both' sides"), (None, "of=None")],
+    ("LoadFriction", "of"): [
+        ("load", "given of='load', but the load is of 'both' sides"),
+        (None, "of=None"),
+        (np.array([1, 2]), "of=a ndarray"),
+    ],
     ("joints.paper", "sensors"): [
         ("beta", "one or several of 'theta', 'alpha', 'speed', but is 'beta'"),
         ((), "but is ''"),
@@ -713,3 +717,10 @@ def test_counts_may_be_a_number_of_numpy() -> None:
     plain = rf.load(FRAME, counts=4096, **options)
     for counts in (np.int64(4096), np.float32(4096), {"theta": np.int32(4096), "alpha": np.array(4096)}):
         assert np.array_equal(rf.load(FRAME, counts=counts, **options).y, plain.y)
+
+
+def test_what_no_float_can_hold_is_refused():
+    with pytest.raises(rf.InputError, match=r"level=1000.* N m, but it needs a finite value"):
+        rf.effects.Coulomb("hub", level=10**400)
+    with pytest.raises(rf.InputError, match="list of degrees, but is True"):
+        basis.Volterra(basis.Delays(3), degrees=True)

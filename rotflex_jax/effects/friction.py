@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
+from rotflex_jax.checks import shown
 from rotflex_jax.effects.base import DryFriction, Probe, Scalar, Scale, register
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import parameter
@@ -217,10 +218,10 @@ class LoadFriction(DryFriction):
     of: str = "both"
 
     def __post_init__(self) -> None:
-        if self.of not in ("both", "motor"):
+        if not isinstance(self.of, str) or self.of not in ("both", "motor"):
             raise InputError(
-                f"LoadFriction was given of={self.of!r}, but the load is of 'both' sides or of the 'motor'; "
-                "give one of these."
+                f"LoadFriction was given of={shown(self.of)}, but the load is of 'both' sides or of the "
+                "'motor'; give one of these."
             )
         if not isinstance(self.tied, bool):
             raise InputError(

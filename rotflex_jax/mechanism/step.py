@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 
-from rotflex_jax.checks import one_of, shown, whole
+from rotflex_jax.checks import one_of, real, shown, whole
 from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of, equations, own_states
@@ -406,7 +406,7 @@ class Exponential:
     between: Intersample = "held"
 
     def __post_init__(self) -> None:
-        if self.order not in (2, 4):
+        if real(self.order) not in (2, 4):
             raise InputError(
                 f"Argument `order` must be 2 or 4, but is {shown(self.order)}; give one of these."
             )
