@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from rotflex_jax.checks import real, shown
+from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import Specification, specifications
 
@@ -165,7 +165,10 @@ class Effect(abc.ABC):
                 )
             if isinstance(value, jax.Array) or not isinstance(value, numbers.Real):
                 continue  # traced or symbolic: checked where the number was given
-            number = real(value)
+            try:
+                number = float(value)
+            except OverflowError:  # an integer that no float can hold
+                number = math.inf
             if not math.isfinite(number) or not spec.lower <= number <= spec.upper:
                 raise InputError(
                     f"{kind} was given {name}={shown(value)} {spec.unit}, but it needs a "
