@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rotflex_jax.basis.bank import Bank, evaluate
-from rotflex_jax.checks import shown, whole
+from rotflex_jax.checks import entries, shown, whole
 from rotflex_jax.errors import InputError
 
 Index = tuple[int, ...]
@@ -224,14 +224,16 @@ class Volterra(eqx.Module):
                 f"Arguments `order` ({order}) and `degrees` ({tuple(degrees)}) were both given, but say "
                 "the same thing; give one of them."
             )
-        if degrees is not None and not isinstance(degrees, Iterable):
+        listed = (
+            tuple(range(1, whole(2 if order is None else order, "order", 1) + 1))
+            if degrees is None
+            else entries(degrees)
+        )
+        if listed is None:
             raise InputError(
                 f"Argument `degrees` must be a list of degrees, but is {shown(degrees)}; give for instance "
                 "(1, 2)."
             )
-        listed = (
-            range(1, whole(2 if order is None else order, "order", 1) + 1) if degrees is None else degrees
-        )
         wanted = sorted({whole(d, "degrees", 0) for d in listed} | ({0} if constant else set()))
         if layout not in ("triangular", "full"):
             raise InputError(

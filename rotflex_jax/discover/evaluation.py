@@ -123,16 +123,20 @@ def errors_as_trained(
     validation: ValidationSet, h: Hypothesis, locations: Sequence[EffectLocation]
 ) -> RunErrors:
     """Errors over recordings with the trained model as it is, less a disturbance; arguments as before."""
-    known = [i not in validation.problem.supermodel.phased for i in h.local]
-    trained = dataclasses.replace(
-        h,
-        local_z=h.local_z.mean(axis=0, keepdims=True) * known,
-        x0=h.x0[:1],
-        K=h.K[:1],
-        densities=np.array(-np.inf),
-    )
+    trained = _with_own_values(validation.problem.supermodel, h, h.local_z.mean(axis=0, keepdims=True))
     model = validation.model_of(trained, locations, 0)
     return free_runs(validation, [model] * len(validation.problem.dataset.recordings)).errors
+
+
+def _with_own_values(s: SuperModel, h: Hypothesis, local_z: Float[np.ndarray, "R L"]) -> Hypothesis:
+    """A trained hypothesis for R recordings with these local values, less a disturbance; for models of it."""
+    return dataclasses.replace(
+        h,
+        local_z=local_z * [i not in s.phased for i in h.local],
+        x0=np.repeat(h.x0[:1], len(local_z), axis=0),
+        K=np.repeat(h.K[:1], len(local_z), axis=0),
+        densities=np.array(-np.inf),
+    )
 
 
 def errors_on_test(
@@ -157,13 +161,7 @@ def errors_on_test(
     s, recordings = test.problem.supermodel, test.problem.dataset.recordings
     known = [runs.index(r) for r in recordings]
     rows = np.array([own.mean(axis=0) if k is None else own[k] for k in known]).reshape(len(known), -1)
-    trained = dataclasses.replace(
-        h,
-        local_z=rows * [i not in s.phased for i in h.local],
-        x0=np.repeat(h.x0[:1], len(known), axis=0),
-        K=np.repeat(h.K[:1], len(known), axis=0),
-        densities=np.array(-np.inf),
-    )
+    trained = _with_own_values(s, h, rows)
     machine = [p for p in locations if runs.compared or p not in s.calibrations]
     on = [machine if k is None else locations for k in known]
     return free_runs(test, [test.model_of(trained, p, i) for i, p in enumerate(on)]).errors

@@ -283,6 +283,12 @@ class PeriodicDisturbance(Actuation):
         return f"a disturbance of {self.frequency:.4g} Hz acts on the motor like {size:.3g} V of the input"
 
 
+def _held(mean: Float[Array, " N"], moment: Float[Array, " N"]) -> Float[Array, " N"]:
+    """Voltage to hold over each sample that moves a machine as one with this mean and first moment."""
+    # The first moment, which the mean does not show: a pulse and its opposite one sample later.
+    return mean - jnp.diff(moment, prepend=0.0)
+
+
 @register
 @dataclasses.dataclass(frozen=True)
 class Delay(Actuation):
@@ -314,9 +320,7 @@ class Delay(Actuation):
 
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
         """Voltage [V] to hold over each sample."""
-        mean, moment = self.within_samples(voltage, Ts)
-        # The first moment, which the mean does not show: a pulse and its opposite one sample later.
-        return mean - jnp.diff(moment, prepend=0.0)
+        return _held(*self.within_samples(voltage, Ts))
 
     def within_samples(
         self, voltage: Float[Array, " N"], Ts: Period
@@ -372,9 +376,7 @@ class Lag(Actuation):
 
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
         """Voltage [V] to hold over each sample."""
-        mean, moment = self.within_samples(voltage, Ts)
-        # The first moment, which the mean does not show: a pulse and its opposite one sample later.
-        return mean - jnp.diff(moment, prepend=0.0)
+        return _held(*self.within_samples(voltage, Ts))
 
     def within_samples(
         self, voltage: Float[Array, " N"], Ts: Period
