@@ -438,7 +438,6 @@ BAD_MODEL: dict[str, Callable[[dict[str, Any]], object]] = {
     "fraction of a sample": lambda d: d["data"].update(n_init=1.5),
     "flag for a number": lambda d: d["mechanism"]["effects"][0]["parameters"]["inertia"].update(value=True),
     "number for a flag": lambda d: d["mechanism"]["effects"][0]["parameters"]["inertia"].update(trusted=1),
-    "many digits": lambda d: d["mechanism"]["effects"][0]["parameters"]["inertia"].update(value=10**400),
     "list for an object": lambda d: d.update(mechanism=[]),
     "list for a name": lambda d: d["mechanism"]["effects"][0].update(effect=["inertia"]),
     "many substeps": lambda d: d["solver"].update(substeps=10**9),
@@ -458,6 +457,13 @@ def test_model_file_that_was_changed(kind: str, tmp_path: Path) -> None:
     BAD_MODEL[kind](data)
     (tmp_path / "model.json").write_text(json.dumps(data))
     refused(lambda: Model.load(tmp_path / "model.json"), "incomplete or was changed by hand")
+
+
+def test_model_file_with_a_value_beyond_a_float(tmp_path: Path) -> None:
+    data = saved_model(tmp_path / "model.json")
+    data["mechanism"]["effects"][0]["parameters"]["inertia"].update(value=10**400)
+    (tmp_path / "model.json").write_text(json.dumps(data))
+    refused(lambda: Model.load(tmp_path / "model.json"), "model.json: .*inertia=10+.* needs a finite value")
 
 
 @pytest.mark.parametrize("content", ["[" * 100_000, '{"kind": ' + "9" * 5000 + "}", "\udcff", '{"a": 1'])
