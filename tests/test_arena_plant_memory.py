@@ -179,7 +179,8 @@ def test_hysteretic_torques_agree_with_scipy(place):
         f = np.zeros(3)
         f[at] = -values["level"] * x[4]
         if effect == "lugre":
-            f[at] -= values["damping"] * values["presliding"] * rate
+            bristles = values["damping"] * np.exp(-((s / values["speed"]) ** 2))
+            f[at] -= bristles * values["presliding"] * rate
         return f, np.array([rate])
 
     exact = integrated(p.Plant(), law, np.zeros(1), u, 30)

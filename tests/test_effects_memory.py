@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.optimize import brentq
 from sticking import Joint
 
 import rotflex_jax.effects as fx
@@ -35,11 +36,11 @@ def bouc_wen(z, w, width, beta):
 
 
 def lugre(z, w, rise, slow, presliding, level, damping):
-    """Rate of the state (deflection over presliding), and the torque: sigma_0 bend + sigma_1 d bend/dt."""
+    """Rate of the state (deflection over presliding), and the torque: sigma_0 bend + sigma_1(w) d bend/dt."""
     g = level * (1 + rise * np.exp(-((w / slow) ** 2)))
-    sigma_0, bend = level / presliding, presliding * z
+    sigma_0, sigma_1, bend = level / presliding, damping * np.exp(-((w / slow) ** 2)), presliding * z
     rate = w - sigma_0 * abs(w) / g * bend
-    return rate / presliding, -(sigma_0 * bend + damping * rate)
+    return rate / presliding, -(sigma_0 * bend + sigma_1 * rate)
 
 
 def heating(warm, m, rate, time):
@@ -122,18 +123,31 @@ def test_small_swings_on_bristles():
     np.testing.assert_allclose(s[:, 0], expected, rtol=0, atol=3e-5 * start / swing)
 
 
+def given_by_bristles(friction, w):
+    """Power that the port gets less what the bristles lose, bent by 2 g, where it is largest [W]."""
+    z = 2 * (1 + friction.rise * math.exp(-((w / friction.slow) ** 2)))
+    rate, torque = (float(f(z, 0.0, w, 0.0)) for f in (friction.flow, friction.force))
+    return torque * w + friction.level * friction.presliding * z * rate
+
+
 def test_lugre_gives_energy_only_beyond_its_known_speed():
-    """The bound of damping |speed| against 4 level g is sharp where the bristles are bent by 2 g."""
-    friction = fx.LuGre("hub", level=0.03, rise=2.0, slow=10.0, presliding=0.004, damping=0.01)
-    for factor, gives in ((0.999, False), (1.001, True)):
-        w = 6.0
-        for _ in range(100):  # w = factor * 4 * level * g(w) / damping
-            g = 1 + 2.0 * math.exp(-((w / 10.0) ** 2))
-            w = 0.5 * w + 0.5 * factor * 4 * 0.03 * g / 0.01
-        z = 2 * g
-        rate, torque = (float(f(z, 0.0, w, 0.0)) for f in (friction.flow, friction.force))
-        given = torque * w + 0.03 * 0.004 * z * rate
-        assert (given > 0) == gives
+    """The bound of sigma_1(w) |w| against 4 level g is sharp where the bristles are bent by 2 g."""
+    friction = fx.LuGre("hub", level=0.03, rise=2.0, slow=10.0, presliding=0.004, damping=0.1)
+
+    def beyond(w):
+        slow = math.exp(-((w / 10.0) ** 2))
+        return 0.1 * slow * w - 4 * 0.03 * (1 + 2.0 * slow)
+
+    bound = brentq(beyond, 0.1, 10 / math.sqrt(2))
+    assert given_by_bristles(friction, 0.999 * bound) < 0 < given_by_bristles(friction, 1.001 * bound)
+
+
+def test_lugre_with_little_damping_gives_no_energy_at_any_speed():
+    friction = fx.LuGre("hub", level=0.03, rise=0.0, slow=0.3, presliding=0.004, damping=9 * 0.03 / 0.3)
+    speeds = np.geomspace(1e-3, 100.0, 300)
+    assert max(given_by_bristles(friction, w) for w in speeds) < 0
+    more = dataclasses.replace(friction, damping=10 * 0.03 / 0.3)
+    assert max(given_by_bristles(more, w) for w in speeds) > 0
 
 
 def test_a_motor_that_stands_warms_to_a_known_level():

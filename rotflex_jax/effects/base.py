@@ -509,6 +509,8 @@ KINDS: tuple[type[Effect], ...] = (DryFriction, Force, Memory, Gear, Linear, Act
 EffectClass = TypeVar("EffectClass", bound=type[Effect])
 
 CATALOG: dict[str, type[Effect]] = {}
+# `law_of` the effects that hold a port at rest, of which every machine has one.
+DRY_FRICTION = "dry friction"
 
 
 def register(effect: EffectClass) -> EffectClass:

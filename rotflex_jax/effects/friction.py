@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from rotflex_jax.checks import shown
-from rotflex_jax.effects.base import DryFriction, Probe, Scalar, Scale, register
+from rotflex_jax.effects.base import DRY_FRICTION, DryFriction, Probe, Scalar, Scale, register
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import parameter
 
@@ -29,7 +29,7 @@ class Coulomb(DryFriction):
 
     name: ClassVar[str] = "coulomb"
     title: ClassVar[str] = "Coulomb friction"
-    law_of: ClassVar[str] = "dry friction"
+    law_of: ClassVar[str] = DRY_FRICTION
     equation: ClassVar[str] = "tau = -level * sign(speed), holds while |tau| <= level"
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
@@ -74,7 +74,7 @@ class CoulombAsymmetric(DryFriction):
 
     name: ClassVar[str] = "coulomb_asymmetric"
     title: ClassVar[str] = "asymmetric Coulomb friction"
-    law_of: ClassVar[str] = "dry friction"
+    law_of: ClassVar[str] = DRY_FRICTION
     equation: ClassVar[str] = (
         "tau = -forward if speed > 0, +backward if speed < 0, holds while -forward <= tau <= backward"
     )
@@ -127,7 +127,7 @@ class Stribeck(DryFriction):
 
     name: ClassVar[str] = "stribeck"
     title: ClassVar[str] = "Stribeck friction"
-    law_of: ClassVar[str] = "dry friction"
+    law_of: ClassVar[str] = DRY_FRICTION
     equation: ClassVar[str] = (
         "tau = -(level + excess * exp(-(v / speed)^2)) * sign(v), holds while |tau| <= level + excess"
     )
@@ -194,7 +194,7 @@ class LoadFriction(DryFriction):
 
     name: ClassVar[str] = "load_friction"
     title: ClassVar[str] = "load-dependent friction"
-    law_of: ClassVar[str] = "dry friction"
+    law_of: ClassVar[str] = DRY_FRICTION
     equation: ClassVar[str] = (
         "tau = -(level + share * |load|) * sign(speed), share = driving if load * speed > 0, driven "
         "otherwise, load torque through the gear"

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from rotflex_jax.effects.base import Memory, Probe, Scalar, Scale, register
+from rotflex_jax.effects.base import DRY_FRICTION, Memory, Probe, Scalar, Scale, register
 from rotflex_jax.parameters import parameter
 
 
@@ -30,7 +30,7 @@ class Dahl(Memory):
 
     name: ClassVar[str] = "dahl"
     title: ClassVar[str] = "Dahl friction"
-    law_of: ClassVar[str] = "dry friction"
+    law_of: ClassVar[str] = DRY_FRICTION
     equation: ClassVar[str] = "dz/dt = speed / presliding * (1 - z * sign(speed)), tau = -level * z"
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
@@ -73,13 +73,15 @@ class LuGre(Memory):
 
         g = 1 + rise exp(-(speed/slow)^2)
         dz/dt = (speed - |speed| z / g) / presliding
-        tau = -(level z + damping presliding dz/dt)
+        tau = -(level z + damping exp(-(speed/slow)^2) presliding dz/dt)
 
     In the usual symbols `level` is Fc, `level rise` is Fs - Fc, `level / presliding` is sigma0 and
     `damping` is sigma1; sigma2 is viscous damping, which has an effect of its own. Not for a
     recording in which the presliding is smaller than the sensor resolves: there it is Stribeck
-    friction, and simpler. The damping of the bristles may give energy at speeds where `damping
-    |speed|` exceeds `4 level g`: a fitted value that large is not physical.
+    friction, and simpler. The damping of the bristles fades with the speed as the rise does: a constant
+    one gives energy at speeds where `damping |speed|` exceeds `4 level g`, and a fit to a machine that
+    moves fast takes it for a damping of impacts. With this one no speed gives energy as long as
+    `damping slow` is below `9 level`.
 
     Args:
         at: Port.
@@ -90,15 +92,16 @@ class LuGre(Memory):
         damping: Of the bristles [N m s/rad].
 
     Source: Canudas de Wit, Olsson, Åström and Lischinsky, IEEE Trans. Automatic Control 40, 1995,
-    equations 1 to 4.
+    equations 1 to 4; damping that falls with the speed: Åström and Canudas de Wit, IEEE Control Systems
+    Magazine 28(6), 2008, 101-114.
     """
 
     name: ClassVar[str] = "lugre"
     title: ClassVar[str] = "LuGre friction"
-    law_of: ClassVar[str] = "dry friction"
+    law_of: ClassVar[str] = DRY_FRICTION
     equation: ClassVar[str] = (
         "g = 1 + rise * exp(-(speed/slow)**2), dz/dt = (speed - |speed| * z / g) / presliding, "
-        "tau = -(level * z + damping * presliding * dz/dt)"
+        "tau = -(level * z + damping * exp(-(speed/slow)**2) * presliding * dz/dt)"
     )
     amplitudes: ClassVar[tuple[str, ...]] = ("level", "damping")
     contains: ClassVar[tuple[str, ...]] = ("coulomb", "stribeck", "dahl")
@@ -116,13 +119,17 @@ class LuGre(Memory):
 
     def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Time derivative of the state [1/s]."""
-        g = 1 + self.rise * jnp.exp(-((speed / self.slow) ** 2))
+        g = 1 + self.rise * self._at_rest(speed)
         return (speed - jnp.abs(speed) * z / g) / self.presliding
 
     def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Torque [N m] on the port."""
         bending = self.presliding * self.flow(z, position, speed, drive)
-        return -(self.level * z + self.damping * bending)
+        return -(self.level * z + self.damping * self._at_rest(speed) * bending)
+
+    def _at_rest(self, speed: Scalar) -> Scalar:
+        """What is left at this speed of all that belongs to slow motion [-]."""
+        return jnp.exp(-((speed / self.slow) ** 2))
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
@@ -163,7 +170,7 @@ class BoucWen(Memory):
 
     name: ClassVar[str] = "bouc_wen"
     title: ClassVar[str] = "Bouc-Wen hysteresis"
-    law_of: ClassVar[str] = "dry friction"
+    law_of: ClassVar[str] = DRY_FRICTION
     equation: ClassVar[str] = (
         "dz/dt = (speed - beta * |speed| * z - (1 - beta) * speed * |z|) / width, tau = -level * z"
     )

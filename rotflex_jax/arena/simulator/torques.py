@@ -63,7 +63,7 @@ def build_up(row, x, s, h):
     .. math::
         \dot x = \frac{s}{w}\Bigl(1 - |x|\,\frac{\beta\,\mathrm{sgn}(s x) + 1 - \beta}{g(s)}\Bigr)
             - \frac{x}{T}, \quad g = 1 + r e^{-(s/s_0)^2}, \quad
-        f = -F x - c\, w\, \dot x
+        f = -F x - c\, e^{-(s/s_0)^2}\, w\, \dot x
 
     With ``beta = 1`` and ``g = 1`` this is Dahl's law, with a `g` and a `c` that of LuGre, with
     another ``beta`` that of Bouc and Wen (exponent 1). `FADING` is ``1 / T``, none as a rule.
@@ -77,7 +77,8 @@ def build_up(row, x, s, h):
     rate = part * abs(s) / (width * g) + row[FADING]
     # Midpoint rule of an equation that is linear in x.
     end = (x * (1 - 0.5 * h * rate) + h * s / width) / (1 + 0.5 * h * rate)
-    return end, -0.5 * level * (x + end) - row[DAMPING] * width * (end - x) / h
+    bristles = row[DAMPING] * np.exp(-((s / row[RISE_SPEED]) ** 2))
+    return end, -0.5 * level * (x + end) - bristles * width * (end - x) / h
 
 
 @compiled
