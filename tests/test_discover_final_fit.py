@@ -118,6 +118,26 @@ def test_an_offset_of_the_machine_is_carried_over(arm, monkeypatch):
     assert value[OFFSET] == pytest.approx(0.04, abs=0.003)
 
 
+def test_it_starts_from_usual_shapes_too_and_takes_the_likelier_end(runs, arm, monkeypatch):
+    """Of what was found the sizes are kept, and the shape is a usual one."""
+    begun, ends, fit = [], [], MODULE.fit
+
+    def noted(model, *given, **how):
+        begun.append(dict(zip(model.mechanism.parameter_names, model.mechanism.values, strict=True)))
+        ends.append(fit(model, *given, **how))
+        return ends[-1]
+
+    monkeypatch.setattr(MODULE, "fit", noted)
+    monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
+    train, validation, _ = runs
+    found = rf.discover(arm, train, validation, candidates=[(rf.effects.Stribeck, "hub")], rounds=1)
+    sizes, inertia = ["hub.stribeck.level", "hub.stribeck.excess"], "hub.inertia.inertia"
+    for searched, usual in zip(begun[::2], begun[1::2], strict=True):
+        assert [usual[n] for n in (*sizes, inertia)] == [searched[n] for n in (*sizes, inertia)]
+        assert usual["hub.stribeck.speed"] != searched["hub.stribeck.speed"]
+    assert found.final_fit.fit.cost == min(end.cost for end in ends[-2:])
+
+
 def test_data_may_speak_against_it(runs, arm, monkeypatch):
     monkeypatch.setattr(MODULE, "MOST_WORSE", -np.inf)
     train, validation, _ = runs

@@ -35,6 +35,7 @@ from rotflex_jax.fit.result import Fit
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import joined
 
 # Errors of a fit from measured first states over those of the search, both fitted to training recordings,
 # up to which the former is taken: logarithm of their ratio on validation data, mean over channels.
@@ -48,7 +49,8 @@ class _Structure:
     """What is fitted.
 
     Attributes:
-        model: The final model, with the calibrations of its recordings.
+        starts: The final model, with the calibrations of its recordings, as the search has fitted it and
+            with the usual shapes of what was found.
         local: Parameters that each recording has for itself.
         own: Calibrations that are not carried over to other recordings.
         on: What is on in the model that a user gets.
@@ -57,7 +59,7 @@ class _Structure:
         window_seconds: Length of free runs [s].
     """
 
-    model: Model
+    starts: tuple[Model, ...]
     local: tuple[str, ...]
     own: tuple[EffectLocation, ...]
     on: tuple[EffectLocation, ...]
@@ -69,17 +71,23 @@ class _Structure:
     def of(cls, state: SearchState, h: Hypothesis, window_seconds: float) -> "_Structure":
         """That of a hypothesis."""
         s = state.problem.supermodel
-        model = Model(s.clean(h.mean_values(s), h.locations), state.model.solver)
-        free = model.mechanism.free_names
+        values = {tuple(v.tolist()): v for v in (h.mean_values(s), _with_usual_shapes(s, h))}
+        starts = tuple(Model(s.clean(v, h.locations), state.model.solver) for v in values.values())
+        free = starts[0].mechanism.free_names
         local = [s.mechanism.parameter_names[i] for i in h.local]
         own = tuple(p for p in h.locations if p in s.calibrations and p not in state.order)
         local = tuple(n for n in local if n in free)
-        return cls(model, local, own, tuple(state.order), h, s, window_seconds)
+        return cls(starts, local, own, tuple(state.order), h, s, window_seconds)
 
     def fitted(self, recordings: Sequence[Recording]) -> Fit:
-        """The structure fitted to free runs of recordings, from where the search has ended."""
+        """The structure fitted to free runs of recordings, the likelier of the ends from its starts.
+
+        Parameters of predictions may lie beside another local minimum of free runs than those that a machine
+        usually has: bristles of a friction that are stiff and damped for some that are soft.
+        """
         how = {"first": "measured", "window_seconds": self.window_seconds}
-        return fit(self.model, list(recordings), local=self.local, **how)
+        ends = [fit(model, list(recordings), local=self.local, **how) for model in self.starts]
+        return min(ends, key=lambda end: float(np.nan_to_num(end.cost, nan=np.inf)))
 
     def as_hypothesis(self, found: Fit) -> Hypothesis:
         """A fit in the terms of the search, what recordings have for themselves at its mean."""
@@ -107,6 +115,17 @@ class _Structure:
         for location in self.own:
             m = m.without(*location)
         return dataclasses.replace(found.model, mechanism=m)
+
+
+def _with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
+    """Parameter values of a hypothesis with effects of their fitted size, but of their usual shape."""
+    values, specs = h.mean_values(s).copy(), s.mechanism.parameter_specifications
+    for location in s.without_calibrations(h.locations):
+        candidate, indices = s.candidates[location], s.parameter_indices(location)
+        sizes = np.array([specs[i].unit for i in indices]) == specs[indices[0]].unit
+        kept = np.asarray(candidate.amplitudes) & sizes
+        values[indices] = np.where(kept, values[indices], np.array(candidate.probes[0][0]))
+    return values
 
 
 def fit_to_all(
@@ -149,14 +168,15 @@ def _fitted_to_all(
     if log_error_ratio(trained, searched) > MOST_WORSE:
         return None
     structure = _with_offsets_of_the_machine(structure, fits, evaluation)
-    found = structure.fitted((*train, *held_back))
+    recordings = joined((*train, *held_back))
+    found = structure.fitted(recordings)
     # A fit to recordings that does worse on them than one that has not seen them has failed; without their
     # offsets it may be a little worse by chance.
     every, bare = [found] * len(fits), RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
     failed = log_error_ratio(_as_carried(structure, every, evaluation), bare) > MOST_WORSE
     if failed or log_error_ratio(_on_validation(structure, every, evaluation), searched) > 0:
         return None
-    return _reported(structure, found, (*train, *held_back), evaluation, trained, searched)
+    return _reported(structure, found, recordings, evaluation, trained, searched)
 
 
 def _with_offsets_of_the_machine(
@@ -232,6 +252,7 @@ def _reported(
             calibrated = errors_with_own_calibration(evaluation.test, validated, structure.on, seconds)
     return FinalFit(
         fit=found,
+        recordings=fitted,
         model=structure.carried(found),
         trained=trained,
         searched=searched,

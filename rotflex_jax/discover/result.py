@@ -193,6 +193,8 @@ class FinalFit:
 
     Attributes:
         fit: To the training and validation recordings together, with what each has for itself.
+        recordings: What was fitted: training and validation recordings, parts of one run that follow on
+            each other as one, since they share the offsets of their run.
         model: The model of it, with nothing that belongs to one recording.
         trained: Errors on validation recordings, with their own offsets where these are calibrated, of the
             structure fitted in the same way to training recordings alone.
@@ -202,6 +204,7 @@ class FinalFit:
     """
 
     fit: Fit
+    recordings: tuple[Recording, ...]
     model: Model
     trained: RunErrors
     searched: RunErrors
@@ -478,7 +481,8 @@ class SearchResult:
         """
         runs, m = KnownRuns.of(self.train, self.validation), self.model.mechanism
         fit = self.final_fit.fit if self.final_fit else None
-        k = runs._replace(recordings=(*self.train, *self.validation) if fit else self.train).index(recording)
+        fitted = self.final_fit.recordings if self.final_fit else self.train
+        k = runs._replace(recordings=fitted).index(recording)
         if k is None and not runs.compared:
             for location in self.offsets:
                 m = m.without(*location)

@@ -394,6 +394,28 @@ def of_one_run(a: Recording, b: Recording) -> bool:
     return bool(moving >= FEWEST_MOVING) and np.array_equal(here, there)
 
 
+def joined(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
+    """Recordings in their order, where parts of one run that follow on each other are one recording."""
+    found: list[Recording] = []
+    for r in recordings:
+        ends = (k for k, a in enumerate(found) if _goes_on(a, r))
+        if (k := next(ends, None)) is None:
+            found.append(r)
+            continue
+        u, y = (np.concatenate(pair) for pair in ((found[k].u, r.u), (found[k].y, r.y)))
+        found[k] = replace(found[k], u=u, y=y, accept=quality.ACCEPTABLE)
+    return tuple(found)
+
+
+def _goes_on(a: Recording, b: Recording) -> bool:
+    """Whether a part of a run knows that it begins where another one ends, on the same machine."""
+    before = b.continues
+    if before is None or before.N < a.N or a.Ts != b.Ts or a.constants != b.constants:
+        return False
+    ends = math.isclose(a.start + a.N * a.Ts, b.start, abs_tol=0.5 * a.Ts)
+    return ends and np.array_equal(before.u[-a.N :], a.u) and np.array_equal(before.y[-a.N :], a.y)
+
+
 def _beginning(recording: Recording) -> Recording:
     """The first recording of a run."""
     while recording.continues is not None:
