@@ -11,6 +11,7 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import Discovery, in_place
+from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.tables import status_sentence
 from rotflex_jax.discover.validation import ValidatedHypothesis
@@ -92,6 +93,31 @@ def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch
         # The largest of each number in a shape; all shapes.
         np.testing.assert_array_equal([c.values, *c.others], [[1.0, 2.0], [3.0, 4.0]])
     assert len(lines) == len(asked)
+
+
+def test_a_law_that_both_horizons_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch):
+    final, better, best = model(STRIBECK, DELAY), model(DAHL, DELAY), model(LUGRE, DELAY)
+    tried = [dataclasses.replace(v, location=p) for v, p in ((better, DAHL), (best, LUGRE))]
+    monkeypatch.setattr(in_place, "_in_place", lambda state, p, laws: tried if p == STRIBECK else [])
+    monkeypatch.setattr(in_place, "both_prefer", lambda rival, found, data: True)
+    monkeypatch.setattr(in_place, "shares_of_gain", lambda rivals, found: np.array([1.0, 1.5]))
+    monkeypatch.setattr(in_place, "parameter_count", lambda s, h, p: 3)
+    monkeypatch.setattr(in_place, "describe", lambda rival, found: str(rival.location))
+    state = SearchState(Any, Any, lambda line: None, final)
+    state.scores, state.gains = {DELAY: 2.0, STRIBECK: 1.0}, {DELAY: "a", STRIBECK: "b"}
+    state.rivals = {DELAY: [LAG], STRIBECK: [LUGRE, COULOMB]}
+    monkeypatch.setattr(
+        SearchState, "problem", SimpleNamespace(supermodel=supermodel(), dataset=SimpleNamespace(data=None))
+    )
+    (note,) = in_place.take_better_laws(state)
+    assert note.startswith("LuGre friction at hub has taken the place of Stribeck friction at hub, which its")
+    assert state.current.hypothesis is best.hypothesis and state.current.location is None
+    assert list(state.scores.items()) == [(DELAY, 2.0), (LUGRE, 1.0)]
+    assert list(state.gains.items()) == [(DELAY, "a"), (LUGRE, "b")]
+    assert state.rivals == {DELAY: [LAG], LUGRE: [STRIBECK, COULOMB]}
+    # One that they do not prefer leaves all as it is.
+    monkeypatch.setattr(in_place, "both_prefer", lambda rival, found, data: False)
+    assert in_place.take_better_laws(state) == () and state.current.hypothesis is best.hypothesis
 
 
 LAWS = [(fx.Coulomb, "hub"), (fx.Stribeck, "hub"), (fx.Dahl, "hub")]

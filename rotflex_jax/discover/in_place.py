@@ -2,17 +2,20 @@
 
 What a model lacks besides suits one law of friction better than another, and a round refits only the laws
 that its scores put forward. At the end every other law of the same thing (`Effect.law_of`) and every rival of
-its round take the place of an effect, fitted at both horizons.
+its round take the place of an effect, fitted at both horizons. A law that both prefer stays there.
 """
 
 import dataclasses
 from collections.abc import Sequence
 
+import numpy as np
+
 from rotflex_jax.discover.conclusion import nats_left
 from rotflex_jax.discover.forward_selection import refit_and_validate
 from rotflex_jax.discover.hypothesis import parameter_count, usual_start, without
 from rotflex_jax.discover.search_state import SearchState
-from rotflex_jax.discover.selection import describe, undecided
+from rotflex_jax.discover.selection import both_prefer, describe, shares_of_gain, undecided
+from rotflex_jax.discover.stepwise import titled
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects import CATALOG
@@ -24,6 +27,40 @@ def other_laws(s: SuperModel, location: EffectLocation) -> list[EffectLocation]:
     law = law_of(location.effect)
     at_port = (p for p in s.candidates if p.port == location.port and p != location)
     return [p for p in at_port if law and law_of(p.effect) == law]
+
+
+def take_better_laws(state: SearchState) -> tuple[str, ...]:
+    """Put laws that both horizons prefer in the places of effects of a poor model.
+
+    Args:
+        state: A search that is done.
+
+    Returns:
+        What has taken which place, in sentences.
+    """
+    s, notes = state.problem.supermodel, []
+    for location in [p for p in state.scores if p in state.current.hypothesis.locations]:
+        laws = [p for p in other_laws(s, location) if p not in state.current.hypothesis.locations]
+        known = _as_found(state, location)
+        fitted = _in_place(state, location, laws)
+        better = [v for v in fitted if both_prefer(v, known, state.problem.dataset.data)]
+        if not better:
+            continue
+        best = better[int(np.argmax(shares_of_gain(better, known)))]
+        assert best.location
+        state.say(f"  + {best.location} in the place of {location}, " + describe(best, known))
+        state.replace(location, best)
+        notes.append(
+            f"{titled(best.location)} has taken the place of {titled(location)}, which its round had added: "
+            "beside all that was found, predictions and free runs prefer it."
+        )
+    return tuple(notes)
+
+
+def _as_found(state: SearchState, location: EffectLocation) -> ValidatedHypothesis:
+    """The final model as a candidate with one of its effects."""
+    count = parameter_count(state.problem.supermodel, state.current.hypothesis, location)
+    return dataclasses.replace(state.current, location=location, parameter_count=count)
 
 
 def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLocation]]:
@@ -39,8 +76,7 @@ def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLoca
     for location in [p for p in found if p in final.hypothesis.locations]:
         wanted = dict.fromkeys([*other_laws(s, location), *state.rivals[location]])
         rivals = [p for p in wanted if p not in final.hypothesis.locations]
-        count = parameter_count(s, final.hypothesis, location)
-        known = dataclasses.replace(final, location=location, parameter_count=count)
+        known = _as_found(state, location)
         fitted = _in_place(state, location, [p for p in rivals if not CATALOG[p.effect].line])
         for rival in fitted:
             state.say(f"  in the place of {location}, " + describe(rival, final))

@@ -15,7 +15,7 @@ from rotflex_jax.discover.conclusion import with_proposal
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.evaluation import Evaluation
 from rotflex_jax.discover.forward_selection import ROUNDS, add_best, add_pair, score_candidates
-from rotflex_jax.discover.in_place import undecided_rivals
+from rotflex_jax.discover.in_place import take_better_laws, undecided_rivals
 from rotflex_jax.discover.likelihood import (
     LikelihoodProblem,
     correct_discretisation_bias,
@@ -223,15 +223,18 @@ def _simplify(state: SearchState) -> None:
     horizons, added = state.horizons, list(state.scores)
     assert state.current.free_run
     needed = eliminate(horizons, state.current.hypothesis, state.current.free_run.hypothesis, added)
-    final, state.worth = needed.prediction, needed.worth
-    state.current = horizons.validated(final, needed.free_run, state.current)
+    state.worth = needed.worth
+    state.current = horizons.validated(needed.prediction, needed.free_run, state.current)
+    swaps = take_better_laws(state) if is_poor(state.current, state.problem.noise) else ()
     state.tried.insert(0, state.current)
-    order = [p for p in added if p in final.locations]
-    order += sorted(set(final.locations) - set(order), key=lambda p: -state.worth[p])
+    final = state.current.hypothesis
+    order = [p for p in state.scores if p in final.locations]
+    # A law in the place of another one may bring calibrations back that were not needed with that.
+    order += sorted(set(final.locations) - set(order), key=lambda p: -state.worth.get(p, 0.0))
     reported = state.reported
     problem, validation = reported.problem, reported.validation
     assigned = assign_calibrations(problem, validation, state.at(reported, state.current).hypothesis, order)
-    final, order, notes = assigned.final.hypothesis, assigned.order, assigned.notes
+    final, order, notes = assigned.final.hypothesis, assigned.order, (*swaps, *assigned.notes)
     found = [p for p in order if p in state.scores]
     if is_poor(state.current, state.problem.noise):
         rivals, swapped = undecided_rivals(state), []

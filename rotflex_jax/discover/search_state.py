@@ -191,6 +191,16 @@ class SearchState:
         self.passed.append(self.current)
         self.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
 
+    def replace(self, old: EffectLocation, found: ValidatedHypothesis) -> None:
+        """Another effect in the place of one that was added."""
+        new = found.location
+        assert new
+        self.scores = {new if p == old else p: score for p, score in self.scores.items()}
+        self.gains = {new if p == old else p: gains for p, gains in self.gains.items()}
+        self.rivals = {new if p == old else p: rivals for p, rivals in self.rivals.items()}
+        self.rivals[new] = [old, *(p for p in self.rivals[new] if p != new)]
+        self.current = dataclasses.replace(found, location=None, parameter_count=0)
+
 
 def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -> SearchState:
     """The user's model, fitted and validated."""

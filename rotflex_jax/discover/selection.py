@@ -20,6 +20,8 @@ from rotflex_jax.discover.score_test import Score, promising
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects.base import DRY_FRICTION
+from rotflex_jax.effects.labels import law_of
 from rotflex_jax.fit.dataset import StackedRecordings
 
 # An effect must gain this on validation data [nat], beyond this many standard deviations of the block gains,
@@ -188,15 +190,24 @@ def choose(
     simpler = [t for t in able if _contained(t, winner) and not _clearly_better(winner, t, current)]
     if simpler:
         winner = max(simpler, key=lambda t: shares[t.location])
-    # Which of two that are alike leads is chance; the one with fewer parameters goes first.
-    fewer = [t for t in able if t.parameter_count < winner.parameter_count and not _related(t, winner)]
-    if alike := [t for t in fewer if _alike(winner, t, current, noise)]:
-        winner = min(alike, key=lambda t: (t.parameter_count, -shares[t.location]))
+    # Which of two that are alike leads is chance. Every machine rubs, so dry friction goes first, then what
+    # has fewer parameters; not what runs worse with the parameters of predictions, as a stand-in does.
+    first = _plausibility(winner)
+    others = [t for t in able if not _related(t, winner) and _plausibility(t) < first]
+    others = [t for t in others if _log_error_ratio(t, winner) <= WINDOWS_APART]
+    if alike := [t for t in others if _alike(winner, t, current, noise)]:
+        winner = min(alike, key=lambda t: (*_plausibility(t), -shares[t.location]))
     rivals = [t for t in candidates if t is not winner and not _related(t, winner)]
     gains = [
         t for t in rivals if t.log_likelihood > current.log_likelihood and _training_gain(t, current)[0] > 0
     ]
     return winner, [t for t in gains if _alike(winner, t, current, noise)]
+
+
+def _plausibility(t: ValidatedHypothesis) -> tuple[bool, int]:
+    """What decides between effects that data do not distinguish, the least first."""
+    assert t.location
+    return law_of(t.location.effect) != DRY_FRICTION, t.parameter_count
 
 
 def undecided(
@@ -221,6 +232,20 @@ def undecided(
     if predictions_apart(found, rival) and lost > left:
         return False
     return _free_run_certainty(found, rival) < FREE_RUN_Z or _log_best_ratio(rival, found) < LAWS_APART
+
+
+def both_prefer(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: StackedRecordings) -> bool:
+    """Whether predictions beyond doubt and free runs by a tenth prefer a rival in the place of an effect.
+
+    Args:
+        rival: The model with the rival in the place of the effect.
+        found: The model that was found; `parameter_count` is that of the effect.
+        data: Training recordings.
+    """
+    more = max(rival.parameter_count - found.parameter_count, 0)
+    gains = paired_gain(rival.blocks, found.blocks)[0], _training_gain(rival, found)[0]
+    enough = gains[0] > HELD_OUT_NATS and gains[1] > _needed(more, data)
+    return enough and predictions_apart(rival, found) and free_runs_apart(rival, found)
 
 
 def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
@@ -373,12 +398,13 @@ def _clearly_better(
     rich: ValidatedHypothesis, simple: ValidatedHypothesis, current: ValidatedHypothesis
 ) -> bool:
     """Whether the richer effect is worth its extra parameters on validation and on training data."""
-    nats, z = paired_gain(rich.blocks, simple.blocks)
+    nats = paired_gain(rich.blocks, simple.blocks)[0]
     train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
     share = nats / max(paired_gain(rich.blocks, current.blocks)[0], 1e-9)
     runs_as_well = _log_best_ratio(rich, simple) < WINDOWS_BETTER
+    # Few seconds of validation data are few blocks: whether the gain is chance, all blocks say together.
     return _free_runs_insist(rich, simple) or (
-        nats > 10 and z > 2.5 and train > 20 and share > 0.003 and runs_as_well
+        nats > 10 and train > 20 and share > 0.003 and runs_as_well and predictions_apart(rich, simple)
     )
 
 
