@@ -168,6 +168,9 @@ KNOWN = {
             ["0.49", "7.1", "20.06"], "mass and clocks of measured servos, checked by their readers"
         ),
         "-3.16": "published [N]",
+        **dict.fromkeys(
+            ["12.92", "2.50", "5.20", "1.62", "24.09", "5.28", "22.97", "5.09", "5.08", "1.89"], "before"
+        ),
         "2405.10779": "name of a preprint",
     },
     "seed_paper.md": {
