@@ -1,5 +1,7 @@
 """An offset belongs to a run until another run shows the same."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from test_discover_final_fit import OFFSET, run, short_runs_miss
@@ -45,9 +47,19 @@ def test_parts_that_follow_on_each_other_are_one_recording(parts):
     np.testing.assert_array_equal(whole.u, np.concatenate([first.u, second.u]))
     assert [r.N for r in joined([second, third])] == [second.N + third.N]
     assert joined([second, third])[0].continues is second.continues
-    # Not across a gap, not against the time, not what is known to be another machine.
-    heavier = rf.Recording(second.u, second.y, second.Ts, "theta", continues=first, constants={"J": 1.0})
-    for apart in ([first, third], [second, first], [first, heavier]):
+    # In whatever order they are given, and where a part knows only the one before it.
+    for order in ([second, first], [first, third, second], [third, second, first]):
+        (run,) = joined(order)
+        assert run.start == first.start and sum(r.N for r in order) == run.N
+    after = dataclasses.replace(third, continues=second)
+    assert [r.N for r in joined([first, second, after])] == [first.N + second.N + third.N]
+    # Not across a gap, and not what is of another machine or measured otherwise.
+    changes = {"constants": {"J": 1.0}, "channels": ("phi",), "units": ("deg",), "Ts": 2 * second.Ts}
+    others = [
+        dataclasses.replace(second, **{name: value}, resolution=None) for name, value in changes.items()
+    ]
+    two = dataclasses.replace(second, y=np.tile(second.y, 2), channels=("theta", "phi"), units=("rad", "rad"))
+    for apart in ([first, third], *([first, other] for other in (*others, two))):
         assert all(a is b for a, b in zip(joined(apart), apart, strict=True))
 
 

@@ -82,8 +82,8 @@ class _Structure:
     def fitted(self, recordings: Sequence[Recording]) -> Fit:
         """The structure fitted to free runs of recordings, the likelier of the ends from its starts.
 
-        Parameters of predictions may lie beside another local minimum of free runs than those that a machine
-        usually has: bristles of a friction that are stiff and damped for some that are soft.
+        Parameters of predictions may lead to another local minimum of free runs than usual ones: to stiff,
+        damped bristles of a friction instead of soft ones.
         """
         how = {"first": "measured", "window_seconds": self.window_seconds}
         ends = [fit(model, list(recordings), local=self.local, **how) for model in self.starts]
@@ -118,13 +118,17 @@ class _Structure:
 
 
 def _with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
-    """Parameter values of a hypothesis with effects of their fitted size, but of their usual shape."""
-    values, specs = h.mean_values(s).copy(), s.mechanism.parameter_specifications
+    """Parameter values with amplitudes in the unit of an effect's first parameter as fitted, others as usual.
+
+    An effect without such an amplitude is left as it is.
+    """
+    values, specs = h.mean_values(s), s.mechanism.parameter_specifications
     for location in s.without_calibrations(h.locations):
         candidate, indices = s.candidates[location], s.parameter_indices(location)
         sizes = np.array([specs[i].unit for i in indices]) == specs[indices[0]].unit
         kept = np.asarray(candidate.amplitudes) & sizes
-        values[indices] = np.where(kept, values[indices], np.array(candidate.probes[0][0]))
+        if kept.any():
+            values[indices] = np.where(kept, values[indices], np.array(candidate.probes[0][0]))
     return values
 
 
@@ -162,7 +166,7 @@ def _fitted_to_all(
     for given in (h, with_all_calibrations(state.problem.supermodel, h)):
         if not tried or given.locations != h.locations:
             structure = _Structure.of(state, given, validation.window_seconds)
-            fits = _without_each(structure, train) if validation.folds else [structure.fitted(train)]
+            fits = _without_each(structure, train) if validation.folds else [structure.fitted(joined(train))]
             tried.append((structure, fits, _on_validation(structure, fits, evaluation)))
     structure, fits, trained = min(tried, key=lambda each: log_error_ratio(each[2], searched))
     if log_error_ratio(trained, searched) > MOST_WORSE:

@@ -39,7 +39,9 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
         What has taken which place, in sentences.
     """
     s, notes = state.problem.supermodel, []
-    for location in [p for p in state.scores if p in state.current.hypothesis.locations]:
+    for location in list(state.scores):
+        if location not in state.current.hypothesis.locations:  # from the start, or by a law that contains it
+            continue
         laws = [p for p in other_laws(s, location) if p not in state.current.hypothesis.locations]
         known = _as_found(state, location)
         fitted = _in_place(state, location, laws)

@@ -220,28 +220,25 @@ def _make_ahead(state: SearchState, evaluation: Evaluation) -> None:
 def _simplify(state: SearchState) -> None:
     """Leave out what is not needed, assign calibrations, merge effects, correct the discretisation bias."""
     state.say(beginning("needed", "checking that each effect is needed"))
-    horizons, added = state.horizons, list(state.scores)
-    assert state.current.free_run
-    needed = eliminate(horizons, state.current.hypothesis, state.current.free_run.hypothesis, added)
-    state.worth = needed.worth
-    state.current = horizons.validated(needed.prediction, needed.free_run, state.current)
-    swaps = take_better_laws(state) if is_poor(state.current, state.problem.noise) else ()
-    state.tried.insert(0, state.current)
+    needed, poor = _eliminate(state), is_poor(state.current, state.problem.noise)
+    swaps = take_better_laws(state) if poor else ()
+    if swaps:  # beside another law other effects and calibrations may be needless
+        needed = _eliminate(state)
     final = state.current.hypothesis
     order = [p for p in state.scores if p in final.locations]
-    # A law in the place of another one may bring calibrations back that were not needed with that.
-    order += sorted(set(final.locations) - set(order), key=lambda p: -state.worth.get(p, 0.0))
+    order += sorted(set(final.locations) - set(order), key=lambda p: -state.worth[p])
     reported = state.reported
     problem, validation = reported.problem, reported.validation
     assigned = assign_calibrations(problem, validation, state.at(reported, state.current).hypothesis, order)
     final, order, notes = assigned.final.hypothesis, assigned.order, (*swaps, *assigned.notes)
     found = [p for p in order if p in state.scores]
-    if is_poor(state.current, state.problem.noise):
+    if poor:
         rivals, swapped = undecided_rivals(state), []
     else:
         rivals, swapped = remaining_rivals(problem, validation, assigned.final, state.rivals, found)
     state.machine = [p for p in order if p not in state.scores]
-    state.alternatives = [*swapped, *(_left_out(state, needed) if reported is horizons.prediction else ())]
+    of_predictions = reported is state.horizons.prediction
+    state.alternatives = [*swapped, *(_left_out(state, needed) if of_predictions else ())]
     if one := merge_effects(problem, validation, assigned.final, order):
         final, notes = one.final, (*notes, one.note)
         state.scores[one.effect] = state.scores[one.simpler]
@@ -253,6 +250,17 @@ def _simplify(state: SearchState) -> None:
         rivals[one.effect] = [*before, *(one.replaced if one.same_count else ())]
     state.order, state.own, state.notes, state.rivals = order, assigned.own, notes, rivals
     state.final = correct_discretisation_bias(problem, final)
+
+
+def _eliminate(state: SearchState) -> Eliminated:
+    """Leave out what is not needed; the model that is left joins what was tried."""
+    assert state.current.free_run
+    h, runs = state.current.hypothesis, state.current.free_run.hypothesis
+    needed = eliminate(state.horizons, h, runs, list(state.scores))
+    state.worth = needed.worth
+    state.current = state.horizons.validated(needed.prediction, needed.free_run, state.current)
+    state.tried.insert(0, state.current)
+    return needed
 
 
 def _check_pairs(state: SearchState) -> None:

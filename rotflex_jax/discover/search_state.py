@@ -192,12 +192,13 @@ class SearchState:
         self.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
 
     def replace(self, old: EffectLocation, found: ValidatedHypothesis) -> None:
-        """Another effect in the place of one that was added."""
+        """Put another law in the place of an effect that was added; score and gains are of its round."""
         new = found.location
         assert new
-        self.scores = {new if p == old else p: score for p, score in self.scores.items()}
-        self.gains = {new if p == old else p: gains for p, gains in self.gains.items()}
-        self.rivals = {new if p == old else p: rivals for p, rivals in self.rivals.items()}
+        # The new one may have been added before, and left out again.
+        self.scores = {new if p == old else p: score for p, score in self.scores.items() if p != new}
+        self.gains = {new if p == old else p: gains for p, gains in self.gains.items() if p != new}
+        self.rivals = {new if p == old else p: rivals for p, rivals in self.rivals.items() if p != new}
         self.rivals[new] = [old, *(p for p in self.rivals[new] if p != new)]
         self.current = dataclasses.replace(found, location=None, parameter_count=0)
 

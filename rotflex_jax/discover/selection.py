@@ -178,7 +178,8 @@ def choose(
 ) -> tuple[ValidatedHypothesis | None, list[ValidatedHypothesis]]:
     """The best admissible candidate and those not distinguished from it; arguments as in `admissible`.
 
-    Of admissible ones that are like the best (`_alike`), the one with the fewest parameters is chosen.
+    Of admissible ones that are like the best (`_alike`), dry friction is chosen first, then what has
+    the fewest parameters.
     A rival need not pass every test that the winner passed: where the effect is small, which of the two
     passes is chance. It is enough that it gains something and that nothing distinguishes it from the winner.
     """
@@ -187,16 +188,21 @@ def choose(
         return None, []
     shares = {t.location: share for t, share in zip(able, shares_of_gain(able, current), strict=True)}
     winner = max(able, key=lambda t: shares[t.location])
-    simpler = [t for t in able if _contained(t, winner) and not _clearly_better(winner, t, current)]
-    if simpler:
-        winner = max(simpler, key=lambda t: shares[t.location])
-    # Which of two that are alike leads is chance. Every machine rubs, so dry friction goes first, then what
-    # has fewer parameters; not what runs worse with the parameters of predictions, as a stand-in does.
+
+    def simplest(t: ValidatedHypothesis) -> ValidatedHypothesis:
+        """An effect, or one that it contains and is not clearly better than."""
+        simpler = [x for x in able if _contained(x, t) and not _clearly_better(t, x, current)]
+        return max(simpler, key=lambda x: shares[x.location], default=t)
+
+    winner = simplest(winner)
+    # Which of two that are alike leads is chance. Every machine has dry friction, so that goes first, then
+    # what has fewer parameters; not what runs worse with the parameters of predictions, as an effect does
+    # that imitates another one.
     first = _plausibility(winner)
     others = [t for t in able if not _related(t, winner) and _plausibility(t) < first]
     others = [t for t in others if _log_error_ratio(t, winner) <= WINDOWS_APART]
     if alike := [t for t in others if _alike(winner, t, current, noise)]:
-        winner = min(alike, key=lambda t: (*_plausibility(t), -shares[t.location]))
+        winner = simplest(min(alike, key=lambda t: (*_plausibility(t), -shares[t.location])))
     rivals = [t for t in candidates if t is not winner and not _related(t, winner)]
     gains = [
         t for t in rivals if t.log_likelihood > current.log_likelihood and _training_gain(t, current)[0] > 0

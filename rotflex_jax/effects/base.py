@@ -509,7 +509,7 @@ KINDS: tuple[type[Effect], ...] = (DryFriction, Force, Memory, Gear, Linear, Act
 EffectClass = TypeVar("EffectClass", bound=type[Effect])
 
 CATALOG: dict[str, type[Effect]] = {}
-# `law_of` the effects that hold a port at rest, of which every machine has one.
+# `law_of` dry friction, which every machine has.
 DRY_FRICTION = "dry friction"
 
 

@@ -80,8 +80,8 @@ class LuGre(Memory):
     recording in which the presliding is smaller than the sensor resolves: there it is Stribeck
     friction, and simpler. The damping of the bristles fades with the speed as the rise does: a constant
     one gives energy at speeds where `damping |speed|` exceeds `4 level g`, and a fit to a machine that
-    moves fast takes it for a damping of impacts. With this one no speed gives energy as long as
-    `damping slow` is below `9 level`.
+    moves fast takes it for a damping of impacts. With this one no speed gives energy where
+    `damping slow` is below `9 level`; a fitted value above that needs a check.
 
     Args:
         at: Port.

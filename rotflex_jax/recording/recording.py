@@ -394,26 +394,36 @@ def of_one_run(a: Recording, b: Recording) -> bool:
     return bool(moving >= FEWEST_MOVING) and np.array_equal(here, there)
 
 
+# What two parts of one run of one machine have in common.
+_OF_ONE_MACHINE = ("Ts", "channels", "units", "input_name", "input_unit", "constants")
+
+
 def joined(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
-    """Recordings in their order, where parts of one run that follow on each other are one recording."""
-    found: list[Recording] = []
-    for r in recordings:
-        ends = (k for k, a in enumerate(found) if _goes_on(a, r))
-        if (k := next(ends, None)) is None:
-            found.append(r)
+    """Recordings in their order, where parts of one run that follow on each other are one recording.
+
+    One that goes on where a later one of the sequence ends stands in the place of that one.
+    """
+    found = list(recordings)
+    for r in sorted(recordings, key=lambda r: r.start):
+        here = next(k for k, a in enumerate(found) if a is r)
+        before = next((k for k, a in enumerate(found) if k != here and _goes_on(a, r)), None)
+        if before is None:
             continue
-        u, y = (np.concatenate(pair) for pair in ((found[k].u, r.u), (found[k].y, r.y)))
-        found[k] = replace(found[k], u=u, y=y, accept=quality.ACCEPTABLE)
+        a = found[before]
+        u, y = (np.concatenate(pair) for pair in ((a.u, r.u), (a.y, r.y)))
+        found[before] = replace(a, u=u, y=y, accept=quality.ACCEPTABLE)
+        del found[here]
     return tuple(found)
 
 
 def _goes_on(a: Recording, b: Recording) -> bool:
     """Whether a part of a run knows that it begins where another one ends, on the same machine."""
     before = b.continues
-    if before is None or before.N < a.N or a.Ts != b.Ts or a.constants != b.constants:
+    if before is None or any(getattr(a, n) != getattr(b, n) for n in _OF_ONE_MACHINE):
         return False
+    n = min(a.N, before.N)  # `a` may be joined already, and longer than what `b` knows
     ends = math.isclose(a.start + a.N * a.Ts, b.start, abs_tol=0.5 * a.Ts)
-    return ends and np.array_equal(before.u[-a.N :], a.u) and np.array_equal(before.y[-a.N :], a.y)
+    return ends and np.array_equal(before.u[-n:], a.u[-n:]) and np.array_equal(before.y[-n:], a.y[-n:])
 
 
 def _beginning(recording: Recording) -> Recording:
