@@ -119,15 +119,15 @@ class LuGre(Memory):
 
     def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Time derivative of the state [1/s]."""
-        g = 1 + self.rise * self._at_rest(speed)
+        g = 1 + self.rise * self._fading(speed)
         return (speed - jnp.abs(speed) * z / g) / self.presliding
 
     def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Torque [N m] on the port."""
         bending = self.presliding * self.flow(z, position, speed, drive)
-        return -(self.level * z + self.damping * self._at_rest(speed) * bending)
+        return -(self.level * z + self.damping * self._fading(speed) * bending)
 
-    def _at_rest(self, speed: Scalar) -> Scalar:
+    def _fading(self, speed: Scalar) -> Scalar:
         """What is left at this speed of all that belongs to slow motion [-]."""
         return jnp.exp(-((speed / self.slow) ** 2))
 
