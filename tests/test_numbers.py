@@ -185,6 +185,14 @@ KNOWN = {
             ],
             "before",
         ),
+        **dict.fromkeys(
+            ["185.4", "2.5", "200.3", "2.0"], "viscous damping of the two files of EMPS, fitted by hand"
+        ),
+        **dict.fromkeys(
+            ["0.66", "0.75", "3.31", "3.2", "2.6", "0.51", "1.77", "1.10", "1.64", "3.3", "4.1"],
+            "errors over 2 s of these fits",
+        ),
+        **dict.fromkeys(["41.9", "0.1", "40.7"], "friction at a speed in both, by hand"),
         "2405.10779": "name of a preprint",
     },
     "seed_paper.md": {

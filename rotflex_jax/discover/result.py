@@ -194,7 +194,7 @@ class FinalFit:
     Attributes:
         fit: To the training and validation recordings together, with what each has for itself.
         recordings: What was fitted: training and validation recordings, parts of one run that follow on
-            each other as one, since they share the offsets of their run.
+            each other as one (`recording.joined`), since they share the offsets of their run.
         model: The model of it, with nothing that belongs to one recording.
         trained: Errors on validation recordings, with their own offsets where these are calibrated, of the
             structure fitted in the same way to training recordings alone.
@@ -252,6 +252,10 @@ class HorizonGain(NamedTuple):
 class Round:
     """One round of the search: an effect that was added.
 
+    Where another effect has taken the place of the one that the round added (a law that both horizons
+    prefer at the end, or one effect for several), `score`, `prediction` and `free_run` are those of the
+    effect that the round added; so is `held_out_gain_nats` where the stages have parameters of free runs.
+
     Attributes:
         effect: Name of the effect.
         port: Where it acts.
@@ -263,8 +267,8 @@ class Round:
         sentence: What was found, in words.
         equation: Its equation.
         doubts: Further reasons why the effect may stand in for something else, in words.
-        prediction: What it gained as a predictor when it was added; None for a calibration.
-        free_run: What it gained in free runs.
+        prediction: What was gained as a predictor when the round added its effect; None for a calibration.
+        free_run: The same in free runs.
     """
 
     effect: str

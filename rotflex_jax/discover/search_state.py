@@ -192,7 +192,7 @@ class SearchState:
         self.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
 
     def replace(self, old: EffectLocation, found: ValidatedHypothesis) -> None:
-        """Put another law in the place of an effect that was added; score and gains are of its round."""
+        """Put another law in the place of an effect that was added, whose score and gains remain."""
         new = found.location
         assert new
         # The new one may have been added before, and left out again.

@@ -1,7 +1,11 @@
 """The likelihood of validation data decides, and it may decide for a set of effects.
 
-Two candidates whose validation log-likelihoods differ by less than their scatter over half-second blocks
-are reported together; a richer effect must beat the simpler one that it contains beyond doubt.
+Two candidates are reported together unless log-likelihoods of all recordings differ by two standard
+deviations of their differences over half-second blocks, or errors of short free runs by a tenth; far from the
+noise, those that gain nearly the same are reported together too. A richer effect must beat the simpler one
+that it contains on validation and on training data, by two standard deviations of all blocks and with free
+runs that are no worse; or free runs of both must prefer it by 2.5 standard deviations, with errors that are
+smaller by a tenth.
 
 Every candidate is compared at two horizons, each with parameters fitted for it: as a predictor and in short
 free runs. Where another part of the model is wrong, the likeliest predictor follows the data within a few

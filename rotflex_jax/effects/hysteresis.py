@@ -78,18 +78,19 @@ class LuGre(Memory):
     In the usual symbols `level` is Fc, `level rise` is Fs - Fc, `level / presliding` is sigma0 and
     `damping` is sigma1; sigma2 is viscous damping, which has an effect of its own. Not for a
     recording in which the presliding is smaller than the sensor resolves: there it is Stribeck
-    friction, and simpler. The damping of the bristles fades with the speed as the rise does: a constant
-    one gives energy at speeds where `damping |speed|` exceeds `4 level g`, and a fit to a machine that
-    moves fast takes it for a damping of impacts. With this one no speed gives energy where
-    `damping slow` is below `9 level`; a fitted value above that needs a check.
+    friction, and simpler. Over the speed `slow` both the rise and the damping of the bristles are lost: at
+    `slow` a share exp(-1) of each is left. A constant damping gives energy at speeds where
+    `damping |speed|` exceeds `4 level g`, and a fit to a machine that moves fast takes it for a damping of
+    impacts. With this one no speed gives energy where `damping slow` is below `9 level`; a fitted value
+    above that needs a check.
 
     Args:
         at: Port.
         level: Friction torque when it slides fast [N m].
         rise: Breakaway level over `level`, less one.
-        slow: Speed over which the rise is lost [rad/s].
+        slow: Speed over which the rise and the damping of the bristles are lost [rad/s].
         presliding: Displacement over which the torque builds up [rad].
-        damping: Of the bristles [N m s/rad].
+        damping: Of the bristles, at rest [N m s/rad].
 
     Source: Canudas de Wit, Olsson, Åström and Lischinsky, IEEE Trans. Automatic Control 40, 1995,
     equations 1 to 4; damping that falls with the speed: Åström and Canudas de Wit, IEEE Control Systems
