@@ -49,10 +49,11 @@ def _read(file: str) -> Any:
 # -- wrong worlds -------------------------------------------------------------------------------------------
 
 
-def _worlds(marked: str, seen: bool = False) -> tuple[int, int]:
-    """How many wrong worlds have a mark, and of how many; without a hidden effect some marks are None."""
+def _worlds(marked: str, seen: bool = False, kind: str | None = None) -> tuple[int, int]:
+    """How many wrong worlds have a mark, of how many; without a hidden effect some marks are None."""
     every = results("B0_wrong_worlds.json")["records"].values()
     rows = [r for r in every if (r["world"] in SEEN_WORLDS) is seen and r.get(marked) is not None]
+    rows = [r for r in rows if kind in (None, r["kind"])]
     return sum(bool(r[marked]) for r in rows), len(rows)
 
 
@@ -60,6 +61,18 @@ def _worlds(marked: str, seen: bool = False) -> tuple[int, int]:
 def worlds_named() -> str:
     """Worlds whose hidden effect was named."""
     return "{} of {}".format(*_worlds("named"))
+
+
+@named
+def worlds_named_joint() -> str:
+    """Of these, flexible joints."""
+    return "{} of {}".format(*_worlds("named", kind="joint"))
+
+
+@named
+def worlds_named_link() -> str:
+    """Of these, links with a strain gauge."""
+    return "{} of {}".format(*_worlds("named", kind="link"))
 
 
 @named

@@ -76,6 +76,9 @@ def test_the_arena_measures_the_search() -> None:
     assert {f"rotflex_jax/{name}.py" for name in parts} <= measured
     assert "benchmarks/arena/trial.py" in measured
     assert not any(path.startswith(("rotflex_jax/report", "rotflex_jax/cli")) for path in measured)
+    # A table of a benchmark shows; the one of `compare` computes errors.
+    assert not any(path.startswith("benchmarks") and path.endswith("table.py") for path in measured)
+    assert "rotflex_jax/compare/table.py" in Imports().sources("B5_compare")
 
 
 MODULE = """'''A text.'''
@@ -122,6 +125,9 @@ def test_results_are_of_an_earlier_version_once_what_they_measure_has_changed(tm
     project(other, benchmarks__B1="a = 2\n")
     assert standing(results, other) == (False, ("abc",), ("benchmarks/B1.py",))
     assert standing(results, tmp_path / "gone").changed == ("benchmarks/B1.py",)
+    # What shows changes no number, though a run may have noted its digest.
+    shown = {"s": sources["s"] | {"benchmarks/arena/wrong_table.py": "before"}}
+    assert standing({**results, "sources": shown}, tmp_path).present
 
 
 def test_a_run_says_what_made_it(monkeypatch) -> None:
