@@ -193,7 +193,7 @@ KNOWN = {
             "errors over 2 s of these fits",
         ),
         **dict.fromkeys(["41.9", "0.1", "40.7"], "friction at a speed in both, by hand"),
-        **dict.fromkeys(["4.97", "3.87", "7.25", "0.86", "4.54"], "rigid arm and halves of EMPS before"),
+        **dict.fromkeys(["4.97", "3.87", "7.25", "0.86", "4.54", "3.18", "2.04"], "errors before"),
         "2405.10779": "name of a preprint",
     },
     "seed_paper.md": {
