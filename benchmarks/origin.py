@@ -37,7 +37,10 @@ SHOWN = ("text", "report", "notebook", "cli", "errors", "checks")
 """Parts of the package that write, show or refuse."""
 
 DRAWN = ("page", "pages", "figure", "figures", "drawing", "origin")
-"""Last words of the names of modules that do, wherever they stand; of benchmarks `table` too."""
+"""Last words of the names of modules that do, wherever they stand."""
+
+TABLE = "table"
+"""Last word of the names of modules of the benchmarks that do; `rotflex_jax/compare/table.py` computes."""
 
 REGISTRIES = ("rotflex_jax.effects", "rotflex_jax.compare")
 """Packages that count as a whole, since what is in them is found by a registry."""
@@ -211,13 +214,13 @@ def _shows(name: str) -> bool:
     """Whether a module writes, shows or refuses."""
     parts = name.split(".")
     inside = parts[0] == "rotflex_jax" and len(parts) > 1
-    last = parts[-1].split("_")[-1]
-    return last in DRAWN or (inside and parts[1] in SHOWN) or (not inside and last == "table")
+    drawn = parts[-1].split("_")[-1] in DRAWN
+    return drawn or (inside and parts[1] in SHOWN) or (not inside and _is_table(parts[-1]))
 
 
-def _module(path: str) -> str:
-    """Full name of the module in a file, by its path from the folder of the project."""
-    return path.removeprefix("benchmarks/").removesuffix(".py").replace("/", ".")
+def _is_table(name: str) -> bool:
+    """Whether a module of the benchmarks is a table, by the last part of its name."""
+    return name.split("_")[-1] == TABLE
 
 
 def _absolute(node: ast.ImportFrom, name: str, file: Path) -> str:
@@ -380,8 +383,9 @@ def standing(results: dict[str, Any], root: Path = ROOT) -> Standing:
     runs = runs_that_count(results)
     for run in runs:
         measured = results.get("sources", {}).get(run.get("sources"))
-        counted = {p: digest for p, digest in (measured or {}).items() if not _shows(_module(p))}
-        other = {path for path, digest in counted.items() if _now(root / path) != digest}
+        other = {path for path, digest in (measured or {}).items() if _now(root / path) != digest}
+        # Runs from before tables were left out have noted them.
+        other -= {path for path in other if path.startswith("benchmarks/") and _is_table(Path(path).stem)}
         if measured and not other and not of_changed_tree(run):
             continue
         present = False

@@ -128,6 +128,14 @@ def test_results_are_of_an_earlier_version_once_what_they_measure_has_changed(tm
     # What shows changes no number, though a run may have noted its digest.
     shown = {"s": sources["s"] | {"benchmarks/arena/wrong_table.py": "before"}}
     assert standing({**results, "sources": shown}, tmp_path).present
+    # A benchmark of pages is measured by its own results, whatever its name.
+    pages = {"s": sources["s"] | {"benchmarks/B8_pages.py": "before"}}
+    assert standing({**results, "sources": pages}, tmp_path).changed == ("benchmarks/B8_pages.py",)
+    # So are files that a benchmark names, and modules of the package that are called so.
+    named = {
+        "s": sources["s"] | {f"rotflex_jax/{name}.py": "before" for name in ("report/page", "compare/table")}
+    }
+    assert len(standing({**results, "sources": named}, tmp_path).changed) == 2
 
 
 def test_a_run_says_what_made_it(monkeypatch) -> None:

@@ -613,17 +613,16 @@ def laden(request) -> Laden:
 
 
 def test_derivatives_of_a_trajectory_equal_central_differences(laden):
-    m = laden
     with double_precision():
-        u, x0 = jnp.asarray(noise(m.N, seed=3)), jnp.asarray([0.2, 0.01, 0.5, -0.3])
-        values, gates = jnp.asarray(m.joint.values), jnp.ones(len(m.joint.effects))
-        forward = np.asarray(m.forward(values, gates, u, x0)[0])
+        u, x0 = jnp.asarray(noise(laden.N, seed=3)), jnp.asarray([0.2, 0.01, 0.5, -0.3])
+        values, gates = jnp.asarray(laden.joint.values), jnp.ones(len(laden.joint.effects))
+        forward = np.asarray(laden.forward(values, gates, u, x0)[0])
         weights = jnp.asarray(np.random.default_rng(0).normal(size=forward.shape[:2]))
-        backward = m.backward(values, gates, u, x0, weights)[0] if m.case in BACKWARD else None
-        for i, name in enumerate(m.joint.parameter_names):
+        backward = laden.backward(values, gates, u, x0, weights)[0] if laden.case in BACKWARD else None
+        for i, name in enumerate(laden.joint.parameter_names):
             # A step small enough that no stick or reversal moves to another sample.
             h = 1e-6 * abs(float(values[i]))
-            plus, minus = (np.asarray(m.run(values.at[i].add(s * h), gates, u, x0)) for s in (1, -1))
+            plus, minus = (np.asarray(laden.run(values.at[i].add(s * h), gates, u, x0)) for s in (1, -1))
             expected = (plus - minus) / (2 * h)
             size = np.abs(expected).max()
             assert size > 0, name
@@ -643,33 +642,31 @@ def test_every_effect_has_its_derivatives_checked():
 
 def test_no_derivative_is_nan_at_rest_or_where_effects_are_absent(laden):
     """All amplitudes and gates at zero, nothing moves; then the voltage sits on the kinks."""
-    m = laden
-    absent = [e.replace(**dict.fromkeys(e.amplitudes, 0.0)) for e in m.joint.effects[m.first :]]
-    bare = with_all(paper(**({"inductance": 1e-4} if m.case == "smooth" else {})), *absent)
-    kinks = np.resize([0.0, 0.15, -0.1, 1.2, -1.2, 0.0, 0.0], m.N)
+    absent = [e.replace(**dict.fromkeys(e.amplitudes, 0.0)) for e in laden.joint.effects[laden.first :]]
+    bare = with_all(paper(**({"inductance": 1e-4} if laden.case == "smooth" else {})), *absent)
+    kinks = np.resize([0.0, 0.15, -0.1, 1.2, -1.2, 0.0, 0.0], laden.N)
     with double_precision():
-        x0, weights = jnp.zeros(4), jnp.ones((m.N, 2))
-        for u in (jnp.zeros(m.N), jnp.asarray(kinks)):
-            for values in (jnp.asarray(m.joint.values), jnp.asarray(bare.values)):
+        x0, weights = jnp.zeros(4), jnp.ones((laden.N, 2))
+        for u in (jnp.zeros(laden.N), jnp.asarray(kinks)):
+            for values in (jnp.asarray(laden.joint.values), jnp.asarray(bare.values)):
                 for size in (0.0, 1.0):
-                    gates = jnp.ones(len(m.joint.effects)).at[m.first :].set(size)
-                    found = [m.run(values, gates, u, x0), *m.forward(values, gates, u, x0)]
-                    if m.case in BACKWARD:
-                        found += m.backward(values, gates, u, x0, weights)
+                    gates = jnp.ones(len(laden.joint.effects)).at[laden.first :].set(size)
+                    found = [laden.run(values, gates, u, x0), *laden.forward(values, gates, u, x0)]
+                    if laden.case in BACKWARD:
+                        found += laden.backward(values, gates, u, x0, weights)
                     assert all(np.isfinite(a).all() for a in found)
 
 
 def test_the_first_trace_of_an_effect_shows_in_the_derivative(laden):
     """At gate zero the slope is that of a small gate: what a score test stands on."""
-    m = laden
     with double_precision():
-        u, x0, h = jnp.asarray(noise(m.N, seed=4)), jnp.zeros(4), 1e-5
-        values = jnp.asarray(m.joint.values)
-        off = jnp.ones(len(m.joint.effects)).at[m.first :].set(0.0)
-        slopes = np.asarray(m.forward(values, off, u, x0)[1])
-        zero = np.asarray(m.run(values, off, u, x0))
-        for i in range(m.first, len(m.joint.effects)):
-            trace = (np.asarray(m.run(values, off.at[i].set(h), u, x0)) - zero) / h
+        u, x0, h = jnp.asarray(noise(laden.N, seed=4)), jnp.zeros(4), 1e-5
+        values = jnp.asarray(laden.joint.values)
+        off = jnp.ones(len(laden.joint.effects)).at[laden.first :].set(0.0)
+        slopes = np.asarray(laden.forward(values, off, u, x0)[1])
+        zero = np.asarray(laden.run(values, off, u, x0))
+        for i in range(laden.first, len(laden.joint.effects)):
+            trace = (np.asarray(laden.run(values, off.at[i].set(h), u, x0)) - zero) / h
             size = np.abs(trace).max()
             assert size > 0
             np.testing.assert_allclose(
@@ -677,5 +674,5 @@ def test_the_first_trace_of_an_effect_shows_in_the_derivative(laden):
                 trace,
                 rtol=0,
                 atol=2e-3 * size,
-                err_msg=f"{m.joint.effects[i].name} at {m.joint.effects[i].at}",
+                err_msg=f"{laden.joint.effects[i].name} at {laden.joint.effects[i].at}",
             )
