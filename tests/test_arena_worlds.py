@@ -20,7 +20,7 @@ from rotflex_jax.arena.simulator.plant import Plant, simulate
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.arena.simulator.seen import distinctness
 from rotflex_jax.arena.simulator.voltage import Path, supply
-from rotflex_jax.arena.wrong_worlds import HIDDEN, VISIBLE, _hides, world
+from rotflex_jax.arena.wrong_worlds import HIDDEN, VISIBLE, _hides, _modes, world
 
 Ts = 0.002
 PD = Controller("pd_theta", (8.0, 0.0, 0.4, 0.0), 40.0)
@@ -138,6 +138,16 @@ def test_what_is_between_angle_and_reading():
     noisy = dataclasses.replace(sensors, noise=(0.0, 0.01))
     error = (run(noisy).y - run(noisy).clean).std(axis=0)
     np.testing.assert_allclose(error, noisy.deviation(), rtol=0.2)
+
+
+@pytest.mark.parametrize("link", [True, False])
+def test_a_gauge_shows_no_oscillator_that_is_not_there(link):
+    """What is absent rests at zero: shown as a deflection, it would be the angle of hub or arm."""
+    drawn = [_modes(np.random.default_rng(seed), link).values for seed in range(40)]
+    assert {tuple(d["modes"]) for d in drawn} == ({("hub",), ("hub", "arm")} if link else {("arm",)})
+    for d in drawn:
+        shown = dict(zip(("hub", "arm"), d["shown"], strict=True))
+        assert {port for port, share in shown.items() if share} == (set(d["modes"]) if link else set())
 
 
 def test_only_what_other_constants_cannot_imitate_is_visible():

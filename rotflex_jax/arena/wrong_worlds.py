@@ -178,7 +178,9 @@ def _modes(rng: np.random.Generator, link: bool) -> Beside:
     modes = {"hub" if link else "arm": own(12.0, 25.0)}
     if link and rng.random() < 0.5:
         modes["arm"] = own(28.0, 60.0)
-    shown = [_sign(rng) * log_uniform(rng, 0.1, 0.8) * link for _ in range(2)]
+    share = [_sign(rng) * log_uniform(rng, 0.1, 0.8) for _ in ("hub", "arm")]
+    # An oscillator that is absent rests at zero: its "deflection" would be the angle of its port.
+    shown = [s if link and port in modes else 0.0 for s, port in zip(share, ("hub", "arm"), strict=True)]
     names = (("second_mode", "hub"), ("second_mode", "arm"))
     return Beside("more_modes", {"modes": modes, "shown": shown}, names)
 
