@@ -111,7 +111,7 @@ def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
 
 
 def _emps(_: list[rf.Recording]) -> list[Way]:
-    # The pulses of the test record were not measured, so that nothing is learnt from it.
+    # The test record has pulses of the voltage, which the training record lacks: it has no say.
     official = rf.data.benchmark("emps")
     return [
         learnt("official", [official.train], list(official.tests.values())),
