@@ -130,8 +130,8 @@ class Transform:
         return np.where(boxed, np.log(share / (1 - share)), z)
 
 
-def _bound_reached(value: float, std: float, spec: Specification) -> str:
-    """The bound that an estimate is at: by its number, or near it with an interval that goes beyond."""
+def bound_reached(value: float, spec: Specification, std: float = math.nan) -> str:
+    """The bound that a value is at, in words: by its number, or near it with an interval that goes beyond."""
     for room, which in ((value - spec.lower, "lower"), (spec.upper - value, "upper")):
         near = room < 1e-2 * spec.typical and (math.isnan(std) or room <= HALF_WIDTH_95 * std)
         if math.isfinite(room) and (room < 1e-6 * spec.typical or near):
@@ -203,7 +203,7 @@ class Estimate:
         remarks = [note] if note else []
         if not low <= value <= high:
             remarks.append("outside its physical range")
-        bound = "" if "bound" in note else _bound_reached(value, std, spec)
+        bound = "" if "bound" in note else bound_reached(value, spec, std)
         if bound:
             remarks.append(bound)
         elif math.isnan(std) and "bound" not in note:

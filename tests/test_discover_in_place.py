@@ -97,9 +97,12 @@ def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch
 
 def test_a_law_that_both_horizons_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch):
     final, better, best = model(STRIBECK, DELAY), model(DAHL, DELAY), model(LUGRE, DELAY)
-    tried = [dataclasses.replace(v, location=p) for v, p in ((better, DAHL), (best, LUGRE))]
+    at_bound = model(COULOMB, DELAY)
+    laws = ((at_bound, COULOMB), (better, DAHL), (best, LUGRE))
+    tried = [dataclasses.replace(v, location=p) for v, p in laws]
     monkeypatch.setattr(in_place, "_in_place", lambda state, p, laws: tried if p == STRIBECK else [])
     monkeypatch.setattr(in_place, "both_prefer", lambda rival, found, data: True)
+    monkeypatch.setattr(in_place, "_shape_at_bound", lambda s, v: v.location == COULOMB)
     monkeypatch.setattr(in_place, "shares_of_gain", lambda rivals, found: np.array([1.0, 1.5]))
     monkeypatch.setattr(in_place, "parameter_count", lambda s, h, p: 3)
     monkeypatch.setattr(in_place, "describe", lambda rival, found: str(rival.location))
@@ -118,6 +121,31 @@ def test_a_law_that_both_horizons_prefer_takes_the_place(monkeypatch: pytest.Mon
     # One that they do not prefer leaves all as it is.
     monkeypatch.setattr(in_place, "both_prefer", lambda rival, found, data: False)
     assert in_place.take_better_laws(state) == () and state.current.hypothesis is best.hypothesis
+
+
+@pytest.mark.parametrize("horizon", ["predictions", "free runs"])
+def test_a_shape_at_a_bound_is_that_of_another_law(horizon: str):
+    """At either horizon. A level of zero is no shape: it is the law switched off."""
+    names = ("level", "rise", "slow", "presliding", "damping")
+    specs = fx.LuGre.__dataclass_fields__
+    s: Any = SimpleNamespace(
+        candidates={
+            LUGRE: SimpleNamespace(parameters=range(5), amplitudes=(True, False, False, False, True)),
+        },
+        mechanism=SimpleNamespace(parameter_specifications=[specs[n].metadata["parameter"] for n in names]),
+    )
+
+    def fitted(*values: float) -> ValidatedHypothesis:
+        h: Any = SimpleNamespace(mean_values=lambda s: np.array(values))
+        return ValidatedHypothesis(h, np.zeros(1), h, np.ones(1), location=LUGRE)
+
+    inside = fitted(0.0, 0.5, 0.3, 0.003, 0.0)
+    ends = [(9.999, 0.3, 0.003), (0.5, 0.0011, 0.003), (0.5, 0.3, 1.1e-6)]
+    for shape in ends:
+        end = fitted(0.02, *shape, 0.01)
+        pair = (end, inside) if horizon == "predictions" else (inside, end)
+        assert in_place._shape_at_bound(s, dataclasses.replace(pair[0], free_run=pair[1]))
+    assert not in_place._shape_at_bound(s, dataclasses.replace(inside, free_run=inside))
 
 
 LAWS = [(fx.Coulomb, "hub"), (fx.Stribeck, "hub"), (fx.Dahl, "hub")]

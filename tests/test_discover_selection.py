@@ -553,6 +553,9 @@ def test_shares_of_the_most_add_up_over_the_horizons() -> None:
     np.testing.assert_allclose(shares_of_gain([candidate, alone], before), [1.0, 0.5])
 
 
+AHEAD = {"held_out": 1.0, "train": 1.0}
+
+
 @SIDES
 @pytest.mark.parametrize("what", ["windows", "scatter", "held_out", "train"])
 def test_a_law_takes_the_place_of_another_one_where_both_horizons_prefer_it(side: float, what: str) -> None:
@@ -564,9 +567,20 @@ def test_a_law_takes_the_place_of_another_one_where_both_horizons_prefer_it(side
         "train": (8.0 + 0.5 * np.log(2 * N)) * side,
     }
     given = {"held_out": 100.0, "train": 100.0, "windows": 3.0, "scatter": 0.0} | {what: limits[what]}
-    found = trial(COULOMB, windows=5.0)
-    rival = trial(EffectLocation("dahl", "hub"), **given, numbers=2)
+    found = at_both({"windows": 5.0}, {"windows": 5.0}, COULOMB)
+    rival = dataclasses.replace(at_both(given, {"windows": 5.0, **AHEAD}, DAHL), parameter_count=2)
     assert both_prefer(rival, found, DATA) is (side > 1)
+
+
+@pytest.mark.parametrize("kind", ["held_out", "train"])
+def test_a_law_that_free_runs_speak_against_takes_no_place(kind: str) -> None:
+    """Of training data as well as of validation data, whatever predictions say."""
+    found = at_both({"windows": 5.0}, {"windows": 5.0}, COULOMB)
+    given = {"held_out": 100.0, "train": 100.0, "windows": 3.0}
+    for lead, taken in ((1.0, True), (-1.0, False)):
+        runs = {"windows": 5.0, **AHEAD, kind: lead}
+        rival = dataclasses.replace(at_both(given, runs, DAHL), parameter_count=2)
+        assert both_prefer(rival, found, DATA) is taken
 
 
 @SIDES
@@ -725,13 +739,19 @@ def test_free_runs_exclude_a_law_that_differs_by_more_than_is_left(side: float) 
 
 
 @SIDES
-def test_a_generalisation_is_preferred_by_both_kinds_of_data(side: float) -> None:
-    more = in_place(LUGRE, numbers=5, held_out=10.0, train=side * MORE_NEEDED)
+def test_a_generalisation_does_better_on_both_kinds_of_data(side: float) -> None:
+    """By what its parameters cost, or, however little it gains, beyond doubt."""
+    vague = 200.0  # of the scatter: far from two deviations
+    more = in_place(LUGRE, numbers=5, held_out=10.0, train=side * MORE_NEEDED, scatter=vague)
     assert remains(more) is (side > 1)
-    assert remains(in_place(LUGRE, numbers=5, held_out=10.0 * (side - 1.0), train=100.0)) is (side > 1)
-    # Or by free runs, beyond doubt on both.
-    assert remains(in_place(LUGRE, numbers=5, windows=9.0, z=2.5 * side, better=True)) is (side > 1)
-    # Beside a special case or another law there is nothing to be preferred.
+    slight = in_place(LUGRE, numbers=5, held_out=10.0 * (side - 1.0), train=100.0, scatter=vague)
+    assert remains(slight) is (side > 1)
+    sure = {"held_out": 3.0, "train": 3.0, "scatter": scatter_for(2.0 * side, 3.0)}
+    assert remains(in_place(LUGRE, numbers=5, **sure)) is (side > 1)
+    assert not remains(in_place(LUGRE, numbers=5, **sure | {"train": -3.0, "scatter": 0.0}))
+    # Or at the other horizon.
+    assert remains(in_place(LUGRE, numbers=5, windows=9.0, z=2.0 * side, better=True)) is (side > 1)
+    # Beside a special case or another law there is nothing to be better at.
     assert remains(in_place(COULOMB, numbers=1)) and remains(in_place(DAHL, numbers=2))
 
 

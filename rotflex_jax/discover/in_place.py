@@ -20,6 +20,7 @@ from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.labels import law_of
+from rotflex_jax.parameters import bound_reached
 
 
 def other_laws(s: SuperModel, location: EffectLocation) -> list[EffectLocation]:
@@ -46,6 +47,7 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
         known = _as_found(state, location)
         fitted = _in_place(state, location, laws)
         better = [v for v in fitted if both_prefer(v, known, state.problem.dataset.data)]
+        better = [v for v in better if not _shape_at_bound(s, v)]
         if not better:
             continue
         best = better[int(np.argmax(shares_of_gain(better, known)))]
@@ -57,6 +59,15 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
             "beside all that was found, predictions and free runs prefer it."
         )
     return tuple(notes)
+
+
+def _shape_at_bound(s: SuperModel, found: ValidatedHypothesis) -> bool:
+    """Whether the shape of a law ends at a bound, at either horizon: what the data ask for is another law."""
+    assert found.location and found.free_run
+    c, specs = s.candidates[found.location], s.mechanism.parameter_specifications
+    shape = [i for i, amplitude in zip(c.parameters, c.amplitudes, strict=True) if not amplitude]
+    fits = [v.hypothesis.mean_values(s) for v in (found, found.free_run)]
+    return any(bound_reached(float(values[i]), specs[i]) for values in fits for i in shape)
 
 
 def _as_found(state: SearchState, location: EffectLocation) -> ValidatedHypothesis:

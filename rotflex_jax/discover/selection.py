@@ -228,7 +228,7 @@ def undecided(
     What such a model lacks suits one of two laws better than the other. It cannot make the whole difference
     where free runs over training and validation data differ by more than is left of their errors, or where
     predictions lose more than would be gained if what is left were the sensor noise alone. A generalisation
-    must be preferred besides: without a use for its further parameters it is the law that was found.
+    must do better besides: without a use for its further parameters it is the law that was found.
 
     Args:
         found: The model that was found; `parameter_count` is that of the effect.
@@ -236,7 +236,7 @@ def undecided(
         left: What predictions of training and validation data leave above the sensor noise [nat].
         data: Training recordings.
     """
-    if _contained(found, rival) and not prefers(rival, found, data):
+    if _contained(found, rival) and not (prefers(rival, found, data) or _leads(rival, found)):
         return False
     lost = paired_gain(found.blocks, rival.blocks)[0] + _training_gain(found, rival)[0]
     if predictions_apart(found, rival) and lost > left:
@@ -247,6 +247,8 @@ def undecided(
 def both_prefer(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: StackedRecordings) -> bool:
     """Whether predictions beyond doubt and free runs by a tenth prefer a rival in the place of an effect.
 
+    Free runs over training data must not speak against it.
+
     Args:
         rival: The model with the rival in the place of the effect.
         found: The model that was found; `parameter_count` is that of the effect.
@@ -255,7 +257,17 @@ def both_prefer(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: St
     more = max(rival.parameter_count - found.parameter_count, 0)
     gains = paired_gain(rival.blocks, found.blocks)[0], _training_gain(rival, found)[0]
     enough = gains[0] > HELD_OUT_NATS and gains[1] > _needed(more, data)
-    return enough and predictions_apart(rival, found) and free_runs_apart(rival, found)
+    apart = predictions_apart(rival, found) and free_runs_apart(rival, found)
+    return enough and apart and _free_run_certainty(rival, found) > 0
+
+
+def _leads(rich: ValidatedHypothesis, simple: ValidatedHypothesis) -> bool:
+    """Whether training and validation data both distinguish a generalisation, at one of the horizons.
+
+    What it gains need not be worth its parameters: beside what a poor model leaves, that size says little.
+    """
+    certainty = paired_gain(rich.blocks, simple.blocks)[1], _training_gain(rich, simple)[1]
+    return min(certainty) > SEPARATE_Z or _free_run_certainty(rich, simple) > SEPARATE_Z
 
 
 def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
