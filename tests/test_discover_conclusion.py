@@ -170,12 +170,32 @@ def test_one_effect_in_the_place_of_several_has_the_signs_of_its_part(monkeypatc
         gains={HUB: (HorizonGain(1.0, 2.0, 0.5, 3.0), None), merged: (HorizonGain(1.0, 2.0, 0.5, 3.0), None)},
         horizons=types.SimpleNamespace(prediction=None, free_run=None),
         current=None,
+        order=[merged],
         in_place_of={merged: HUB},
     )
     asked = {}
     monkeypatch.setattr(summary, "signs", lambda *a: asked.update(gains=a[2]) or {HUB: ("it is small",)})
     assert summary.stand_ins(state)[merged] == ("it is small",)
     assert asked["gains"][HUB] == 4.0
+
+
+def test_a_bias_beside_another_fault_of_its_sensor_is_provisional(monkeypatch: pytest.MonkeyPatch):
+    """Beside a fault of another sensor, or friction, it is not."""
+    rectifier, bias, other = (
+        EffectLocation(*p)
+        for p in (("rectifier", "alpha"), ("sensor_bias", "alpha"), ("sensor_bias", "theta"))
+    )
+    state = types.SimpleNamespace(
+        gains={},
+        horizons=types.SimpleNamespace(prediction=None, free_run=None),
+        current=None,
+        order=[HUB, rectifier, bias, other],
+        in_place_of={},
+    )
+    monkeypatch.setattr(summary, "signs", lambda *a: {})
+    assert summary.stand_ins(state) == {
+        bias: ("what rectifying sensor of alpha leaves of the error of alpha may look like a bias",)
+    }
 
 
 HELPS = HorizonGain(1.0, 2.0, 0.5)

@@ -16,9 +16,9 @@ from rotflex_jax.discover.checkpoint import (
     restored,
 )
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
-from rotflex_jax.discover.input_reading import nats_if_smooth, smooth_note
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.pairs import promising_pairs
+from rotflex_jax.discover.reading import nats_if_smooth, opposite_signs, sign_note, smooth_note
 from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.score_test import PairScore, Score, ScoreTest, residual_lines, score_test
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
@@ -65,7 +65,7 @@ class SearchState:
         tested: The model whose score tests were made last.
         nominal: The user's model with the values that it has, where the fit has moved far away from these.
         resumed: After how many rounds of a search that was stopped this one went on.
-        smooth_nats: What the model gains with an input that is smooth between samples [nat]; zero if unclear.
+        reading_notes: That the recordings may have been read wrongly, in sentences.
         digest: Of all that the models depend on.
     """
 
@@ -75,7 +75,7 @@ class SearchState:
     current: ValidatedHypothesis
     digest: str = ""
     resumed: int = 0
-    smooth_nats: float = 0.0
+    reading_notes: tuple[str, ...] = ()
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
@@ -135,6 +135,12 @@ class SearchState:
         return dict(zip(self.model.mechanism.channels, self.problem.noise.tolist(), strict=True))
 
     @property
+    def units(self) -> dict[str, str]:
+        """Channel -> its own unit."""
+        channels, recording = self.model.mechanism.channels, self.validation.problem.dataset.recordings[0]
+        return {c: recording.units[recording.channels.index(c)] for c in channels}
+
+    @property
     def reported(self) -> SearchHorizon:
         """The horizon whose parameters a user gets: that of predictions, unless free runs are clearly better.
 
@@ -152,9 +158,8 @@ class SearchState:
 
     def reached(self, label: str, added: Sequence[AddedEffect] = ()) -> None:
         """Report the error of the current model, after effects were added."""
-        channels, recording = self.model.mechanism.channels, self.validation.problem.dataset.recordings[0]
-        units = {c: recording.units[recording.channels.index(c)] for c in channels}
-        line = milestone(label, channels, units, best_window_rmse(self.current), self.problem.noise)
+        channels, errors = self.model.mechanism.channels, best_window_rmse(self.current)
+        line = milestone(label, channels, self.units, errors, self.problem.noise)
         if (runs := self.current.free_run) is not None:
             stage = KeptStage(kept(self.current.hypothesis), kept(runs.hypothesis), tuple(added))
             line.kept = stage.to_dict(self.digest)
@@ -215,9 +220,14 @@ def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -
 
 
 def _check_baseline(state: SearchState) -> None:
-    """Whether the baseline would rather have a smooth input, and whether its fit has gone far away."""
-    state.smooth_nats = nats_if_smooth(state.problem, state.current.hypothesis)
-    for line in smooth_note(state.smooth_nats):
+    """Whether the baseline asks for another reading of the data, and whether its fit has gone far away."""
+    notes = smooth_note(nats_if_smooth(state.problem, state.current.hypothesis))
+    if runs := state.current.free_run:
+        problem, seconds = state.horizons.free_run.problem, state.validation.window_seconds
+        signs = opposite_signs(state.model, problem, runs.hypothesis, seconds)
+        notes += sign_note(signs, state.units, seconds)
+    state.reading_notes = notes
+    for line in notes:
         state.say(line)
     fits = [v.hypothesis for v in (state.current, state.current.free_run) if v]
     if any(far_from_given(state.problem.supermodel, h) for h in fits):

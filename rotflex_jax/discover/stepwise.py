@@ -52,7 +52,7 @@ def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
     least, most = problem.process_noise_range
     intensities = (most, np.sqrt(least * most), least)
     # A distant start is safe only with a short horizon: all paths begin with one.
-    near = problem.with_process_noise(_start(problem), dict.fromkeys(problem.ports, 100 * most))
+    near = problem.with_process_noise(values_given(problem), dict.fromkeys(problem.ports, 100 * most))
     problem.make_ahead([near])
     near = refit(problem, [near], alternations=0)[0]
     paths = [problem.with_process_noise(near, dict.fromkeys(problem.ports, q)) for q in intensities]
@@ -69,7 +69,7 @@ def fit_free_run_baseline(problem: LikelihoodProblem, prediction: Hypothesis) ->
         problem: Of free runs.
         prediction: The user's model fitted to predictions.
     """
-    starts = [as_free_run(problem, h) for h in (prediction, _start(problem))]
+    starts = [as_free_run(problem, h) for h in (prediction, values_given(problem))]
     able = [h for h in starts if np.isfinite(h.log_likelihood)] or starts[:1]
     return max(refit(problem, able), key=lambda h: h.log_likelihood)
 
@@ -90,11 +90,11 @@ def far_from_given(s: SuperModel, h: Hypothesis) -> list[int]:
 def as_given(horizons: Horizons) -> ValidatedHypothesis:
     """The user's model with the values that it has and the process noise that suits these, validated."""
     problem = horizons.prediction.problem
-    h = choose_process_noise(problem, _start(problem), wide=True)
+    h = choose_process_noise(problem, values_given(problem), wide=True)
     return horizons.validated(h, as_free_run(horizons.free_run.problem, h))
 
 
-def _start(problem: LikelihoodProblem) -> Hypothesis:
+def values_given(problem: LikelihoodProblem) -> Hypothesis:
     """The user's model with the values that it has, and calibrations of zero."""
     s, first = problem.supermodel, problem.windows.first_states
     R, C = len(first), len(s.mechanism.channels)

@@ -20,7 +20,6 @@ from rotflex_jax.discover.evaluation import (
 )
 from rotflex_jax.discover.final_fit import fit_to_all
 from rotflex_jax.discover.hypothesis import Hypothesis, without
-from rotflex_jax.discover.input_reading import smooth_note
 from rotflex_jax.discover.likelihood import choose_process_noise, refit
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
@@ -46,6 +45,8 @@ from rotflex_jax.discover.stepwise import (
 )
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, validate
+from rotflex_jax.effects import CATALOG, SensorBias
+from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.fit.plausibility import Remark, at_bounds, beyond_recordings
 from rotflex_jax.recording import Recording
 
@@ -145,7 +146,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
         noise_floor=state.noise_floor,
         elapsed_s=time.perf_counter() - started,
         notes=(
-            *smooth_note(state.smooth_nats),
+            *state.reading_notes,
             *_resumed(state.resumed),
             *conditional_note(conditional),
             *calibration_notes(supermodel, evaluated.final, state.own),
@@ -291,8 +292,21 @@ def stand_ins(state: SearchState) -> dict[EffectLocation, tuple[str, ...]]:
     """Signs that effects stand in for something else, of the final model at both horizons."""
     gains = {p: at.gain + at.training_gain for p, (at, _) in state.gains.items()}
     found = signs((state.horizons.prediction, state.horizons.free_run), state.current, gains)
+    found |= _biases_beside_other_faults(state.order)
     # One effect in the place of several has the signs of the one whose place in the order it took.
     return found | {new: found[old] for new, old in state.in_place_of.items() if old in found}
+
+
+def _biases_beside_other_faults(order: Sequence[EffectLocation]) -> dict[EffectLocation, tuple[str, ...]]:
+    """Biases of channels that have another fault, a part of whose error may look like a bias."""
+    found = {}
+    for bias in (p for p in order if p.effect == SensorBias.name):
+        others = (p for p in order if p != bias and p.port == bias.port)
+        faults = [p for p in others if CATALOG[p.effect].acts_on == "channel"]
+        if faults:
+            named = " and ".join(effect_phrase(p.effect, p.port) for p in faults)
+            found[bias] = (f"what {named} leaves of the error of {bias.port} may look like a bias",)
+    return found
 
 
 def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: Stage, before: Stage) -> float:

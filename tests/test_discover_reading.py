@@ -1,11 +1,15 @@
-"""An input that is smooth between its samples is noticed, and read so the right friction is named."""
+"""A smooth input is noticed, and so is a channel with the opposite sign."""
+
+import dataclasses
+import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.input_reading import held_equivalent
+from rotflex_jax.discover.reading import held_equivalent
 from rotflex_jax.effects import Coulomb, LuGre, Stribeck
 
 FAST, SLOW, SECONDS = 1000, 100, 12.0
@@ -53,3 +57,39 @@ def test_a_held_input_is_not_offered_another_reading() -> None:
     demo = rf.data.demo_recording().slice(0, 1500)
     found = rf.discover(rf.joints.paper(), *demo.split(0.7), candidates=FRICTIONS, rounds=0)
     assert not any("--intersample" in note for note in found.notes)
+
+
+def signs(train: rf.Recording, validation: rf.Recording, model: rf.Mechanism) -> tuple[list[str], list[str]]:
+    """What is said of signs in the notes of a search, and while it runs."""
+    said: list[str] = []
+    found = rf.discover(model, train, validation, candidates=FRICTIONS, rounds=0, progress=said.append)
+    notes, lines = ([x for x in texts if "opposite sign" in x] for texts in (found.notes, said))
+    return notes, lines
+
+
+def negated(r: rf.Recording) -> rf.Recording:
+    return dataclasses.replace(r, y=r.y * np.array([1.0, -1.0]))
+
+
+@pytest.mark.parametrize("stiffness", [0.4, 16.0])
+def test_a_channel_with_the_opposite_sign_is_named(stiffness: float) -> None:
+    """From stiffnesses that are far from the machine's, 1.6 N m/rad; the right sign is left alone."""
+    r = make_record({("coulomb", "hub"): {"level": 0.03}}, kind="steps", seed=3, seconds=8.0, fs=250.0)
+    runs = rf.Recording(u=r["u"], y=r["y"], Ts=1 / 250).split(0.7)
+    joint = rf.joints.paper().with_values({"joint.spring.stiffness": stiffness})
+    notes, lines = signs(*map(negated, runs), joint)
+    assert notes == lines
+    (note,) = notes
+    assert note.startswith("alpha may have been recorded with the opposite sign")
+    before, after = (float(x) for x in re.findall(r"([\d.]+) deg", note))
+    assert after < 0.3 * before and before > 0.8 * np.rad2deg(np.std(runs[0].y[:, 1]))
+    assert signs(*runs, joint) == ([], [])
+
+
+def test_the_sign_of_a_measured_arm(measured: Callable[[str], list[rf.Recording]]) -> None:
+    run, *_ = measured("rotary_arm")
+    train, validation = run.slice(0, 5000).split(0.7)
+    model = rf.joints.rotary_arm(flexible=True)
+    assert signs(train, validation, model) == ([], [])
+    ((note,), _) = signs(negated(train), negated(validation), model)
+    assert note.startswith("alpha may have been recorded with the opposite sign")

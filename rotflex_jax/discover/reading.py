@@ -1,0 +1,171 @@
+"""Whether a model explains its recordings better if they are read otherwise.
+
+An input may be smooth between its samples. A converter holds each value until the next; a voltage that was
+measured behind a low-pass filter is determined between its samples by the samples. The two differ by half a
+sample of delay. Read wrongly at a low rate, that delay has the phase of friction, and a search may name a
+richer friction than there is.
+
+A channel may have the opposite sign: a deflection measured from the arm to the hub, or a sensor mounted the
+other way round. No parameter of a machine corrects that: a fit ends at values far from any machine, and
+beside these no candidate helps.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.selection import paired_gain
+from rotflex_jax.discover.stepwise import values_given
+from rotflex_jax.discover.validation import as_free_run
+from rotflex_jax.fit.dataset import Windows, first_states
+from rotflex_jax.mechanism.intersample import KERNEL_HALF_WIDTH, interpolation_weights
+from rotflex_jax.models.model import Model
+from rotflex_jax.text.numbers import as_read
+
+# The other reading is named where it gains this [nat], and so many standard deviations of the block gains.
+LEAST_NATS, LEAST_Z = 20.0, 3.0
+# An input of which more samples than this share repeat the one before is held.
+MOST_REPEATED = 0.5
+
+
+def held_equivalent(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Values that act, each held over its sample, as the band-limited signal through the samples does.
+
+    That is its value in the middle of each sample, with the amplitude that holding takes restored.
+
+    >>> t = 0.1 * np.arange(200.0)
+    >>> bool(np.allclose(held_equivalent(np.sin(t))[50:150], np.sin(t + 0.05)[50:150], atol=1e-3))
+    True
+    """
+    before, after = KERNEL_HALF_WIDTH - 1, KERNEL_HALF_WIDTH
+    ends = np.concatenate([np.full(before, u[0]), u, np.full(after, u[-1])])
+    return np.correlate(ends, interpolation_weights(1)[0], "valid")
+
+
+def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
+    """What a fitted model gains with the input read as smooth, not held [nat]; zero if that is not clear.
+
+    The input is data of the compiled programs, so this costs one refit from where the model is.
+
+    Args:
+        problem: Predictions of recordings.
+        h: Fitted to them with the input held.
+    """
+    data = problem.dataset.data
+    if getattr(problem.predictor.solver, "between", "") != "held":
+        return 0.0
+    u = np.array(data.u)
+    for row, recording in zip(u, problem.dataset.recordings, strict=True):
+        if np.mean(np.diff(recording.u) == 0) > MOST_REPEATED:
+            return 0.0
+        row[: recording.N] = held_equivalent(recording.u.astype(float))
+    read = data._replace(u=u)
+    smooth = dataclasses.replace(
+        problem,
+        predictor=dataclasses.replace(problem.predictor, data=read),
+        dataset=dataclasses.replace(problem.dataset, data=read),
+    )
+    start = smooth.with_likelihood(h)
+    if not np.isfinite(start.log_likelihood):
+        return 0.0
+    gain, z = paired_gain(refit(smooth, [start], alternations=1)[0].blocks, h.blocks)
+    return gain if gain > LEAST_NATS and z > LEAST_Z else 0.0
+
+
+def smooth_note(nats: float) -> tuple[str, ...]:
+    """That the other reading of the input is better, and how to ask for it; nothing for zero."""
+    if not nats:
+        return ()
+    return (
+        "The input was taken as held between its samples, but the baseline explains the recordings "
+        f"{nats:.0f} nats better with one that is smooth there, as a voltage is behind a low-pass filter: "
+        "search again with --intersample smooth, in Python with "
+        'rotflex_jax.Model(joint, rotflex_jax.Exponential(between="smooth", substeps=4)).',
+    )
+
+
+# A channel of which the model leaves less than this share has the right sign; the opposite one is named where
+# it leaves less than the second share of that.
+LEAST_LEFT, MOST_LEFT = 0.5, 0.7
+
+
+def opposite_signs(
+    model: Model, problem: LikelihoodProblem, h: Hypothesis, seconds: float
+) -> dict[str, tuple[float, float]]:
+    """Channels that the user's model explains much better with the opposite sign.
+
+    Only channels are tried of which the fitted model leaves much. What was measured is data of the compiled
+    programs, so each costs one refit of free runs from the values that were given.
+
+    Args:
+        model: The user's model.
+        problem: Free runs over the training recordings.
+        h: The model fitted to them.
+        seconds: Length of the free runs [s].
+
+    Returns:
+        Channel -> its root mean square error as it was read, and with the opposite sign.
+    """
+    measured = [model.measured(r).astype(float) for r in problem.dataset.recordings]
+    size = np.concatenate([y - y.mean(axis=0) for y in measured]).std(axis=0)
+    left, found = _errors(problem, h), {}
+    for k, channel in enumerate(model.mechanism.channels):
+        if left[k] < LEAST_LEFT * size[k]:
+            continue
+        reversed_ = _with_opposite_sign(model, problem, channel, seconds)
+        start = as_free_run(reversed_, values_given(reversed_))
+        if not np.isfinite(start.log_likelihood):
+            continue
+        fitted = refit(reversed_, [start])[0]
+        other = _errors(reversed_, fitted)[k]
+        if other < MOST_LEFT * left[k] and fitted.log_likelihood > h.log_likelihood:
+            found[channel] = (float(left[k]), float(other))
+    return found
+
+
+def _errors(problem: LikelihoodProblem, h: Hypothesis) -> Float[np.ndarray, " C"]:
+    """Root mean square error of each channel; infinite where runs diverge."""
+    e = problem.innovations([h])[0][problem.seen > 0]
+    return np.nan_to_num(np.sqrt(np.mean(e**2, axis=0)), nan=np.inf)
+
+
+def _with_opposite_sign(
+    model: Model, problem: LikelihoodProblem, channel: str, seconds: float
+) -> LikelihoodProblem:
+    """Free runs over the same recordings with one channel negated."""
+    negated = []
+    for r in problem.dataset.recordings:
+        sign = np.where(np.array(r.channels) == channel, -1.0, 1.0)
+        negated.append(dataclasses.replace(r, y=r.y * sign))
+    y = problem.dataset.data.y * np.where(np.array(model.mechanism.channels) == channel, -1.0, 1.0)
+    data = problem.dataset.data._replace(y=y)
+    dataset = dataclasses.replace(
+        problem.dataset, recordings=tuple(negated), data=data, first_states=first_states(model, negated)
+    )
+    windows = Windows.of_seconds(model, dataset, seconds, problem.windows.number)
+    predictor = dataclasses.replace(problem.predictor, data=data)
+    return dataclasses.replace(problem, predictor=predictor, dataset=dataset, windows=windows)
+
+
+def sign_note(
+    found: dict[str, tuple[float, float]], units: dict[str, str], seconds: float
+) -> tuple[str, ...]:
+    """That channels may have the opposite sign, in a sentence each.
+
+    Args:
+        found: As `opposite_signs` gives them.
+        units: Channel -> its own unit.
+        seconds: Length of the free runs [s].
+    """
+    sentences = []
+    for channel, errors in found.items():
+        (before, unit), (after, _) = (as_read(error, units[channel]) for error in errors)
+        sentences.append(
+            f"{channel} may have been recorded with the opposite sign: free runs of the model as it is over "
+            f"{seconds:g} s of training data leave {before:.3g} {unit} of it, and {after:.3g} {unit} where "
+            "it is negated. If so, negate that column and search again."
+        )
+    return tuple(sentences)
