@@ -169,7 +169,9 @@ def test_rotary_arm_is_in_seconds_and_radians(measured: Measured) -> None:
     assert flexible.channels == ("theta", "alpha")
     assert np.max(np.abs(flexible.y[:, 1])) < 1.0
     # The arm falls behind the hub when a step of the voltage sets that in motion.
-    for k in np.flatnonzero(np.abs(np.diff(flexible.u)) > 0.5):
+    steps = np.flatnonzero(np.abs(np.diff(flexible.u)) > 0.5)
+    assert len(steps) == 2
+    for k in steps:
         hub, lag = flexible.y[k + 80] - flexible.y[k]
         assert hub * lag < 0
     assert all(recording.channels == ("theta",) for recording in rigid)

@@ -192,10 +192,16 @@ def test_a_bias_beside_another_fault_of_its_sensor_is_provisional(monkeypatch: p
         order=[HUB, rectifier, bias, other],
         in_place_of={},
     )
-    monkeypatch.setattr(summary, "signs", lambda *a: {})
-    assert summary.stand_ins(state) == {
-        bias: ("what rectifying sensor of alpha leaves of the error of alpha may look like a bias",)
-    }
+    monkeypatch.setattr(summary, "signs", lambda *a: {bias: ("it is small",)})
+    small, beside = summary.stand_ins(state).pop(bias)
+    assert small == "it is small"
+    assert beside == (
+        "alpha has another fault (rectifying sensor of alpha), a part of which may look like a bias"
+    )
+    assert set(summary.stand_ins(state)) == {bias}
+    # A late channel has no error where nothing moves.
+    state.order = [EffectLocation("channel_delay", "alpha"), bias]
+    assert summary.stand_ins(state) == {bias: ("it is small",)}
 
 
 HELPS = HorizonGain(1.0, 2.0, 0.5)

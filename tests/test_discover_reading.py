@@ -9,7 +9,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.reading import held_equivalent
+from rotflex_jax.discover.reading import held_equivalent, sign_note
 from rotflex_jax.effects import Coulomb, LuGre, Stribeck
 
 FAST, SLOW, SECONDS = 1000, 100, 12.0
@@ -83,7 +83,25 @@ def test_a_channel_with_the_opposite_sign_is_named(stiffness: float) -> None:
     assert note.startswith("alpha may have been recorded with the opposite sign")
     before, after = (float(x) for x in re.findall(r"([\d.]+) deg", note))
     assert after < 0.3 * before and before > 0.8 * np.rad2deg(np.std(runs[0].y[:, 1]))
+    assert note.endswith("negate that column and search again.")
     assert signs(*runs, joint) == ([], [])
+
+
+def test_runs_that_validate_each_other_with_columns_in_another_order() -> None:
+    runs = []
+    for seed in (3, 4):
+        r = make_record({}, kind="steps", seed=seed, seconds=6.0, fs=250.0)
+        y = np.column_stack([-r["y"][:, 1], r["y"][:, 0]])
+        runs.append(rf.Recording(u=r["u"], y=y, Ts=1 / 250, channels=("alpha", "theta")))
+    joint = rf.joints.paper().with_values({"joint.spring.stiffness": 0.4})
+    found = rf.discover(joint, runs, candidates=FRICTIONS, rounds=0)
+    (note,) = [n for n in found.notes if "opposite sign" in n]
+    assert note.startswith("alpha may have been")
+
+
+def test_all_channels_with_the_opposite_sign_are_an_input_with_it() -> None:
+    (note,) = sign_note({"theta": (0.2, 0.1)}, {"theta": "rad"}, 2.0)
+    assert "leave 11.5 deg of it, and 5.73 deg where it is negated. If so, negate the input" in note
 
 
 def test_the_sign_of_a_measured_arm(measured: Callable[[str], list[rf.Recording]]) -> None:

@@ -155,9 +155,9 @@ def load_rotary_arm(path: str | os.PathLike[str]) -> Recording:
     """Reads a run of a geared motor with a rigid or a flexible arm, rounded to 1 mrad and 1 mm.
 
     Motor constants: gear ratio 48.4, 0.0107 N m/A, 3.29 ohm. The time is in milliseconds, whatever
-    the header says. The tip of the flexible arm was measured as a distance that is positive where the tip
-    is behind the hub: it first follows each step of the voltage, and the hub is held back where it is
-    large. Its angle is `alpha = -tip / 0.45 m`, so that theta + alpha points at the tip.
+    the header says. The tip of the flexible arm was measured as a distance, positive where the tip is behind
+    the hub (after a step of the voltage it has the sign of the hub's motion). Its angle is
+    `alpha = -tip / 0.45 m`, so that theta + alpha points at the tip.
 
     Args:
         path: of the text file.

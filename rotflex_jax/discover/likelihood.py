@@ -81,11 +81,12 @@ class LikelihoodProblem:
         """The same where only some samples count."""
         data = self.dataset.data
         data = data._replace(seen=data.seen * samples)
-        return dataclasses.replace(
-            self,
-            predictor=dataclasses.replace(self.predictor, data=data),
-            dataset=dataclasses.replace(self.dataset, data=data),
-        )
+        return self.of_dataset(dataclasses.replace(self.dataset, data=data))
+
+    def of_dataset(self, dataset: Dataset) -> "LikelihoodProblem":
+        """The same with data of the same shape, which compiled programs take as arguments; windows stay."""
+        predictor = dataclasses.replace(self.predictor, data=dataset.data)
+        return dataclasses.replace(self, predictor=predictor, dataset=dataset)
 
     @property
     def supermodel(self) -> SuperModel:

@@ -6,8 +6,7 @@ sample of delay. Read wrongly at a low rate, that delay has the phase of frictio
 richer friction than there is.
 
 A channel may have the opposite sign: a deflection measured from the arm to the hub, or a sensor mounted the
-other way round. No parameter of a machine corrects that: a fit ends at values far from any machine, and
-beside these no candidate helps.
+other way round. A fit then ends at values far from those of any machine.
 """
 
 import dataclasses
@@ -20,9 +19,10 @@ from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.selection import paired_gain
 from rotflex_jax.discover.stepwise import values_given
 from rotflex_jax.discover.validation import as_free_run
-from rotflex_jax.fit.dataset import Windows, first_states
+from rotflex_jax.fit.dataset import Windows, prepare
 from rotflex_jax.mechanism.intersample import KERNEL_HALF_WIDTH, interpolation_weights
 from rotflex_jax.models.model import Model
+from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.text.numbers import as_read
 
 # The other reading is named where it gains this [nat], and so many standard deviations of the block gains.
@@ -62,12 +62,7 @@ def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
         if np.mean(np.diff(recording.u) == 0) > MOST_REPEATED:
             return 0.0
         row[: recording.N] = held_equivalent(recording.u.astype(float))
-    read = data._replace(u=u)
-    smooth = dataclasses.replace(
-        problem,
-        predictor=dataclasses.replace(problem.predictor, data=read),
-        dataset=dataclasses.replace(problem.dataset, data=read),
-    )
+    smooth = problem.of_dataset(dataclasses.replace(problem.dataset, data=data._replace(u=u)))
     start = smooth.with_likelihood(h)
     if not np.isfinite(start.log_likelihood):
         return 0.0
@@ -87,9 +82,9 @@ def smooth_note(nats: float) -> tuple[str, ...]:
     )
 
 
-# A channel of which the model leaves less than this share has the right sign; the opposite one is named where
-# it leaves less than the second share of that.
-LEAST_LEFT, MOST_LEFT = 0.5, 0.7
+# The opposite sign of a channel is tried where errors of free runs are more than this share of the channel's
+# deviation within their windows, and named where they become less than the second share of what they were.
+LEAST_LEFT, MOST_LEFT = 0.5, 0.6
 
 
 def opposite_signs(
@@ -107,11 +102,13 @@ def opposite_signs(
         seconds: Length of the free runs [s].
 
     Returns:
-        Channel -> its root mean square error as it was read, and with the opposite sign.
+        Channel -> its root mean square error as it was read, and with the opposite sign. Nothing where runs
+        of the fitted model diverge.
     """
-    measured = [model.measured(r).astype(float) for r in problem.dataset.recordings]
-    size = np.concatenate([y - y.mean(axis=0) for y in measured]).std(axis=0)
-    left, found = _errors(problem, h), {}
+    found: dict[str, tuple[float, float]] = {}
+    if not np.isfinite(h.log_likelihood):
+        return found
+    left, size = _errors(problem, h), _deviations(problem)
     for k, channel in enumerate(model.mechanism.channels):
         if left[k] < LEAST_LEFT * size[k]:
             continue
@@ -127,9 +124,19 @@ def opposite_signs(
 
 
 def _errors(problem: LikelihoodProblem, h: Hypothesis) -> Float[np.ndarray, " C"]:
-    """Root mean square error of each channel; infinite where runs diverge."""
+    """Root mean square error of each channel."""
     e = problem.innovations([h])[0][problem.seen > 0]
-    return np.nan_to_num(np.sqrt(np.mean(e**2, axis=0)), nan=np.inf)
+    return np.sqrt(np.mean(e**2, axis=0))
+
+
+def _deviations(problem: LikelihoodProblem) -> Float[np.ndarray, " C"]:
+    """Standard deviation of each measured channel within the windows of free runs."""
+    parts = [
+        y[samples] - y[samples].mean(axis=0)
+        for r, y in enumerate(problem.dataset.data.y)
+        for _, samples in problem.windows.of(r)
+    ]
+    return np.concatenate(parts).std(axis=0)
 
 
 def _with_opposite_sign(
@@ -139,15 +146,12 @@ def _with_opposite_sign(
     negated = []
     for r in problem.dataset.recordings:
         sign = np.where(np.array(r.channels) == channel, -1.0, 1.0)
-        negated.append(dataclasses.replace(r, y=r.y * sign))
-    y = problem.dataset.data.y * np.where(np.array(model.mechanism.channels) == channel, -1.0, 1.0)
-    data = problem.dataset.data._replace(y=y)
-    dataset = dataclasses.replace(
-        problem.dataset, recordings=tuple(negated), data=data, first_states=first_states(model, negated)
-    )
+        # What was accepted of a channel, such as a limit at zero, may be another fault of its negative.
+        negated.append(dataclasses.replace(r, y=r.y * sign, accept=ACCEPTABLE))
+    length = problem.dataset.data.u.shape[1]
+    dataset = prepare(model, negated, length=length, like=problem.dataset)
     windows = Windows.of_seconds(model, dataset, seconds, problem.windows.number)
-    predictor = dataclasses.replace(problem.predictor, data=data)
-    return dataclasses.replace(problem, predictor=predictor, dataset=dataset, windows=windows)
+    return dataclasses.replace(problem.of_dataset(dataset), windows=windows)
 
 
 def sign_note(
@@ -160,12 +164,12 @@ def sign_note(
         units: Channel -> its own unit.
         seconds: Length of the free runs [s].
     """
-    sentences = []
+    sentences, what = [], "the input" if set(found) == set(units) else "that column"
     for channel, errors in found.items():
         (before, unit), (after, _) = (as_read(error, units[channel]) for error in errors)
         sentences.append(
             f"{channel} may have been recorded with the opposite sign: free runs of the model as it is over "
             f"{seconds:g} s of training data leave {before:.3g} {unit} of it, and {after:.3g} {unit} where "
-            "it is negated. If so, negate that column and search again."
+            f"it is negated. If so, negate {what} and search again."
         )
     return tuple(sentences)

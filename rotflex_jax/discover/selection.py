@@ -236,7 +236,7 @@ def undecided(
         left: What predictions of training and validation data leave above the sensor noise [nat].
         data: Training recordings.
     """
-    if _contained(found, rival) and not (prefers(rival, found, data) or _leads(rival, found)):
+    if _contained(found, rival) and not (_is_worth(rival, found, data) or _leads(rival, found)):
         return False
     lost = paired_gain(found.blocks, rival.blocks)[0] + _training_gain(found, rival)[0]
     if predictions_apart(found, rival) and lost > left:
@@ -247,7 +247,7 @@ def undecided(
 def both_prefer(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: StackedRecordings) -> bool:
     """Whether predictions beyond doubt and free runs by a tenth prefer a rival in the place of an effect.
 
-    Free runs over training data must not speak against it.
+    Free runs over training data, and over validation data, must each be better with it.
 
     Args:
         rival: The model with the rival in the place of the effect.
@@ -270,10 +270,8 @@ def _leads(rich: ValidatedHypothesis, simple: ValidatedHypothesis) -> bool:
     return min(certainty) > SEPARATE_Z or _free_run_certainty(rich, simple) > SEPARATE_Z
 
 
-def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
-    """Whether predictions prefer a generalisation, or free runs do beyond doubt.
-
-    Predictions of training data must prefer it after the penalty, and those of validation data at all.
+def _is_worth(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
+    """Whether predictions of validation data prefer a generalisation, and of training data after the penalty.
 
     Args:
         rich: The generalisation.
@@ -282,8 +280,7 @@ def prefers(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: Stacke
     """
     more = rich.parameter_count - simple.parameter_count
     gain = rich.log_likelihood - simple.log_likelihood
-    by_predictions = gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
-    return by_predictions or _free_run_certainty(rich, simple) > FREE_RUN_Z
+    return gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
 
 
 def _needed(parameter_count: int, data: StackedRecordings) -> float:

@@ -45,7 +45,7 @@ from rotflex_jax.discover.stepwise import (
 )
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, validate
-from rotflex_jax.effects import CATALOG, SensorBias
+from rotflex_jax.effects import CATALOG, ChannelDelay, SensorBias
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.fit.plausibility import Remark, at_bounds, beyond_recordings
 from rotflex_jax.recording import Recording
@@ -292,20 +292,21 @@ def stand_ins(state: SearchState) -> dict[EffectLocation, tuple[str, ...]]:
     """Signs that effects stand in for something else, of the final model at both horizons."""
     gains = {p: at.gain + at.training_gain for p, (at, _) in state.gains.items()}
     found = signs((state.horizons.prediction, state.horizons.free_run), state.current, gains)
-    found |= _biases_beside_other_faults(state.order)
+    for bias, reason in _biases_beside_other_faults(state.order).items():
+        found[bias] = (*found.get(bias, ()), reason)
     # One effect in the place of several has the signs of the one whose place in the order it took.
     return found | {new: found[old] for new, old in state.in_place_of.items() if old in found}
 
 
-def _biases_beside_other_faults(order: Sequence[EffectLocation]) -> dict[EffectLocation, tuple[str, ...]]:
-    """Biases of channels that have another fault, a part of whose error may look like a bias."""
-    found = {}
+def _biases_beside_other_faults(order: Sequence[EffectLocation]) -> dict[EffectLocation, str]:
+    """Biases of channels that have another fault -> why a part of that one may look like a bias."""
+    apart, found = (SensorBias.name, ChannelDelay.name), {}
+    faults = [p for p in order if CATALOG[p.effect].acts_on == "channel" and p.effect not in apart]
     for bias in (p for p in order if p.effect == SensorBias.name):
-        others = (p for p in order if p != bias and p.port == bias.port)
-        faults = [p for p in others if CATALOG[p.effect].acts_on == "channel"]
-        if faults:
-            named = " and ".join(effect_phrase(p.effect, p.port) for p in faults)
-            found[bias] = (f"what {named} leaves of the error of {bias.port} may look like a bias",)
+        same = [effect_phrase(p.effect, p.port) for p in faults if p.port == bias.port]
+        if same:
+            named = " and ".join(same)
+            found[bias] = f"{bias.port} has another fault ({named}), a part of which may look like a bias"
     return found
 
 
