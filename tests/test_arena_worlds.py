@@ -243,9 +243,9 @@ def test_page_of_worlds(tmp_path):
     assert "(coulomb@hub)" in text and text.count("1.15 / - -> 1.15 / -") == 3 and "515" not in text
     # Worlds that were read before a revision are summed apart.
     (page,) = publish_worlds([row, {**row, "world": 3012}], tmp_path / "B0_wrong_worlds.json")
-    first, second = page.read_text().split("Worlds 3000 to 3018, which were read before")
+    first, second = page.read_text().split("Worlds 3000 to 3069, which were read before")
     for part in (first, second):
         assert part.count("| link with gauge | 1 | 1/1 | 0/1 | 1/1 | 0 in 0/1 worlds |") == 1
-    assert "no revision of the search has seen" in first and "3000 to 3018" not in text
+    assert "no revision of the search has seen" in first and "3000 to 3069" not in text
     assert "failed 1" in summary([row, failed])
     assert publish_worlds([failed], tmp_path / "no.json") == []

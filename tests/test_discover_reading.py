@@ -71,12 +71,11 @@ def negated(r: rf.Recording) -> rf.Recording:
     return dataclasses.replace(r, y=r.y * np.array([1.0, -1.0]))
 
 
-@pytest.mark.parametrize("stiffness", [0.4, 16.0])
-def test_a_channel_with_the_opposite_sign_is_named(stiffness: float) -> None:
-    """From stiffnesses that are far from the machine's, 1.6 N m/rad; the right sign is left alone."""
+def test_a_channel_with_the_opposite_sign_is_named() -> None:
+    """From a stiffness that is far from the machine's, 1.6 N m/rad; the right sign is left alone."""
     r = make_record({("coulomb", "hub"): {"level": 0.03}}, kind="steps", seed=3, seconds=8.0, fs=250.0)
     runs = rf.Recording(u=r["u"], y=r["y"], Ts=1 / 250).split(0.7)
-    joint = rf.joints.paper().with_values({"joint.spring.stiffness": stiffness})
+    joint = rf.joints.paper().with_values({"joint.spring.stiffness": 0.4})
     notes, lines = signs(*map(negated, runs), joint)
     assert notes == lines
     (note,) = notes

@@ -18,7 +18,7 @@ Row = dict[str, Any]
 
 from rotflex_jax.text.files import write_file
 
-SEEN = tuple(range(3000, 3019))
+SEEN = tuple(range(3000, 3070))
 """Report worlds that were read before the search was last revised; what is quoted is of the others."""
 
 
