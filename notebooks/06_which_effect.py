@@ -82,8 +82,8 @@ measured
 
 # %% [markdown]
 # Friction at the hub is named, and the held-out error of theta falls several times. But the verdict is
-# honest: *something remains*. The error is still many times the noise of the sensor, the error of the
-# deflection hardly changes, and the page on the measured joint follows up why.
+# honest: *something remains*. The error is still many times the noise of the sensor, that of the
+# deflection has grown, and the page on the measured joint follows up why.
 # `rf.explore(measured, run_b)` puts the model under sliders: switch an effect off, move a number, and see
 # at once what it does to the run and to its error (`pip install "rotflex_jax[notebook]"`).
 #
@@ -105,6 +105,6 @@ if measured:
     assert measured.verdict == "unexplained" and measured.rounds[0].port == "hub"
     assert measured.rounds[0].effect in ("coulomb", "stribeck", "lugre", "dahl")
     before, after = measured.baseline.held_out_rmse_windows, measured.final.held_out_rmse_windows
-    assert after["theta"] < before["theta"] / 4 and abs(after["alpha"] / before["alpha"] - 1) < 0.1
+    assert after["theta"] < before["theta"] / 4 and after["alpha"] > before["alpha"]
     print(f"theta: {np.rad2deg(before['theta']):.2f} to {np.rad2deg(after['theta']):.2f} deg")
 print("All claims hold.")
