@@ -15,6 +15,7 @@ from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.tables import status_sentence
 from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.parameters import specifications
 
 COULOMB, STRIBECK, DAHL, LUGRE = (EffectLocation(e, "hub") for e in ("coulomb", "stribeck", "dahl", "lugre"))
 ARM, DEAD_ZONE = EffectLocation("coulomb", "arm"), EffectLocation("dead_zone", "input")
@@ -126,13 +127,13 @@ def test_a_law_that_both_horizons_prefer_takes_the_place(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("horizon", ["predictions", "free runs"])
 def test_a_shape_at_a_bound_is_that_of_another_law(horizon: str):
     """At either horizon. A level of zero is no shape: it is the law switched off."""
-    names = ("level", "rise", "slow", "presliding", "damping")
-    specs = fx.LuGre.__dataclass_fields__
+    specs = specifications(fx.LuGre)
+    assert list(specs) == ["level", "rise", "slow", "presliding", "damping"]
     s: Any = SimpleNamespace(
         candidates={
             LUGRE: SimpleNamespace(parameters=range(5), amplitudes=(True, False, False, False, True)),
         },
-        mechanism=SimpleNamespace(parameter_specifications=[specs[n].metadata["parameter"] for n in names]),
+        mechanism=SimpleNamespace(parameter_specifications=list(specs.values())),
     )
 
     def fitted(*values: float) -> ValidatedHypothesis:
