@@ -16,6 +16,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.cli import app
+from rotflex_jax.discover.reading import sign_note
 from rotflex_jax.effects import CATALOG, LearnedTorque
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -160,6 +161,13 @@ RAISED: dict[str, Callable[[], object]] = {
     "effect without a port": lambda: command("simulate", file(), "--add", "coulomb"),
 }
 
+# What a search says without a refusal.
+SAID: dict[str, Callable[[], tuple[str, ...]]] = {
+    "alpha turned round": lambda: sign_note(
+        {"alpha": (np.deg2rad(0.762), np.deg2rad(0.405))}, {"theta": "rad", "alpha": "rad"}, 2.0
+    ),
+}
+
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
@@ -184,8 +192,9 @@ def test_every_message_that_is_quoted_is_really_raised_and_the_other_way_round(f
         with pytest.raises(rf.InputError) as caught:
             do()
         said[kind] = str(caught.value)
+    notes = [note for say in SAID.values() for note in say()]
     quoted = [block.strip() for block in blocks("troubleshooting.md", "text")]
-    assert sorted(quoted) == sorted(said.values())
+    assert sorted(quoted) == sorted([*said.values(), *notes])
 
 
 @pytest.mark.parametrize(
