@@ -1,6 +1,7 @@
 """How a search ends: signs that an effect stands in for another, limits of the verdict, the proposal."""
 
 import dataclasses
+import functools
 import json
 import math
 import types
@@ -98,6 +99,7 @@ def test_nats_above_the_noise_by_hand(same):
     errors[:, 6:] = 1e6
     of = {"innovations": lambda hypotheses: [errors], "seen": seen.astype(float), "noise": np.ones(1)}
     part: Any = SimpleNamespace(**of)
+    part.channel_errors = functools.partial(LikelihoodProblem.channel_errors, part)
     assert nats_above_noise(part, h) == pytest.approx(6 * np.log(2.0))
 
 
@@ -120,15 +122,15 @@ def test_each_sign_is_a_sentence(same):
 
 
 @pytest.mark.parametrize("folds", [True, False], ids=["validating each other", "held out"])
-@pytest.mark.parametrize("beyond", [None, "scatter", "change", "gain"])
+@pytest.mark.parametrize("beyond", [None, "scatter", "change", "gain", "any scatter", "no change"])
 def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pytest.MonkeyPatch):
     """15 % of the size, half of the error that is left, the nats left in both sets; the worse set counts."""
     space = types.SimpleNamespace
     validation = space(folds=folds, problem="free runs, held out", window_seconds=2.0)
     prediction = space(problem="predictions", validation=space(folds=folds, problem="predictions, held out"))
     runs = space(hypothesis=space(locations=(HUB,)), adapted=None)
-    scatter = 0.152 if beyond == "scatter" else 0.15
-    change = 0.495 if beyond == "change" else 0.5
+    scatter = {"scatter": 0.152, "any scatter": 2e4}.get(beyond, 0.15)
+    change = {"change": 0.495, "no change": 1.9e-6}.get(beyond, 0.5)
     sizes = {"free runs": WindowSizes(0.01, 9.0), "free runs, held out": WindowSizes(scatter, change)}
     if folds:  # the recordings for training are all there are
         sizes = {"free runs": sizes["free runs, held out"]}
@@ -140,6 +142,7 @@ def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pyte
     horizons = (prediction, space(problem="free runs", validation=validation))
     found = signs(horizons, final, {HUB: rest - 0.1 if beyond == "gain" else rest})[HUB]
     words = {"scatter": "windows of 2 s differ by 15%", "change": "changes free runs by 0.49 of the error"}
+    words |= {"any scatter": "by more than 1000% on its size", "no change": "by less than 0.01 of the error"}
     words |= {"gain": f"{rest:.0f} are left above the sensor noise"}
     assert len(found) == (beyond is not None)
     assert beyond is None or words[beyond] in found[0]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -147,7 +148,7 @@ def test_data_may_speak_against_it(runs, arm, monkeypatch):
     assert final_fit_sentence(found) == ""
 
 
-def test_it_is_saved_and_told(found, tmp_path: Path, monkeypatch):
+def test_it_is_saved_and_told(found, runs, tmp_path: Path, monkeypatch):
     # The page without its figures, which take most of the time.
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
     monkeypatch.setattr(rf.Discovery, "identifiability", lambda self: None)
@@ -164,6 +165,10 @@ def test_it_is_saved_and_told(found, tmp_path: Path, monkeypatch):
     assert len(row.stages) == len(found.stages) + 1
     page = found.report(tmp_path / "report", learned=False).read_text()
     assert FITTED_TO_ALL in page and "training and validation recordings together" in page
+    # What stands large at the top is what the model to use does on data that had no say.
+    top = page[page.index("error over 2 s of test data") :]
+    shown = next(float(x) for x in re.findall(r"→ </span>([\d.]+) deg", top))
+    assert shown == pytest.approx(np.rad2deg(short_runs_miss(found.model, runs[2])), rel=0.01)
 
 
 def test_runs_that_validate_each_other(runs, arm):

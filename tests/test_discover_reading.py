@@ -1,4 +1,4 @@
-"""A smooth input is noticed, and so is a channel with the opposite sign."""
+"""A smooth input is noticed, and so are a channel with the opposite sign and validation data at rest."""
 
 import dataclasses
 import re
@@ -101,6 +101,29 @@ def test_runs_that_validate_each_other_with_columns_in_another_order() -> None:
 def test_all_channels_with_the_opposite_sign_are_an_input_with_it() -> None:
     (note,) = sign_note({"theta": (0.2, 0.1)}, {"theta": "rad"}, 2.0)
     assert "leave 11.5 deg of it, and 5.73 deg where it is negated. If so, negate the input" in note
+
+
+def test_validation_data_at_rest_are_named() -> None:
+    """A voltage that stops before the last part: the hub rests there, held by its friction."""
+    t = np.arange(round(10 * FAST)) / FAST
+    played = np.where(t < 6.0, 2 * multisine(t), 0.0)
+    r = make_record({("coulomb", "hub"): {"level": 0.03}}, seed=5, fs=FAST, played=played)
+    run = rf.Recording(u=r["u"], y=r["y"], Ts=1 / FAST)
+    train, moving, still = run.slice(0, 4000), run.slice(4000, 6000), run.slice(8000, 10000)
+
+    def search(validation: rf.Recording) -> tuple[str, ...]:
+        return rf.discover(rf.joints.paper(), train, validation, candidates=FRICTIONS, rounds=0).notes
+
+    theta, alpha = (note for note in search(still) if "hardly moves" in note)
+    windows = [run.y[k : k + 2000] for k in (8000, 0, 2000)]
+    rests, *both = (np.rad2deg(y.std(axis=0)) for y in windows)
+    moves = np.sqrt(np.mean(np.square(both), axis=0))
+    for k, note in enumerate((theta, alpha)):
+        said = [float(x) for x in re.findall(r"([\d.]+) deg", note)]
+        assert note.startswith(("theta ", "alpha ")[k]) and said == pytest.approx(
+            [rests[k], moves[k]], rel=0.05
+        )
+    assert not any("hardly moves" in note for note in search(moving))
 
 
 def test_the_sign_of_a_measured_arm(measured: Callable[[str], list[rf.Recording]]) -> None:

@@ -146,6 +146,8 @@ def seen_limits(recordings: tuple[Recording, ...]) -> Limits:
 # Root mean square of the change of size between windows, over the size, that an effect of the machine stays
 # below, and least root mean square that it changes free runs by, over the error that is left.
 SCATTER, LEAST_CHANGE = 0.15, 0.5
+# Beyond these a scatter or a change has no size that a reader could use.
+MOST_WRITTEN, LEAST_WRITTEN = 10.0, 0.01
 
 
 class WindowSizes(NamedTuple):
@@ -213,9 +215,8 @@ def nats_above_noise(problem: LikelihoodProblem, h: Hypothesis) -> float:
 
     `N log(rms / noise)`, summed over the channels whose error is above the noise.
     """
-    e, counted = problem.innovations([h])[0], problem.seen > 0
-    rms = np.sqrt(np.mean(e[counted] ** 2, axis=0))
-    return float(np.sum(counted.sum() * np.log(np.maximum(rms / problem.noise, 1.0))))
+    multiples = np.maximum(problem.channel_errors(h) / problem.noise, 1.0)
+    return float(np.sum(problem.seen > 0) * np.sum(np.log(multiples)))
 
 
 def nats_left(prediction: SearchHorizon, final: ValidatedHypothesis) -> float:
@@ -255,11 +256,12 @@ def signs(
     for location in locations:
         own, reasons = [x[location] for x in sizes if location in x], []
         if own and (scatter := max(x.scatter for x in own)) > SCATTER:
-            reasons.append(
-                f"windows of {free_run.validation.window_seconds:g} s differ by {scatter:.0%} on its size"
-            )
+            seconds, by = free_run.validation.window_seconds, f"{scatter:.0%}"
+            by = by if scatter < MOST_WRITTEN else f"more than {MOST_WRITTEN:.0%}"
+            reasons.append(f"windows of {seconds:g} s differ by {by} on its size")
         if own and (change := min(x.change for x in own)) < LEAST_CHANGE:
-            reasons.append(f"it changes free runs by {change:.2g} of the error that is left")
+            share = f"{change:.2g}" if change > LEAST_WRITTEN else f"less than {LEAST_WRITTEN:g}"
+            reasons.append(f"it changes free runs by {share} of the error that is left")
         if gains[location] < rest:
             gain = gains[location]
             reasons.append(

@@ -165,6 +165,11 @@ class LikelihoodProblem:
         """Innovations of parameter sets."""
         return self.predictor.innovations(parameter_sets, self.windows.index)
 
+    def channel_errors(self, h: Hypothesis) -> Float[np.ndarray, " C"]:
+        """Root mean square innovation of each channel, in its unit."""
+        e = self.innovations([h])[0][self.seen > 0]
+        return np.sqrt(np.mean(e**2, axis=0))
+
     def make_ahead(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Have the programs of innovations made for hypotheses whose slopes are needed first."""
         s = self.supermodel

@@ -1,4 +1,4 @@
-"""Whether a model explains its recordings better if they are read otherwise.
+"""What a search says of its recordings: whether they may have been read wrongly, and whether they can decide.
 
 An input may be smooth between its samples. A converter holds each value until the next; a voltage that was
 measured behind a low-pass filter is determined between its samples by the samples. The two differ by half a
@@ -7,6 +7,9 @@ richer friction than there is.
 
 A channel may have the opposite sign: a deflection measured from the arm to the hub, or a sensor mounted the
 other way round. A fit then ends at values far from those of any machine.
+
+Validation data may hold a channel nearly at rest that moves in the training data, as the end of a step does.
+What acts on that channel has no consequences there, whatever its size.
 """
 
 import dataclasses
@@ -108,7 +111,7 @@ def opposite_signs(
     found: dict[str, tuple[float, float]] = {}
     if not np.isfinite(h.log_likelihood):
         return found
-    left, size = _errors(problem, h), _deviations(problem)
+    left, size = problem.channel_errors(h), _deviations(problem)
     for k, channel in enumerate(model.mechanism.channels):
         if left[k] < LEAST_LEFT * size[k]:
             continue
@@ -117,25 +120,18 @@ def opposite_signs(
         if not np.isfinite(start.log_likelihood):
             continue
         fitted = refit(reversed_, [start])[0]
-        other = _errors(reversed_, fitted)[k]
+        other = reversed_.channel_errors(fitted)[k]
         if other < MOST_LEFT * left[k] and fitted.log_likelihood > h.log_likelihood:
             found[channel] = (float(left[k]), float(other))
     return found
 
 
-def _errors(problem: LikelihoodProblem, h: Hypothesis) -> Float[np.ndarray, " C"]:
-    """Root mean square error of each channel."""
-    e = problem.innovations([h])[0][problem.seen > 0]
-    return np.sqrt(np.mean(e**2, axis=0))
-
-
 def _deviations(problem: LikelihoodProblem) -> Float[np.ndarray, " C"]:
     """Standard deviation of each measured channel within the windows of free runs."""
-    parts = [
-        y[samples] - y[samples].mean(axis=0)
-        for r, y in enumerate(problem.dataset.data.y)
-        for _, samples in problem.windows.of(r)
-    ]
+    parts = []
+    for r, recording in enumerate(problem.dataset.recordings):
+        y = problem.dataset.data.y[r, : recording.N]  # what follows fills the array up
+        parts += [y[samples] - y[samples].mean(axis=0) for _, samples in problem.windows.of(r)]
     return np.concatenate(parts).std(axis=0)
 
 
@@ -171,5 +167,45 @@ def sign_note(
             f"{channel} may have been recorded with the opposite sign: free runs of the model as it is over "
             f"{seconds:g} s of training data leave {before:.3g} {unit} of it, and {after:.3g} {unit} where "
             f"it is negated. If so, negate {what} and search again."
+        )
+    return tuple(sentences)
+
+
+# A channel hardly moves in validation data where its deviation is below this share of that in training data.
+LEAST_MOTION = 0.1
+
+
+def still_channels(train: LikelihoodProblem, validation: LikelihoodProblem) -> dict[str, tuple[float, float]]:
+    """Channels that hardly move in validation data.
+
+    Args:
+        train: Free runs over the training recordings.
+        validation: The same over the validation recordings.
+
+    Returns:
+        Channel -> its standard deviation within windows of training and of validation data, in its unit.
+    """
+    channels = train.supermodel.mechanism.channels
+    pairs = zip(channels, _deviations(train).tolist(), _deviations(validation).tolist(), strict=True)
+    return {c: (moved, rests) for c, moved, rests in pairs if rests < LEAST_MOTION * moved}
+
+
+def still_note(
+    found: dict[str, tuple[float, float]], units: dict[str, str], seconds: float
+) -> tuple[str, ...]:
+    """That channels hardly move in validation data, in a sentence each.
+
+    Args:
+        found: As `still_channels` gives them.
+        units: Channel -> its own unit.
+        seconds: Length of the windows [s].
+    """
+    sentences = []
+    for channel, deviations in found.items():
+        (moved, unit), (rests, same) = (as_read(x, units[channel]) for x in deviations)
+        sentences.append(
+            f"{channel} hardly moves in the validation data: its standard deviation within {seconds:g} s is "
+            f"{rests:.2g} {same}, and {moved:.2g} {unit} in the training data. They say little of what acts "
+            f"on {channel}; give validation data in which it moves."
         )
     return tuple(sentences)

@@ -18,7 +18,14 @@ from rotflex_jax.discover.checkpoint import (
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.pairs import promising_pairs
-from rotflex_jax.discover.reading import nats_if_smooth, opposite_signs, sign_note, smooth_note
+from rotflex_jax.discover.reading import (
+    nats_if_smooth,
+    opposite_signs,
+    sign_note,
+    smooth_note,
+    still_channels,
+    still_note,
+)
 from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.score_test import PairScore, Score, ScoreTest, residual_lines, score_test
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
@@ -65,7 +72,7 @@ class SearchState:
         tested: The model whose score tests were made last.
         nominal: The user's model with the values that it has, where the fit has moved far away from these.
         resumed: After how many rounds of a search that was stopped this one went on.
-        reading_notes: That the recordings may have been read wrongly, in sentences.
+        reading_notes: That recordings may have been read wrongly or cannot decide, in sentences.
         digest: Of all that the models depend on.
     """
 
@@ -226,12 +233,22 @@ def _check_baseline(state: SearchState) -> None:
         problem, seconds = state.horizons.free_run.problem, state.validation.window_seconds
         signs = opposite_signs(state.model, problem, runs.hypothesis, seconds)
         notes += sign_note(signs, state.units, seconds)
+    notes += _still_channels(state)
     state.reading_notes = notes
     for line in notes:
         state.say(line)
     fits = [v.hypothesis for v in (state.current, state.current.free_run) if v]
     if any(far_from_given(state.problem.supermodel, h) for h in fits):
         state.nominal = as_given(state.horizons)
+
+
+def _still_channels(state: SearchState) -> tuple[str, ...]:
+    """Which channels hardly move in the validation data, in a sentence each."""
+    at = state.horizons.free_run
+    if at.validation.folds:  # the validation recordings are those of training
+        return ()
+    found = still_channels(at.problem, at.validation.problem)
+    return still_note(found, state.units, at.validation.window_seconds)
 
 
 def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:

@@ -111,7 +111,12 @@ class LuGre(Memory):
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque when it slides fast")
     # Where it hardly slides at all (a large rise, a small level), only their product shows.
     rise: float = parameter(0.5, unit="", lower=0.0, upper=10.0, meaning="breakaway level over it, less one")
-    slow: float = parameter(0.3, unit="rad/s", lower=1e-3, meaning="speed over which the rise is lost")
+    slow: float = parameter(
+        0.3,
+        unit="rad/s",
+        lower=1e-3,
+        meaning="speed over which the rise and the damping of the bristles are lost",
+    )
     # Stribeck friction is the limit of none at all; the bound keeps the rate finite.
     presliding: float = parameter(
         0.003, unit="rad", lower=1e-6, meaning="displacement over which it builds up"

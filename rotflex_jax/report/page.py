@@ -90,11 +90,16 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
 
 
 def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
-    """The error of each channel before and after, large: on data that had no say, where there are any."""
-    tiles, data = [], "test" if discovery.test else "validation"
+    """The error of each channel before and after, large: on data that had no say, where there are any.
+
+    After is the model to use: that of the final fit, where there is one and data that had no say.
+    """
+    tiles, data, fit = [], "test" if discovery.test else "validation", discovery.final_fit
     first, last = (
         s.test.windows if s.test else s.held_out_rmse_windows for s in (discovery.baseline, discovery.final)
     )
+    if fit and fit.test:
+        last = fit.test.windows
     for channel, unit in channel_units(discovery).items():
         before, read = readable(first[channel], unit)
         after, _ = readable(last[channel], unit)
