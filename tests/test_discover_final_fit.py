@@ -146,6 +146,13 @@ def test_data_may_speak_against_it(runs, arm, monkeypatch):
     assert found.verdict == "unexplained" and found.final_fit is None
     assert found.model is found.final.model and found.to_dict()["final_fit"] is None
     assert final_fit_sentence(found) == ""
+    (note,) = refusals(found)
+    assert "on validation data are" in note
+
+
+def refusals(found: rf.Discovery) -> list[str]:
+    """What is said of a final fit that was not taken."""
+    return [n for n in found.notes if n.startswith("The model to use is that of the search, not one")]
 
 
 def test_it_is_saved_and_told(found, runs, tmp_path: Path, monkeypatch):
@@ -212,7 +219,13 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, taken):
         return errors(structure, fits, evaluation)._replace(windows={"theta": float(worse * theirs)})
 
     monkeypatch.setattr(MODULE, "_on_validation", on_validation)
-    assert (search().final_fit is not None) == taken
+    found = search()
+    assert (found.final_fit is not None) == taken
+    # e^(1.02 * 0.2) is 1.23
+    said = (
+        "fitted in that way to the training recordings alone its errors over 2 s on validation data are 1.23 "
+    )
+    assert [said in note for note in refusals(found)] == [True] * (not taken)
 
 
 def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
@@ -229,6 +242,8 @@ def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
     monkeypatch.setattr(MODULE._Structure, "fitted", lost)
     found = rf.discover(arm, train, validation, candidates=[], rounds=0)
     assert found.verdict == "unexplained" and found.final_fit is None
+    (note,) = refusals(found)
+    assert "times as large, although it was fitted to them" in note
 
 
 def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
@@ -239,6 +254,8 @@ def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
     train, validation, _ = runs
     found = rf.discover(arm, train, validation, candidates=[], rounds=0)
     assert found.verdict == "unexplained" and found.final_fit is None
+    (note,) = refusals(found)
+    assert note.endswith("recordings together: One channel does not move.")
 
 
 def test_of_many_runs_each_third_is_left_out():

@@ -13,6 +13,7 @@ also decide whether recordings have offsets that the search could do without.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -132,9 +133,19 @@ def _with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
     return values
 
 
+class Refused(NamedTuple):
+    """Why the final model was not fitted to all that had a say.
+
+    Attributes:
+        sentence: For the notes of a result.
+    """
+
+    sentence: str
+
+
 def fit_to_all(
     state: SearchState, stage: Stage, final: ValidatedHypothesis, evaluation: Evaluation
-) -> FinalFit | None:
+) -> FinalFit | Refused:
     """The final model fitted once more, to training and validation recordings together.
 
     Args:
@@ -144,21 +155,27 @@ def fit_to_all(
         evaluation: The recordings that errors are reported on.
 
     Returns:
-        The fit; None where validation data speak against it, where it does worse on them than the model that
-        has not seen them, or with a periodic disturbance, whose phase no other recording shares.
+        The fit; or why there is none: validation data speak against it, it does worse on them than the model
+        that has not seen them, or it has a periodic disturbance, whose phase no other recording shares.
     """
     if state.problem.supermodel.phased.intersection(final.hypothesis.local):
-        return None
+        return _refused(state, "it has a periodic disturbance, whose phase no other recording shares")
     state.say("fitting what was chosen to all recordings that had a say")
     try:
         return _fitted_to_all(state, stage, final.hypothesis, evaluation)
-    except InputError:  # some recordings cannot be fitted alone: no reason to lose what was found
-        return None
+    except InputError as error:  # some recordings cannot be fitted alone: no reason to lose what was found
+        return _refused(state, str(error).rstrip("."))
+
+
+def _refused(state: SearchState, why: str) -> Refused:
+    """A reason as a sentence."""
+    used = "all recordings" if state.validation.folds else "training and validation recordings together"
+    return Refused(f"The model to use is that of the search, not one fitted to {used}: {why}.")
 
 
 def _fitted_to_all(
     state: SearchState, stage: Stage, h: Hypothesis, evaluation: Evaluation
-) -> FinalFit | None:
+) -> FinalFit | Refused:
     train, validation = state.problem.dataset.recordings, state.validation
     held_back = () if validation.folds else validation.problem.dataset.recordings
     searched = stage.calibrated or RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
@@ -169,17 +186,26 @@ def _fitted_to_all(
             fits = _without_each(structure, train) if validation.folds else [structure.fitted(joined(train))]
             tried.append((structure, fits, _on_validation(structure, fits, evaluation)))
     structure, fits, trained = min(tried, key=lambda each: log_error_ratio(each[2], searched))
-    if log_error_ratio(trained, searched) > MOST_WORSE:
-        return None
+    seconds = f"errors over {validation.window_seconds:g} s on validation data"
+    if (ratio := log_error_ratio(trained, searched)) > MOST_WORSE:
+        others = "the other recordings" if validation.folds else "the training recordings"
+        return _refused(
+            state,
+            f"fitted in that way to {others} alone its {seconds} are {np.exp(ratio):.3g} times as large",
+        )
     structure = _with_offsets_of_the_machine(structure, fits, evaluation)
     recordings = joined((*train, *held_back))
     found = structure.fitted(recordings)
     # A fit to recordings that does worse on them than one that has not seen them has failed; without their
     # offsets it may be a little worse by chance.
     every, bare = [found] * len(fits), RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
-    failed = log_error_ratio(_as_carried(structure, every, evaluation), bare) > MOST_WORSE
-    if failed or log_error_ratio(_on_validation(structure, every, evaluation), searched) > 0:
-        return None
+    carried = log_error_ratio(_as_carried(structure, every, evaluation), bare)
+    own = log_error_ratio(_on_validation(structure, every, evaluation), searched)
+    if carried > MOST_WORSE or own > 0:
+        worse = np.exp(carried if carried > MOST_WORSE else own)
+        return _refused(
+            state, f"its {seconds} are {worse:.3g} times as large, although it was fitted to them"
+        )
     return _reported(structure, found, recordings, evaluation, trained, searched)
 
 

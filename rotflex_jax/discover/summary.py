@@ -18,7 +18,7 @@ from rotflex_jax.discover.evaluation import (
     paired_estimates,
     process_noise_gain,
 )
-from rotflex_jax.discover.final_fit import fit_to_all
+from rotflex_jax.discover.final_fit import Refused, fit_to_all
 from rotflex_jax.discover.hypothesis import Hypothesis, without
 from rotflex_jax.discover.likelihood import choose_process_noise, refit
 from rotflex_jax.discover.localise import locate
@@ -63,7 +63,8 @@ class EvaluatedModels:
         rounds: What was added, in order.
         where: When the error of the baseline is large.
         test: Recordings that had no say.
-        final_fit: The final model fitted to all that had a say; None where it explains its recordings.
+        final_fit: The final model fitted to all that had a say, or why not; None where it explains its
+            recordings.
     """
 
     stages: tuple[Stage, ...]
@@ -73,7 +74,7 @@ class EvaluatedModels:
     rounds: tuple[Round, ...]
     where: tuple[Where, ...]
     test: tuple[Recording, ...]
-    final_fit: FinalFit | None
+    final_fit: FinalFit | Refused | None
 
 
 def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedModels:
@@ -155,6 +156,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *difference_notes(supermodel, evaluated.pairs),
             *_far_baseline(state),
             *state.notes,
+            *([evaluated.final_fit.sentence] if isinstance(evaluated.final_fit, Refused) else []),
             *(f"{remark.sentence}." for remark in remarks),
         ),
         remarks=remarks,
@@ -162,7 +164,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             state, assess_stages(baseline, final, state.noise_floor, held_back).misfit
         ),
         conditional=conditional,
-        final_fit=evaluated.final_fit,
+        final_fit=evaluated.final_fit if isinstance(evaluated.final_fit, FinalFit) else None,
     )
 
 
