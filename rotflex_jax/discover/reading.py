@@ -26,7 +26,7 @@ from rotflex_jax.fit.dataset import Windows, prepare
 from rotflex_jax.mechanism.intersample import KERNEL_HALF_WIDTH, interpolation_weights
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording.quality import ACCEPTABLE
-from rotflex_jax.text.numbers import as_read
+from rotflex_jax.text.numbers import plain_number, readable
 
 # The other reading is named where it gains this [nat], and so many standard deviations of the block gains.
 LEAST_NATS, LEAST_Z = 20.0, 3.0
@@ -162,11 +162,11 @@ def sign_note(
     """
     sentences, what = [], "the input" if set(found) == set(units) else "that column"
     for channel, errors in found.items():
-        (before, unit), (after, _) = (as_read(error, units[channel]) for error in errors)
+        before, after = (_shown(error, units[channel]) for error in errors)
         sentences.append(
             f"{channel} may have been recorded with the opposite sign: free runs of the model as it is over "
-            f"{seconds:g} s of training data leave {before:.3g} {unit} of it, and {after:.3g} {unit} where "
-            f"it is negated. If so, negate {what} and search again."
+            f"{seconds:g} s of training data leave {before} of it, and {after} where it "
+            f"is negated. If so, negate {what} and search again."
         )
     return tuple(sentences)
 
@@ -202,10 +202,16 @@ def still_note(
     """
     sentences = []
     for channel, deviations in found.items():
-        (moved, unit), (rests, same) = (as_read(x, units[channel]) for x in deviations)
+        moved, rests = (_shown(x, units[channel]) for x in deviations)
         sentences.append(
             f"{channel} hardly moves in the validation data: its standard deviation within {seconds:g} s is "
-            f"{rests:.2g} {same}, and {moved:.2g} {unit} in the training data. They say little of what acts "
-            f"on {channel}; give validation data in which it moves."
+            f"{rests}, and {moved} in the training data. They say little of what acts on {channel}; give "
+            "validation data in which it moves."
         )
     return tuple(sentences)
+
+
+def _shown(value: float, unit: str) -> str:
+    """A value with its unit as people read them."""
+    number, read = readable(value, unit)
+    return f"{plain_number(number)} {read}"

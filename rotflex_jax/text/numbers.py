@@ -137,22 +137,26 @@ def ratio(value: float, floor: float | None) -> float:
 def multiple(times: float) -> str:
     """How many times the noise an error is, as it stands in every sentence, tile and table.
 
-    >>> multiple(1.168), multiple(23.456), multiple(228.6)
-    ('1.17', '23.46', '229')
+    >>> multiple(1.168), multiple(23.456), multiple(228.6), multiple(39885.0)
+    ('1.17', '23.46', '229', 'over 10,000')
     """
     if not math.isfinite(times):
         return ""
-    return f"{times:.2f}" if times < 100 else f"{times:.0f}" if times < 1e5 else f"{times:.2e}"
+    return f"{times:.2f}" if times < 100 else f"{times:.0f}" if times < 10_000 else "over 10,000"
 
 
 def as_read(value: float, unit: str) -> tuple[float, str]:
-    """A value in the unit that people read: degrees for angles."""
+    """A value in the unit that people read: degrees for angles, millimetres for lengths.
+
+    >>> as_read(0.00085, "m"), as_read(0.5, "V")
+    ((0.85, 'mm'), (0.5, 'V'))
+    """
     if unit in ("rad", "rad/s"):
         return math.degrees(value), unit.replace("rad", "deg")
-    return value, unit
+    return (1000 * value, f"m{unit}") if unit in ("m", "m/s") else (value, unit)
 
 
 def readable(value: float, unit: str) -> tuple[float, str]:
-    """A value and its unit as people read them: degrees for angles."""
+    """The same with the unit in the signs of print."""
     number, read = as_read(value, unit)
     return number, unit_text(read)

@@ -183,7 +183,8 @@ def staircase(discovery: SearchResult) -> Figure | None:
         for text, colour in zip(ax.get_xticklabels(), colours, strict=True):
             text.set_color(colour)
             text.set_fontweight("bold")
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=20))
+        wide = max(values) > 1000 * min(values)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1,) if wide else (1, 2, 5), numticks=20))
         plain_ticks(ax.yaxis)
         ax.grid(axis="x", visible=False)
         ax.set_title(channel)
