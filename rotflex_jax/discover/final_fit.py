@@ -173,6 +173,13 @@ def _refused(state: SearchState, why: str) -> Refused:
     return Refused(f"The model to use is that of the search, not one fitted to {used}: {why}.")
 
 
+def _worse(ratio: float, seconds: float) -> str:
+    """That errors are larger, by the logarithm of their ratio."""
+    if np.isinf(ratio):
+        return "its runs of the validation data diverge"
+    return f"its errors over {seconds:g} s on validation data are {np.exp(ratio):.3g} times as large"
+
+
 def _fitted_to_all(
     state: SearchState, stage: Stage, h: Hypothesis, evaluation: Evaluation
 ) -> FinalFit | Refused:
@@ -186,13 +193,10 @@ def _fitted_to_all(
             fits = _without_each(structure, train) if validation.folds else [structure.fitted(joined(train))]
             tried.append((structure, fits, _on_validation(structure, fits, evaluation)))
     structure, fits, trained = min(tried, key=lambda each: log_error_ratio(each[2], searched))
-    seconds = f"errors over {validation.window_seconds:g} s on validation data"
     if (ratio := log_error_ratio(trained, searched)) > MOST_WORSE:
         others = "the other recordings" if validation.folds else "the training recordings"
-        return _refused(
-            state,
-            f"fitted in that way to {others} alone its {seconds} are {np.exp(ratio):.3g} times as large",
-        )
+        worse = _worse(ratio, validation.window_seconds)
+        return _refused(state, f"fitted in that way to {others} alone, {worse}")
     structure = _with_offsets_of_the_machine(structure, fits, evaluation)
     recordings = joined((*train, *held_back))
     found = structure.fitted(recordings)
@@ -202,10 +206,8 @@ def _fitted_to_all(
     carried = log_error_ratio(_as_carried(structure, every, evaluation), bare)
     own = log_error_ratio(_on_validation(structure, every, evaluation), searched)
     if carried > MOST_WORSE or own > 0:
-        worse = np.exp(carried if carried > MOST_WORSE else own)
-        return _refused(
-            state, f"its {seconds} are {worse:.3g} times as large, although it was fitted to them"
-        )
+        worse = _worse(carried if carried > MOST_WORSE else own, validation.window_seconds)
+        return _refused(state, f"{worse}, although it was fitted to them")
     return _reported(structure, found, recordings, evaluation, trained, searched)
 
 
