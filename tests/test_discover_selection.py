@@ -803,3 +803,24 @@ def test_first_states_come_from_a_generalisation_that_does_better(
     assert first.location == COULOMB and first.log_likelihood == pytest.approx(
         (trial(None, held_out=55.0) if asked else simple).log_likelihood
     )
+
+
+@pytest.mark.parametrize(("rise", "needed"), [(1.09, False), (1.13, True)])
+def test_an_effect_without_which_validation_runs_are_clearly_worse_is_needed(
+    rise: float, needed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tenth, though the training recordings are as well off without it; the better horizon counts."""
+    blocks, runs_problem = np.zeros(12), SimpleNamespace(supermodel=None)
+    monkeypatch.setattr(stepwise, "without", lambda s, h, location: h)
+    monkeypatch.setattr(
+        stepwise, "refit", lambda problem, hypotheses, alternations: [SimpleNamespace(blocks=blocks)]
+    )
+    errors = {"with": np.array([0.02, 0.01]), "without": rise * np.array([0.02, 0.01])}
+
+    def validated(prediction: str, free_run: Any, near: Any = None) -> Any:
+        runs = SimpleNamespace(window_rmse=errors[prediction], free_run=None)
+        return SimpleNamespace(window_rmse=9 * errors[prediction], free_run=runs)
+
+    horizons: Any = SimpleNamespace(free_run=SimpleNamespace(problem=runs_problem), validated=validated)
+    given: Any = SimpleNamespace(blocks=blocks)
+    assert stepwise._need(horizons, "with", given, EffectLocation("coulomb", "hub"), "without") == needed

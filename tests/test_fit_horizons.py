@@ -1,5 +1,7 @@
 """Fits of long free runs with models that lack something, bounds, and sizes that nothing speaks for."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import small_problem as sp
@@ -9,9 +11,9 @@ from scipy.signal import lfilter
 
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
-from rotflex_jax.discover.hypothesis import is_physical
+from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
 from rotflex_jax.discover.search_state import SearchState
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, build, scales
 from rotflex_jax.fit import fit
 from rotflex_jax.fit.inference import RecordingSlopes, curvature, nats_that_count
 from rotflex_jax.fit.plausibility import Reach, beyond_recordings, physical_ranges
@@ -26,6 +28,7 @@ from rotflex_jax.optimise.damped_least_squares import (
     minimise,
     solution_within,
 )
+from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
 
 SECONDS, NOISE = 10.0, np.sqrt(JITTER**2 + COUNT**2 / 12)
@@ -209,6 +212,46 @@ def test_a_search_leaves_out_candidates_of_sizes_that_no_signal_reaches():
     z[:, list(s.local).index(s.parameter_indices(offset)[0])] = 1e4
     large = type(h)(**{**vars(h), "local_z": z})
     assert not state.is_plausible(large, offset) and is_physical(s, large, offset)
+
+
+@pytest.mark.parametrize(("share", "plausible"), [(0.98, False), (1.02, True)])
+def test_a_search_leaves_out_sensors_that_could_not_read_what_was_recorded(
+    share: float, plausible: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """A cubic error whose readings turn round just below and just above the largest one of the recordings."""
+    found, location = sp.recordings(sp.records()), EffectLocation("sensor_cubic", "theta")
+    sizes = scales(Model(sp.baseline()), found, sp.dataset(found).torque_scale)
+    s = build(sp.baseline(), [(fx.SensorCubic, "theta")], sizes)
+    monkeypatch.setattr(sp, "supermodel", lambda: s)
+    at = sp.problem(found)
+    largest = max(float(np.abs(r.y[:, 0]).max()) for r in found)
+
+    class Horizons:
+        prediction = type("Prediction", (), {"problem": at})
+
+    def turn(cubic: float) -> float:
+        """The largest reading before readings fall again, on a grid."""
+        value = np.linspace(0.0, 20 * largest, 200_001)
+        reading = value + cubic * value**3
+        return float(reading[: int(np.argmax(np.diff(reading) < 0)) + 1].max())
+
+    # A cubic error acts alike at any scale: `cubic value^2` counts.
+    cubic = -((turn(-1.0) / (share * largest)) ** 2)
+    assert turn(cubic) == pytest.approx(share * largest, rel=1e-3)
+    h, transform = (
+        sp.start(at, locations=(*s.calibrations, location)),
+        Transform.of(s.mechanism.parameter_specifications),
+    )
+
+    def with_error(cubic: float) -> Hypothesis:
+        values = h.mean_values(s)
+        values[s.parameter_indices(location)] = cubic
+        return dataclasses.replace(h, z=transform.unconstrain(values))
+
+    state = SearchState(Model(sp.baseline()), Horizons, print, None)
+    assert state.is_plausible(with_error(cubic), location) == plausible
+    assert is_physical(s, with_error(cubic), location)
+    assert state.is_plausible(with_error(10 * abs(cubic)), location)
 
 
 def test_nats_of_errors_that_go_on_count_less():

@@ -37,6 +37,7 @@ from rotflex_jax.discover.validation import (
     ValidatedHypothesis,
     ValidationSet,
 )
+from rotflex_jax.effects.base import Sensing
 from rotflex_jax.fit.plausibility import Reach, beyond_recordings
 from rotflex_jax.models.model import Model
 
@@ -119,12 +120,18 @@ class SearchState:
         return Reach.of(self.model, self.problem.dataset.recordings)
 
     def is_plausible(self, h: Hypothesis, location: EffectLocation) -> bool:
-        """Whether the parameters of an effect are physical, and of sizes that the recordings reach."""
+        """Whether the parameters of an effect are physical, and of sizes that the recordings reach.
+
+        A sensor of which readings as large as the recorded ones belong to no true value is not physical.
+        """
         s = self.problem.supermodel
         if not is_physical(s, h, location):
             return False
         m = s.clean(h.mean_values(s), h.locations)
-        return not beyond_recordings(m, self.reach, [m.effect(*location)])
+        effect = m.effect(*location)
+        if isinstance(effect, Sensing) and self.reach.position[effect.at] > effect.largest_reading():
+            return False
+        return not beyond_recordings(m, self.reach, [effect])
 
     @property
     def problem(self) -> LikelihoodProblem:

@@ -241,7 +241,7 @@ def undecided(
     lost = paired_gain(found.blocks, rival.blocks)[0] + _training_gain(found, rival)[0]
     if predictions_apart(found, rival) and lost > left:
         return False
-    return _free_run_certainty(found, rival) < FREE_RUN_Z or _log_best_ratio(rival, found) < LAWS_APART
+    return _free_run_certainty(found, rival) < FREE_RUN_Z or log_best_ratio(rival, found) < LAWS_APART
 
 
 def both_prefer(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: StackedRecordings) -> bool:
@@ -394,11 +394,11 @@ def related(a: EffectLocation, b: EffectLocation) -> bool:
 
 def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
     """Whether short free runs distinguish the winner from a rival that is worse."""
-    return _log_best_ratio(rival, winner) > WINDOWS_APART
+    return log_best_ratio(rival, winner) > WINDOWS_APART
 
 
-def _log_best_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
-    """Mean log ratio of the errors of short free runs with the parameters that suit them best."""
+def log_best_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
+    """Mean log ratio of the errors of short free runs, each with the parameters that suit them best."""
     return float(np.mean(np.log(best_window_rmse(a) / best_window_rmse(b))))
 
 
@@ -420,7 +420,7 @@ def _clearly_better(
     nats = paired_gain(rich.blocks, simple.blocks)[0]
     train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
     share = nats / max(paired_gain(rich.blocks, current.blocks)[0], 1e-9)
-    runs_as_well = _log_best_ratio(rich, simple) < WINDOWS_BETTER
+    runs_as_well = log_best_ratio(rich, simple) < WINDOWS_BETTER
     # Few seconds of validation data are few blocks: whether the gain is chance, all blocks say together.
     return _free_runs_insist(rich, simple) or (
         nats > 10 and train > 20 and share > 0.003 and runs_as_well and predictions_apart(rich, simple)

@@ -31,6 +31,7 @@ from rotflex_jax.discover.selection import (
     TRAIN_Z,
     WINDOWS_BETTER,
     distinguished,
+    log_best_ratio,
     paired_gain,
     runs_clearly_better,
 )
@@ -248,21 +249,39 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
             if paired_gain(h.blocks, r.blocks)[1] < TRAIN_Z:
                 surplus[p] = min(surplus[p], -1.0)
         needless = sorted((p for p in tested if surplus[p] < 0), key=lambda p: surplus[p])
-        drop = next((p for p in needless if p not in added or not _need(runs_problem, runs, p)), None)
+        without_each = dict(zip(tested, rivals, strict=True))
+        drop = next(
+            (p for p in needless if p not in added or not _need(horizons, h, runs, p, without_each[p])), None
+        )
         if drop is None:
             break
-        h = rivals[tested.index(drop)]
+        h = without_each[drop]
         runs = refit(runs_problem, [without(s, runs, drop)])[0]
     else:
         worth, rivals = {}, []
     return Eliminated(h, runs, worth, rivals)
 
 
-def _need(problem: LikelihoodProblem, runs: Hypothesis, location: EffectLocation) -> bool:
-    """Whether free runs over the training recordings are clearly worse without an effect."""
-    less = refit(problem, [without(problem.supermodel, runs, location)], alternations=1)[0]
-    gain, z = paired_gain(runs.blocks, less.blocks)
-    return z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER
+def _need(
+    horizons: Horizons, h: Hypothesis, runs: Hypothesis, location: EffectLocation, less: Hypothesis
+) -> bool:
+    """Whether free runs are clearly worse without an effect, over training or over validation recordings.
+
+    Args:
+        horizons: With the recordings.
+        h: The model fitted to predictions.
+        runs: The same fitted to free runs.
+        location: The effect.
+        less: The model of predictions without it.
+    """
+    problem = horizons.free_run.problem
+    less_runs = refit(problem, [without(problem.supermodel, runs, location)], alternations=1)[0]
+    gain, z = paired_gain(runs.blocks, less_runs.blocks)
+    if z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER:
+        return True
+    # A fit without it may suit the training recordings with parameters that suit no others.
+    as_it_is = horizons.validated(h, runs)
+    return log_best_ratio(horizons.validated(less, less_runs, as_it_is), as_it_is) > FREE_RUN_BETTER
 
 
 class RemainingRivals(NamedTuple):

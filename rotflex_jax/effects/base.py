@@ -491,6 +491,10 @@ class Sensing(Effect):
     def measure(self, value: Scalar, *beside: Any) -> Scalar:
         """Reading [unit of the channel] for a true value."""
 
+    def largest_reading(self) -> float:
+        """The largest reading, either way, that belongs to one true value [unit of the channel]."""
+        return math.inf
+
     def stamp(self) -> Stamp:
         """Equations of its own states; not for a sensor without any."""
         return Stamp()

@@ -135,6 +135,10 @@ class SensorCubic(Sensing):
         """Reading [unit of the channel]."""
         return value + self.cubic * value * value * value
 
+    def largest_reading(self) -> float:
+        """That at `3 |cubic| value^2 = 1` for a negative `cubic`, from where on readings fall again."""
+        return 2.0 / 3.0 / math.sqrt(-3.0 * float(self.cubic)) if self.cubic < 0 else math.inf
+
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
         """One direction: five percent at the largest readings."""
