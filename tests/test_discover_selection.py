@@ -121,6 +121,23 @@ def test_free_runs_alone_may_ask_for_an_effect():
     assert not admissible(at_both({"windows": 1.1}, STRONG | {"windows": 0.9}, COULOMB), near, DATA, NOISE)
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "apart"),
+    [
+        ({}, True),
+        ({"train": 41.0}, False),
+        ({"held_out": 41.0}, False),
+        ({"windows": 5.0 * 1.11}, True),
+        ({"windows": 5.0 * 1.09}, False),
+    ],
+)
+def test_free_runs_that_training_data_see_the_other_way_round_distinguish_nothing(spoilt: dict, apart: bool):
+    """An error that is a fifth larger over validation data, unless blocks of either set prefer it."""
+    winner = at_both(NOTHING, STRONG, COULOMB)
+    rival = at_both(NOTHING, STRONG | {"held_out": 39.0, "train": 39.0, "windows": 6.0} | spoilt, DRAG)
+    assert selection.free_runs_apart(winner, rival) == apart
+
+
 def test_parameters_of_predictions_need_not_suit_free_runs():
     """A candidate whose predictions gain is not refused for the free runs of its predictor's parameters."""
     worse = GOOD | {"windows": 12.0}

@@ -257,8 +257,7 @@ def both_prefer(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: St
     more = max(rival.parameter_count - found.parameter_count, 0)
     gains = paired_gain(rival.blocks, found.blocks)[0], _training_gain(rival, found)[0]
     enough = gains[0] > HELD_OUT_NATS and gains[1] > _needed(more, data)
-    apart = predictions_apart(rival, found) and free_runs_apart(rival, found)
-    return enough and apart and _free_run_certainty(rival, found) > 0
+    return enough and predictions_apart(rival, found) and free_runs_apart(rival, found)
 
 
 def _leads(rich: ValidatedHypothesis, simple: ValidatedHypothesis) -> bool:
@@ -393,8 +392,14 @@ def related(a: EffectLocation, b: EffectLocation) -> bool:
 
 
 def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
-    """Whether short free runs distinguish the winner from a rival that is worse."""
-    return log_best_ratio(rival, winner) > WINDOWS_APART
+    """Whether short free runs distinguish the winner from a rival that is worse.
+
+    Where half-second blocks of free runs over training or over validation data prefer the rival, the smaller
+    error of the winner on validation data is chance.
+    """
+    if log_best_ratio(rival, winner) <= WINDOWS_APART:
+        return False
+    return winner.free_run is None or rival.free_run is None or _free_run_certainty(winner, rival) > 0
 
 
 def log_best_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
