@@ -54,7 +54,7 @@ def test_what_moves_is_five_times_its_error(share: float, moves: bool) -> None:
     assert localise._sides("speed", np.where(x > 0, 1.0, -1.0), "m/s", 0.2, WORDS) is None  # five times it
 
 
-@pytest.mark.parametrize(("unit", "factor", "step"), [("m/s", 1.0, 0.1), ("rad", 180 / np.pi, 5.0)])
+@pytest.mark.parametrize(("unit", "factor", "step"), [("V", 1.0, 0.1), ("rad", 180 / np.pi, 5.0)])
 def test_conditions_hold_where_they_say(unit: str, factor: float, step: float) -> None:
     """An eighth of what is reached, a round number in the unit that is read; for 3 to 60 % of the time."""
     x = np.concatenate([np.linspace(-0.83, 0.87, 1700), np.tile(0.1 * np.arange(-8, 9), 10)])
