@@ -840,4 +840,5 @@ def test_an_effect_without_which_validation_runs_are_clearly_worse_is_needed(
 
     horizons: Any = SimpleNamespace(free_run=SimpleNamespace(problem=runs_problem), validated=validated)
     given: Any = SimpleNamespace(blocks=blocks)
-    assert stepwise._need(horizons, "with", given, EffectLocation("coulomb", "hub"), "without") == needed
+    as_it_is = lambda: validated("with", given)  # noqa: E731
+    assert stepwise._need(horizons, as_it_is, given, EffectLocation("coulomb", "hub"), "without") == needed

@@ -238,10 +238,8 @@ def test_a_search_leaves_out_sensors_that_could_not_read_what_was_recorded(
     # A cubic error acts alike at any scale: `cubic value^2` counts.
     cubic = -((turn(-1.0) / (share * largest)) ** 2)
     assert turn(cubic) == pytest.approx(share * largest, rel=1e-3)
-    h, transform = (
-        sp.start(at, locations=(*s.calibrations, location)),
-        Transform.of(s.mechanism.parameter_specifications),
-    )
+    h = sp.start(at, locations=(*s.calibrations, location))
+    transform = Transform.of(s.mechanism.parameter_specifications)
 
     def with_error(cubic: float) -> Hypothesis:
         values = h.mean_values(s)

@@ -1,7 +1,8 @@
 """The stepwise search: fit the baseline, add, remove, swap and merge effects, assign calibrations."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -250,8 +251,14 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
                 surplus[p] = min(surplus[p], -1.0)
         needless = sorted((p for p in tested if surplus[p] < 0), key=lambda p: surplus[p])
         without_each = dict(zip(tested, rivals, strict=True))
+        as_it_is = functools.cache(functools.partial(horizons.validated, h, runs))
         drop = next(
-            (p for p in needless if p not in added or not _need(horizons, h, runs, p, without_each[p])), None
+            (
+                p
+                for p in needless
+                if p not in added or not _need(horizons, as_it_is, runs, p, without_each[p])
+            ),
+            None,
         )
         if drop is None:
             break
@@ -263,14 +270,18 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
 
 
 def _need(
-    horizons: Horizons, h: Hypothesis, runs: Hypothesis, location: EffectLocation, less: Hypothesis
+    horizons: Horizons,
+    as_it_is: Callable[[], ValidatedHypothesis],
+    runs: Hypothesis,
+    location: EffectLocation,
+    less: Hypothesis,
 ) -> bool:
     """Whether free runs are clearly worse without an effect, over training or over validation recordings.
 
     Args:
         horizons: With the recordings.
-        h: The model fitted to predictions.
-        runs: The same fitted to free runs.
+        as_it_is: The model at both horizons on validation data, the same for all effects.
+        runs: The model fitted to free runs.
         location: The effect.
         less: The model of predictions without it.
     """
@@ -280,8 +291,7 @@ def _need(
     if z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER:
         return True
     # A fit without it may suit the training recordings with parameters that suit no others.
-    as_it_is = horizons.validated(h, runs)
-    return log_best_ratio(horizons.validated(less, less_runs, as_it_is), as_it_is) > FREE_RUN_BETTER
+    return log_best_ratio(horizons.validated(less, less_runs, as_it_is()), as_it_is()) > FREE_RUN_BETTER
 
 
 class RemainingRivals(NamedTuple):
