@@ -14,6 +14,7 @@ from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
 from rotflex_jax.effects import Coulomb
+from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording.recording import digest_of_recordings
 
 MODULE = sys.modules[log_error_ratio.__module__]
@@ -110,13 +111,38 @@ def test_offsets_stay_with_their_recordings(arm, monkeypatch):
     assert level_of(last.model) == pytest.approx(0.06, rel=0.02)
 
 
-def test_an_offset_of_the_machine_is_carried_over(arm, monkeypatch):
-    """One that all recordings have, and that the search has left to them."""
+def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypatch):
+    """The search leaves 0.06 and 0.02 V to the recordings: the first is no good for the second run."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
-    given = run(0.06, 0.04, 0), run(0.06, 0.04, 1)
+    given = run(0.06, 0.06, 0), run(0.06, 0.02, 1)
     found = rf.discover(arm + Coulomb("hub", level=0.02), *given, candidates=[], rounds=0)
     value = dict(zip(found.model.mechanism.parameter_names, found.model.mechanism.values, strict=True))
-    assert value[OFFSET] == pytest.approx(0.04, abs=0.003)
+    assert value[OFFSET] == pytest.approx(0.03, abs=0.003)  # 0.04 (1 - 0.0008 / (2 0.04^2))
+    estimate = next(e for e in found.estimates if e.name == OFFSET)
+    assert estimate.value == value[OFFSET]
+    assert estimate.std == pytest.approx(0.02, abs=0.003)  # of the mean of two
+    assert [n for n in found.notes if f"the model to use has {value[OFFSET]:+.3g} V for other runs" in n]
+
+
+@pytest.mark.parametrize(
+    ("values", "common"),
+    [
+        ((0.02, 0.02, 0.02), 0.02),
+        ((0.03, -0.03), 0.0),
+        ((0.0, 0.0), 0.0),
+        ((0.06, 0.02), 0.03),
+        ((3.0, -1.0), 0.0),
+    ],
+)
+def test_what_runs_have_in_common(values, common):
+    """The estimate of Efron and Morris, by hand: mean m, variance s^2, m max(0, 1 - s^2 / (K m^2))."""
+    each = [Estimate(OFFSET, v, 1e-4, (v - 2e-4, v + 2e-4), "V") for v in values]
+    found = MODULE._common(each)
+    assert found.value == pytest.approx(common)
+    assert found.std == pytest.approx(np.std(values, ddof=1) / np.sqrt(len(values)))
+    if len(values) == 2:  # one degree of freedom: the quantile of a Cauchy distribution
+        half = np.tan(np.pi * 0.475) * found.std
+        assert found.ci95 == pytest.approx((common - half, common + half))
 
 
 def test_it_starts_from_usual_shapes_too_and_takes_the_likelier_end(runs, arm, monkeypatch):

@@ -160,7 +160,8 @@ def errors_on_test(
     """
     s, recordings = test.problem.supermodel, test.problem.dataset.recordings
     known = [runs.index(r) for r in recordings]
-    rows = np.array([own.mean(axis=0) if k is None else own[k] for k in known]).reshape(len(known), -1)
+    any_run = h.local_z.mean(axis=0)
+    rows = np.array([any_run if k is None else own[k] for k in known]).reshape(len(known), -1)
     trained = _with_own_values(s, h, rows)
     machine = [p for p in locations if runs.compared or p not in s.calibrations]
     on = [machine if k is None else locations for k in known]

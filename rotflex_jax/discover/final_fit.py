@@ -8,7 +8,8 @@ Parameters of an incomplete model depend on what they are fitted to. Those of th
 free runs that each have a first state of their own, which may hide a drift of the model. Whoever uses a model
 starts it from a measured state. So this fit is to free runs over windows from what their first samples show,
 unless validation data speak against that clearly, tried on the training recordings alone. Validation data
-also decide whether recordings have offsets that the search could do without.
+also decide whether recordings have offsets that the search could do without. A run of which nothing is known
+gets what the fitted runs have in common of them.
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 from jaxtyping import Float
 
 from rotflex_jax.discover.evaluation import (
@@ -34,7 +36,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import Transform
+from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import joined
 
@@ -110,12 +112,55 @@ class _Structure:
         """A hypothesis, or one for each recording, as errors are evaluated; nothing is adapted."""
         return ValidatedHypothesis(h, np.zeros(0), h, np.zeros(0), folds=tuple(folds))
 
+    def with_common_offsets(self, found: Fit) -> tuple["_Structure", Fit]:
+        """The structure that carries over what runs have in common of their offsets, and the fit with that.
+
+        The offset of a run is that of the machine plus a deviation of the run. By the values of K runs, with
+        mean m and variance s^2 (of K - 1 degrees of freedom), that of the machine is estimated as
+
+            m max(0, 1 - s^2 / (K m^2)):
+
+        their mean where they agree, zero where it is no larger than its standard deviation.
+
+        Source: B. Efron and C. Morris, "Stein's estimation rule and its competitors - an empirical Bayes
+        approach", Journal of the American Statistical Association 68 (1973) 117-130.
+        """
+        common = dict[str, Estimate]()
+        for location in self.own:
+            head = f"{location.port}.{location.effect}."
+            shared = {n: _common(each) for n, each in found.local.items() if n.startswith(head)}
+            if any(e.value for e in shared.values()):
+                common |= shared
+        carried = tuple(p for p in self.own if any(n.startswith(f"{p.port}.{p.effect}.") for n in common))
+        left = tuple(p for p in self.own if p not in carried)
+        mechanism = found.model.mechanism.with_values({n: e.value for n, e in common.items()})
+        found = dataclasses.replace(
+            found,
+            model=dataclasses.replace(found.model, mechanism=mechanism),
+            parameters=tuple(common.get(e.name, e) for e in found.parameters),
+        )
+        return dataclasses.replace(self, own=left, on=(*self.on, *carried)), found
+
     def carried(self, found: Fit) -> Model:
         """The model of a fit without what belongs to the recordings that were fitted."""
         m = found.model.mechanism
         for location in self.own:
             m = m.without(*location)
         return dataclasses.replace(found.model, mechanism=m)
+
+
+def _common(of_runs: Sequence[Estimate]) -> Estimate:
+    """What runs have in common by the estimates of each; see `_Structure.with_common_offsets`.
+
+    Its interval is that of their mean, by how they differ.
+    """
+    values = [e.value for e in of_runs]
+    count, mean = len(values), float(np.mean(values))
+    std = float(np.std(values, ddof=1)) / np.sqrt(count)
+    value = mean * max(0.0, 1.0 - (std / mean) ** 2) if mean else 0.0
+    half = float(scipy.special.stdtrit(count - 1, 0.975)) * std
+    note = "common to runs with " + ", ".join(f"{v:.3g}" for v in values)
+    return dataclasses.replace(of_runs[0], value=value, std=std, ci95=(value - half, value + half), note=note)
 
 
 def _with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
@@ -197,9 +242,12 @@ def _fitted_to_all(
         others = "the other recordings" if validation.folds else "the training recordings"
         worse = _worse(ratio, validation.window_seconds)
         return _refused(state, f"fitted in that way to {others} alone, {worse}")
-    structure = _with_offsets_of_the_machine(structure, fits, evaluation)
     recordings = joined((*train, *held_back))
     found = structure.fitted(recordings)
+    if evaluation.runs.compared:
+        structure, found = structure.with_common_offsets(found)
+    else:
+        structure = _with_offsets_that_help(structure, fits, evaluation)
     # A fit to recordings that does worse on them than one that has not seen them has failed; without their
     # offsets it may be a little worse by chance.
     every, bare = [found] * len(fits), RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
@@ -211,10 +259,8 @@ def _fitted_to_all(
     return _reported(structure, found, recordings, evaluation, trained, searched)
 
 
-def _with_offsets_of_the_machine(
-    structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation
-) -> _Structure:
-    """The structure that carries over what makes runs of other recordings better with its fitted value."""
+def _with_offsets_that_help(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> _Structure:
+    """The structure that carries over the offsets with which runs of validation data are better."""
     for location in structure.own:
         left = tuple(p for p in structure.own if p != location)
         more = dataclasses.replace(structure, own=left, on=(*structure.on, location))

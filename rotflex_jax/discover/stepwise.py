@@ -45,6 +45,7 @@ from rotflex_jax.discover.validation import (
     validate,
 )
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.runtime.persistent_jit import make_ahead
 
@@ -532,19 +533,31 @@ def _better_without(
 
 
 def calibration_notes(
-    s: SuperModel, final: ValidatedHypothesis, own: Sequence[EffectLocation]
+    s: SuperModel, final: ValidatedHypothesis, own: Sequence[EffectLocation], used: Mechanism
 ) -> tuple[str, ...]:
-    """What differs between recordings, in sentences."""
+    """What differs between recordings, in sentences.
+
+    Args:
+        s: The calibrations.
+        final: Their values in the training and in the validation recordings.
+        own: Those that the search does not carry over.
+        used: The mechanism to use, which may have what all runs have in common of them.
+    """
+    common = dict(zip(used.parameter_names, used.values.tolist(), strict=True))
     out = []
     for location in own:
         for i in s.parameter_indices(location):
-            unit = s.mechanism.parameter_specifications[i].unit
+            unit, name = s.mechanism.parameter_specifications[i].unit, s.mechanism.parameter_names[i]
             columns = (h.values(s)[:, i] for h in (final.hypothesis, final.adapted))
             trained, adapted = (", ".join(f"{v:+.3g} {unit}" for v in column) for column in columns)
             out.append(
                 f"{titled(location)} belongs to each recording, not to the machine: "
                 f"{trained} in the training data, {adapted} in the validation data; it was fitted, "
-                f"but not carried over."
+                + (
+                    f"and the model to use has {common[name]:+.3g} {unit} for other runs."
+                    if name in common
+                    else "but not carried over."
+                )
             )
     return tuple(out)
 

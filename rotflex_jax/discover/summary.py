@@ -128,7 +128,8 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
     baseline, final = evaluated.stages[0], evaluated.stages[-1]
     supermodel, remarks = state.problem.supermodel, evaluated.remarks
     held_back = state.validation.problem.dataset.recordings
-    conditional = _conditional(state)
+    conditional, last = _conditional(state), evaluated.final_fit
+    used = last.model if isinstance(last, FinalFit) else final.model
     scores = [s for s, _ in state.ranking]
     verdict, sentence = end_state(baseline, evaluated.rounds, final, state.noise_floor, scores, held_back)
     return Discovery(
@@ -150,13 +151,13 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *state.reading_notes,
             *_resumed(state.resumed),
             *conditional_note(conditional),
-            *calibration_notes(supermodel, evaluated.final, state.own),
+            *calibration_notes(supermodel, evaluated.final, state.own, used.mechanism),
             *_run_notes(state, evaluated.test),
             *disturbance_notes(supermodel, evaluated.final),
             *difference_notes(supermodel, evaluated.pairs),
             *_far_baseline(state),
             *state.notes,
-            *([evaluated.final_fit.sentence] if isinstance(evaluated.final_fit, Refused) else []),
+            *([last.sentence] if isinstance(last, Refused) else []),
             *(f"{remark.sentence}." for remark in remarks),
         ),
         remarks=remarks,
@@ -164,7 +165,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             state, assess_stages(baseline, final, state.noise_floor, held_back).misfit
         ),
         conditional=conditional,
-        final_fit=evaluated.final_fit if isinstance(evaluated.final_fit, FinalFit) else None,
+        final_fit=last if isinstance(last, FinalFit) else None,
     )
 
 
