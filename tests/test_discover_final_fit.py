@@ -100,15 +100,23 @@ def test_its_errors_are_those_of_its_model(found, runs):
     assert last.trained.windows["theta"] == pytest.approx(short_runs_miss(alone, validation), rel=0.2)
 
 
-def test_offsets_stay_with_their_recordings(arm, monkeypatch):
+def test_offsets_stay_with_their_runs(arm, monkeypatch):
+    """Another run has none of them; what follows in a run that was fitted has those of that run."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
-    given = run(0.06, 0.03, 0), run(0.06, -0.03, 1)
-    found = rf.discover(arm + Coulomb("hub", level=0.02), *given, candidates=[], rounds=0)
+    train = run(0.06, 0.03, 0)
+    validation, rest = run(0.06, -0.03, 1, N=4500).split(2 / 3)
+    model = arm + Coulomb("hub", level=0.02)
+    found = rf.discover(model, train, validation, test=rest, candidates=[], rounds=0)
     last = found.final_fit
     assert [e.value for e in last.fit.local[OFFSET]] == pytest.approx([0.03, -0.03], abs=0.003)
     assert OFFSET not in last.model.mechanism.parameter_names
     assert OFFSET not in [e.name for e in found.estimates]
     assert level_of(last.model) == pytest.approx(0.06, rel=0.02)
+    own = found.model_of(rest)
+    assert own == last.fit.model_of(1) == found.model_of(validation)
+    assert found.model_of(run(0.06, 0.0, 2)) == last.model
+    assert last.test.windows["theta"] == pytest.approx(short_runs_miss(own, rest), rel=1e-6)
+    assert short_runs_miss(own, rest) < 0.5 * short_runs_miss(last.model, rest)
 
 
 def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypatch):

@@ -145,6 +145,7 @@ def errors_on_test(
     own: Float[np.ndarray, "K L"],
     locations: Sequence[EffectLocation],
     runs: KnownRuns,
+    of_runs: Sequence[EffectLocation] = (),
 ) -> RunErrors:
     """Errors over recordings that had no say, each with the offsets that are known of its run.
 
@@ -157,6 +158,7 @@ def errors_on_test(
         own: Unconstrained values of its local parameters in each of the fitted recordings.
         locations: What its model has.
         runs: The fitted recordings.
+        of_runs: What the model has for recordings of the fitted runs besides.
     """
     s, recordings = test.problem.supermodel, test.problem.dataset.recordings
     known = [runs.index(r) for r in recordings]
@@ -164,7 +166,7 @@ def errors_on_test(
     rows = np.array([any_run if k is None else own[k] for k in known]).reshape(len(known), -1)
     trained = _with_own_values(s, h, rows)
     machine = [p for p in locations if runs.compared or p not in s.calibrations]
-    on = [machine if k is None else locations for k in known]
+    on = [machine if k is None else [*locations, *of_runs] for k in known]
     return free_runs(test, [test.model_of(trained, p, i) for i, p in enumerate(on)]).errors
 
 

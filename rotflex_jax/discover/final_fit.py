@@ -324,7 +324,9 @@ def _reported(
         h = structure.as_hypothesis(found)
         runs = evaluation.runs._replace(recordings=fitted)
         own = structure.own_values(found, len(fitted))
-        test = errors_on_test(evaluation.test, h, own, structure.on, runs)
+        # Of one run alone, validation data have said already whether its own offsets do any good.
+        of_runs = structure.own if runs.compared else ()
+        test = errors_on_test(evaluation.test, h, own, structure.on, runs, of_runs)
         if seconds:
             validated = structure.validated(h)
             calibrated = errors_with_own_calibration(evaluation.test, validated, structure.on, seconds)

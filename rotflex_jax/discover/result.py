@@ -192,7 +192,8 @@ class FinalFit:
     The fit is to free runs over windows, from what the first samples of each show.
 
     Attributes:
-        fit: To the training and validation recordings together, with what each has for itself.
+        fit: To the training and validation recordings together, with what each has for itself. What belongs
+            to a run has in its `model` and `parameters` the value that runs have in common, or their mean.
         recordings: What was fitted: training and validation recordings, parts of one run that follow on
             each other as one (`recording.joined`), since they share the offsets of their run.
         model: The model of it, with nothing that belongs to one recording.
@@ -491,6 +492,8 @@ class SearchResult:
             for location in self.offsets:
                 m = m.without(*location)
         elif k is not None and fit is not None:
+            if runs.compared:  # offsets of a run that others do not share are its own all the same
+                return fit.model_of(k)
             own = {name: each[k].value for name, each in fit.local.items() if name in m.parameter_names}
             m = m.with_values(own)
         return dataclasses.replace(self.model, mechanism=m)
