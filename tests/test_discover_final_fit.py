@@ -129,7 +129,7 @@ def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypa
     estimate = next(e for e in found.estimates if e.name == OFFSET)
     assert estimate.value == value[OFFSET]
     assert estimate.std == pytest.approx(0.02, abs=0.003)  # of the mean of two
-    assert [n for n in found.notes if f"the model to use has {value[OFFSET]:+.3g} V for other runs" in n]
+    assert [n for n in found.notes if f"the model to use has {value[OFFSET]:+.3g} V." in n]
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypa
     ],
 )
 def test_what_runs_have_in_common(values, common):
-    """The estimate of Efron and Morris, by hand: mean m, variance s^2, m max(0, 1 - s^2 / (K m^2))."""
+    """By hand: mean m, variance s^2, m max(0, 1 - s^2 / (K m^2))."""
     each = [Estimate(OFFSET, v, 1e-4, (v - 2e-4, v + 2e-4), "V") for v in values]
     found = MODULE._common(each)
     assert found.value == pytest.approx(common)

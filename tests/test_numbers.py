@@ -194,7 +194,9 @@ KNOWN = {
         ),
         **dict.fromkeys(["41.9", "0.1", "40.7"], "friction at a speed in both, by hand"),
         **dict.fromkeys(["4.97", "3.87", "1.33", "0.41", "4.54", "3.18", "2.04"], "errors before"),
-        **dict.fromkeys(["0.70", "0.21", "0.18", "5.72", "2.92", "2.95", "0.48"], "errors before, by final fits"),
+        **dict.fromkeys(
+            ["0.70", "0.21", "0.18", "5.72", "2.92", "2.95", "0.48"], "errors before, by final fits"
+        ),
         **dict.fromkeys(["0.045", "0.03", "0.01", "-0.005", "0.015"], "offsets of windows, by hand [V]"),
         **dict.fromkeys(["0.38", "0.28", "1.93", "0.61", "0.20"], "errors with one offset for both, by hand"),
         "2405.10779": "name of a preprint",

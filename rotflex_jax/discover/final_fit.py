@@ -122,8 +122,11 @@ class _Structure:
 
         their mean where they agree, zero where it is no larger than its standard deviation.
 
-        Source: B. Efron and C. Morris, "Stein's estimation rule and its competitors - an empirical Bayes
-        approach", Journal of the American Statistical Association 68 (1973) 117-130.
+        This is an empirical Bayes estimate with a prior of mean zero; it is better than the mean where what
+        runs have in common is small against their scatter.
+
+        Source: after B. Efron and C. Morris, "Stein's estimation rule and its competitors - an empirical
+        Bayes approach", Journal of the American Statistical Association 68 (1973) 117-130.
         """
         common = dict[str, Estimate]()
         for location in self.own:
@@ -152,7 +155,7 @@ class _Structure:
 def _common(of_runs: Sequence[Estimate]) -> Estimate:
     """What runs have in common by the estimates of each; see `_Structure.with_common_offsets`.
 
-    Its interval is that of their mean, by how they differ.
+    Its interval has the width of that of their mean, by how they differ.
     """
     values = [e.value for e in of_runs]
     count, mean = len(values), float(np.mean(values))
@@ -244,7 +247,7 @@ def _fitted_to_all(
         return _refused(state, f"fitted in that way to {others} alone, {worse}")
     recordings = joined((*train, *held_back))
     found = structure.fitted(recordings)
-    if evaluation.runs.compared:
+    if evaluation.runs.compared and len(recordings) > 1:
         structure, found = structure.with_common_offsets(found)
     else:
         structure = _with_offsets_that_help(structure, fits, evaluation)

@@ -554,7 +554,7 @@ def calibration_notes(
                 f"{titled(location)} belongs to each recording, not to the machine: "
                 f"{trained} in the training data, {adapted} in the validation data; it was fitted, "
                 + (
-                    f"and the model to use has {common[name]:+.3g} {unit} for other runs."
+                    f"and the model to use has {common[name]:+.3g} {unit}."
                     if name in common
                     else "but not carried over."
                 )
