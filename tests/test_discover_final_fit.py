@@ -139,6 +139,7 @@ def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypa
         ((0.03, -0.03), 0.0),
         ((0.0, 0.0), 0.0),
         ((0.06, 0.02), 0.03),
+        ((0.06, 0.06, 0.0), 0.03),
         ((3.0, -1.0), 0.0),
     ],
 )

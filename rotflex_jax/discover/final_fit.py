@@ -128,13 +128,13 @@ class _Structure:
         Source: after B. Efron and C. Morris, "Stein's estimation rule and its competitors - an empirical
         Bayes approach", Journal of the American Statistical Association 68 (1973) 117-130.
         """
-        common = dict[str, Estimate]()
+        s, common, carried = self.supermodel, dict[str, Estimate](), list[EffectLocation]()
         for location in self.own:
-            head = f"{location.port}.{location.effect}."
-            shared = {n: _common(each) for n, each in found.local.items() if n.startswith(head)}
+            names = [s.mechanism.parameter_names[i] for i in s.parameter_indices(location)]
+            shared = {n: _common(found.local[n]) for n in names if n in found.local}
             if any(e.value for e in shared.values()):
                 common |= shared
-        carried = tuple(p for p in self.own if any(n.startswith(f"{p.port}.{p.effect}.") for n in common))
+                carried.append(location)
         left = tuple(p for p in self.own if p not in carried)
         mechanism = found.model.mechanism.with_values({n: e.value for n, e in common.items()})
         found = dataclasses.replace(
