@@ -132,6 +132,18 @@ def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypa
     assert [n for n in found.notes if f"the model to use has {value[OFFSET]:+.3g} V." in n]
 
 
+def test_what_most_runs_have_in_common_may_not_suit_a_run_of_validation_data(arm):
+    """Of 0.06, 0.06 and 0 V half would be carried over; the fit is kept, without it."""
+    train, validation = [run(0.06, 0.06, 0), run(0.06, 0.06, 1)], run(0.06, 0.0, 2)
+    found = rf.discover(arm + Coulomb("hub", level=0.02), train, validation, candidates=[], rounds=0)
+    last = found.final_fit
+    assert last is not None and [e.value for e in last.fit.local[OFFSET]] == pytest.approx(
+        [0.06, 0.06, 0.0], abs=0.005
+    )
+    assert OFFSET not in last.model.mechanism.parameter_names
+    assert OFFSET not in last.to_dict()["parameters"]
+
+
 @pytest.mark.parametrize(
     ("values", "common"),
     [
@@ -198,6 +210,7 @@ def test_it_is_saved_and_told(found, runs, tmp_path: Path, monkeypatch):
     np.testing.assert_array_equal(read.mechanism.values, found.model.mechanism.values)
     told = json.loads(json.dumps(found.to_dict()))["final_fit"]
     assert told["parameters"][LEVEL]["value"] == level_of(found.model)
+    assert set(told["parameters"]) == set(found.model.mechanism.parameter_names)
     assert told["test_rmse_windows"]["theta"] == found.final_fit.test.windows["theta"]
     by_title = {errors.title: errors.errors for errors in error_lists(found)}
     assert FITTED_TO_ALL in by_title["Test data"] and FITTED_TO_ALL not in by_title["Validation data"]

@@ -96,14 +96,14 @@ def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch
     assert len(lines) == len(asked)
 
 
-def test_a_law_that_both_horizons_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch):
+def test_a_law_that_data_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch):
     final, better, best = model(STRIBECK, DELAY), model(DAHL, DELAY), model(LUGRE, DELAY)
     at_bound = model(COULOMB, DELAY)
     laws = ((at_bound, COULOMB), (better, DAHL), (best, LUGRE))
     tried = [dataclasses.replace(v, location=p) for v, p in laws]
     monkeypatch.setattr(in_place, "_in_place", lambda state, p, laws: tried if p == STRIBECK else [])
-    monkeypatch.setattr(in_place, "both_prefer", lambda rival, found, data: True)
-    monkeypatch.setattr(in_place, "_shape_at_bound", lambda s, v: v.location == COULOMB)
+    monkeypatch.setattr(in_place, "better_in_place", lambda rival, found, data: True)
+    monkeypatch.setattr(in_place, "_shape_at_bound", lambda s, v, known: v.location == COULOMB)
     monkeypatch.setattr(in_place, "shares_of_gain", lambda rivals, found: np.array([1.0, 1.5]))
     monkeypatch.setattr(in_place, "parameter_count", lambda s, h, p: 3)
     monkeypatch.setattr(in_place, "describe", lambda rival, found: str(rival.location))
@@ -113,6 +113,7 @@ def test_a_law_that_both_horizons_prefer_takes_the_place(monkeypatch: pytest.Mon
     monkeypatch.setattr(
         SearchState, "problem", SimpleNamespace(supermodel=supermodel(), dataset=SimpleNamespace(data=None))
     )
+    monkeypatch.setattr(in_place, "predictions_apart", lambda rival, found: True)
     (note,) = in_place.take_better_laws(state)
     assert note.startswith("LuGre friction at hub has taken the place of Stribeck friction at hub, which its")
     assert state.current.hypothesis is best.hypothesis and state.current.location is None
@@ -120,13 +121,14 @@ def test_a_law_that_both_horizons_prefer_takes_the_place(monkeypatch: pytest.Mon
     assert list(state.gains.items()) == [(DELAY, "a"), (LUGRE, "b")]
     assert state.rivals == {DELAY: [LAG], LUGRE: [STRIBECK, COULOMB]}
     # One that they do not prefer leaves all as it is.
-    monkeypatch.setattr(in_place, "both_prefer", lambda rival, found, data: False)
+    monkeypatch.setattr(in_place, "better_in_place", lambda rival, found, data: False)
     assert in_place.take_better_laws(state) == () and state.current.hypothesis is best.hypothesis
 
 
-@pytest.mark.parametrize("horizon", ["predictions", "free runs"])
-def test_a_shape_at_a_bound_is_that_of_another_law(horizon: str):
-    """At either horizon. A level of zero is no shape: it is the law switched off."""
+@pytest.mark.parametrize("predictions", [True, False])
+def test_a_shape_at_a_bound_is_that_of_another_law(predictions: bool, monkeypatch: pytest.MonkeyPatch):
+    """Where a horizon prefers the law. A level of zero is no shape: it is the law switched off."""
+    monkeypatch.setattr(in_place, "predictions_apart", lambda rival, found: predictions)
     specs = specifications(fx.LuGre)
     assert list(specs) == ["level", "rise", "slow", "presliding", "damping"]
     s: Any = SimpleNamespace(
@@ -140,13 +142,17 @@ def test_a_shape_at_a_bound_is_that_of_another_law(horizon: str):
         h: Any = SimpleNamespace(mean_values=lambda s: np.array(values))
         return ValidatedHypothesis(h, np.zeros(1), h, np.ones(1), location=LUGRE)
 
+    def at_bound(of_predictions: ValidatedHypothesis, of_free_runs: ValidatedHypothesis) -> bool:
+        rival = dataclasses.replace(of_predictions, free_run=of_free_runs)
+        return in_place._shape_at_bound(s, rival, inside)
+
     inside = fitted(0.0, 0.5, 0.3, 0.003, 0.0)
     ends = [(9.999, 0.3, 0.003), (0.5, 0.0011, 0.003), (0.5, 0.3, 1.1e-6)]
     for shape in ends:
         end = fitted(0.02, *shape, 0.01)
-        pair = (end, inside) if horizon == "predictions" else (inside, end)
-        assert in_place._shape_at_bound(s, dataclasses.replace(pair[0], free_run=pair[1]))
-    assert not in_place._shape_at_bound(s, dataclasses.replace(inside, free_run=inside))
+        assert at_bound(inside, end)
+        assert at_bound(end, inside) is predictions
+    assert not at_bound(inside, inside)
 
 
 LAWS = [(fx.Coulomb, "hub"), (fx.Stribeck, "hub"), (fx.Dahl, "hub")]

@@ -16,7 +16,7 @@ from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.selection import (
     admissible,
     best_window_rmse,
-    both_prefer,
+    better_in_place,
     choose,
     describe,
     distinguished,
@@ -586,7 +586,7 @@ def test_a_law_takes_the_place_of_another_one_where_both_horizons_prefer_it(side
     given = {"held_out": 100.0, "train": 100.0, "windows": 3.0, "scatter": 0.0} | {what: limits[what]}
     found = at_both({"windows": 5.0}, {"windows": 5.0}, COULOMB)
     rival = dataclasses.replace(at_both(given, {"windows": 5.0, **AHEAD}, DAHL), parameter_count=2)
-    assert both_prefer(rival, found, DATA) is (side > 1)
+    assert better_in_place(rival, found, DATA) is (side > 1)
 
 
 @pytest.mark.parametrize("kind", ["held_out", "train"])
@@ -597,7 +597,28 @@ def test_a_law_that_free_runs_speak_against_takes_no_place(kind: str) -> None:
     for lead, taken in ((1.0, True), (-1.0, False)):
         runs = {"windows": 5.0, **AHEAD, kind: lead}
         rival = dataclasses.replace(at_both(given, runs, DAHL), parameter_count=2)
-        assert both_prefer(rival, found, DATA) is taken
+        assert better_in_place(rival, found, DATA) is taken
+
+
+@SIDES
+@pytest.mark.parametrize("what", ["windows", "held_out", "train", "predictions"])
+def test_a_law_takes_the_place_where_free_runs_insist_and_predictions_do_not_object(
+    side: float, what: str
+) -> None:
+    """Free runs of both data by 2.5 deviations and a tenth; predictions lose less than two."""
+    z_is_one = np.sqrt(BLOCKS) * np.sqrt(BLOCKS / (BLOCKS - 1))
+    limits = {"windows": 5.0 * np.exp(-0.1 * side), "held_out": 2.5 * side * z_is_one}
+    limits["train"] = limits["held_out"]
+    runs = {"held_out": 100.0, "train": 100.0, "windows": 3.0, "scatter": 1.0}
+    objection = 2.0 * np.sqrt(2 * BLOCKS) * np.sqrt(2 * BLOCKS / (2 * BLOCKS - 1)) / 2
+    predictions = {"windows": 5.0, "held_out": 0.0, "train": 0.0, "scatter": 1.0}
+    if what == "predictions":
+        predictions |= {"held_out": -objection / side, "train": -objection / side}
+    else:
+        runs |= {what: limits[what]}
+    found = at_both({"windows": 5.0}, {"windows": 5.0}, COULOMB)
+    rival = dataclasses.replace(at_both(predictions, runs, DAHL), parameter_count=9)
+    assert better_in_place(rival, found, DATA) is (side > 1)
 
 
 @SIDES

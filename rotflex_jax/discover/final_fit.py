@@ -247,15 +247,22 @@ def _fitted_to_all(
         return _refused(state, f"fitted in that way to {others} alone, {worse}")
     recordings = joined((*train, *held_back))
     found = structure.fitted(recordings)
-    if evaluation.runs.compared and len(recordings) > 1:
-        structure, found = structure.with_common_offsets(found)
-    else:
-        structure = _with_offsets_that_help(structure, fits, evaluation)
     # A fit to recordings that does worse on them than one that has not seen them has failed; without their
     # offsets it may be a little worse by chance.
-    every, bare = [found] * len(fits), RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
-    carried = log_error_ratio(_as_carried(structure, every, evaluation), bare)
-    own = log_error_ratio(_on_validation(structure, every, evaluation), searched)
+    bare = RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
+
+    def as_carried(structure: _Structure, found: Fit) -> float:
+        return log_error_ratio(_as_carried(structure, [found] * len(fits), evaluation), bare)
+
+    if evaluation.runs.compared and len(recordings) > 1:
+        common = structure.with_common_offsets(found)
+        # What most runs have in common may be far from what a run of validation data has.
+        if as_carried(*common) <= MOST_WORSE:
+            structure, found = common
+    else:
+        structure = _with_offsets_that_help(structure, fits, evaluation)
+    carried = as_carried(structure, found)
+    own = log_error_ratio(_on_validation(structure, [found] * len(fits), evaluation), searched)
     if carried > MOST_WORSE or own > 0:
         worse = _worse(carried if carried > MOST_WORSE else own, validation.window_seconds)
         return _refused(state, f"{worse}, although it was fitted to them")

@@ -2,7 +2,8 @@
 
 What a model lacks besides suits one law of friction better than another, and a round refits only the laws
 that its scores put forward. At the end every other law of the same thing (`Effect.law_of`) and every rival of
-its round take the place of an effect, fitted at both horizons. A law that both prefer stays there.
+its round take the place of an effect, fitted at both horizons. A law that one horizon prefers beyond doubt
+stays there, where the other one allows it (`better_in_place`).
 """
 
 import dataclasses
@@ -14,7 +15,13 @@ from rotflex_jax.discover.conclusion import nats_left
 from rotflex_jax.discover.forward_selection import refit_and_validate
 from rotflex_jax.discover.hypothesis import parameter_count, usual_start, without
 from rotflex_jax.discover.search_state import SearchState
-from rotflex_jax.discover.selection import both_prefer, describe, shares_of_gain, undecided
+from rotflex_jax.discover.selection import (
+    better_in_place,
+    describe,
+    predictions_apart,
+    shares_of_gain,
+    undecided,
+)
 from rotflex_jax.discover.stepwise import titled
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
@@ -31,7 +38,7 @@ def other_laws(s: SuperModel, location: EffectLocation) -> list[EffectLocation]:
 
 
 def take_better_laws(state: SearchState) -> tuple[str, ...]:
-    """Put laws that both horizons prefer in the places of effects of a poor model.
+    """Put laws that data prefer (`better_in_place`) in the places of effects of a poor model.
 
     Args:
         state: A search that is done.
@@ -46,27 +53,37 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
         laws = [p for p in other_laws(s, location) if p not in state.current.hypothesis.locations]
         known = _as_found(state, location)
         fitted = _in_place(state, location, laws)
-        better = [v for v in fitted if both_prefer(v, known, state.problem.dataset.data)]
-        better = [v for v in better if not _shape_at_bound(s, v)]
+        better = [v for v in fitted if better_in_place(v, known, state.problem.dataset.data)]
+        better = [v for v in better if not _shape_at_bound(s, v, known)]
         if not better:
             continue
         best = better[int(np.argmax(shares_of_gain(better, known)))]
         assert best.location
         state.say(f"  + {best.location} in the place of {location}, " + describe(best, known))
         state.replace(location, best)
+        predictions = predictions_apart(best, known)
+        why = (
+            "predictions and free runs prefer it"
+            if predictions
+            else "free runs prefer it by far, and predictions do not distinguish the two"
+        )
         notes.append(
             f"{titled(best.location)} has taken the place of {titled(location)}, which its round had added: "
-            "beside all that was found, predictions and free runs prefer it."
+            f"beside all that was found, {why}."
         )
     return tuple(notes)
 
 
-def _shape_at_bound(s: SuperModel, found: ValidatedHypothesis) -> bool:
-    """Whether the shape of a law ends at a bound, at either horizon: what the data ask for is another law."""
-    assert found.location and found.free_run
-    c, specs = s.candidates[found.location], s.mechanism.parameter_specifications
+def _shape_at_bound(s: SuperModel, rival: ValidatedHypothesis, known: ValidatedHypothesis) -> bool:
+    """Whether the shape of a law that is preferred ends at a bound: what the data ask for is another law.
+
+    Where predictions do not prefer it, its shape there says nothing.
+    """
+    assert rival.location and rival.free_run
+    c, specs = s.candidates[rival.location], s.mechanism.parameter_specifications
     shape = [i for i, amplitude in zip(c.parameters, c.amplitudes, strict=True) if not amplitude]
-    fits = [v.hypothesis.mean_values(s) for v in (found, found.free_run)]
+    preferred = (rival, rival.free_run) if predictions_apart(rival, known) else (rival.free_run,)
+    fits = [v.hypothesis.mean_values(s) for v in preferred]
     return any(bound_reached(float(values[i]), specs[i]) for values in fits for i in shape)
 
 

@@ -185,6 +185,11 @@ class KnownRuns(NamedTuple):
         return next((k for k, r in enumerate(self.recordings) if of_one_run(r, recording)), None)
 
 
+def _parameters(estimates: Sequence[Estimate]) -> dict[str, Any]:
+    """Estimates by name as plain JSON."""
+    return {e.name: {**e.to_dict(), "free": e.free, "note": e.note} for e in estimates}
+
+
 @dataclasses.dataclass(frozen=True)
 class FinalFit:
     """The final model of a search that ends unexplained, fitted once more to all that had a say in it.
@@ -212,12 +217,18 @@ class FinalFit:
     test: RunErrors | None = None
     test_calibrated: RunErrors | None = None
 
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """Parameters of `model` with intervals; without offsets that belong to single runs."""
+        names = self.model.mechanism.parameter_names
+        return tuple(e for e in self.fit.parameters if e.name in names)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""
         out: dict[str, Any] = {
             "window_seconds": self.fit.options.window_seconds,
             "status": self.fit.status,
-            "parameters": {e.name: {**e.to_dict(), "free": e.free} for e in self.fit.parameters},
+            "parameters": _parameters(self.estimates),
         }
         for name, suffix, errors in (
             ("held_out_rmse_of_training_fit", "", self.trained),
@@ -253,7 +264,7 @@ class HorizonGain(NamedTuple):
 class Round:
     """One round of the search: an effect that was added.
 
-    Where another effect has taken the place of the one that the round added (a law that both horizons
+    Where another effect has taken the place of the one that the round added (a law that data
     prefer at the end, or one effect for several), `score`, `prediction` and `free_run` are those of the
     effect that the round added; so is `held_out_gain_nats` where the stages have parameters of free runs.
 
@@ -508,10 +519,7 @@ class SearchResult:
     @property
     def estimates(self) -> tuple[Estimate, ...]:
         """Parameters of `model` with intervals."""
-        if self.final_fit is None:
-            return self.final.estimates
-        names = self.model.mechanism.parameter_names
-        return tuple(e for e in self.final_fit.fit.parameters if e.name in names)
+        return (self.final_fit or self.final).estimates
 
     @property
     def final(self) -> Stage:
@@ -545,9 +553,7 @@ class SearchResult:
             "baseline": self.baseline.errors(),
             "noise_floor": plain(self.noise_floor),
             "rounds": [r.to_dict() for r in self.rounds],
-            "parameters": {
-                e.name: {**e.to_dict(), "free": e.free, "note": e.note} for e in self.final.estimates
-            },
+            "parameters": _parameters(self.final.estimates),
             "ranking": [r.to_dict() for r in self.ranking],
             "where": [w.to_dict() for w in self.where],
             "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,

@@ -244,16 +244,19 @@ def undecided(
     return _free_run_certainty(found, rival) < FREE_RUN_Z or log_best_ratio(rival, found) < LAWS_APART
 
 
-def both_prefer(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: StackedRecordings) -> bool:
-    """Whether predictions beyond doubt and free runs by a tenth prefer a rival in the place of an effect.
+def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: StackedRecordings) -> bool:
+    """Whether a rival is to take the place of an effect.
 
-    Free runs over training data, and over validation data, must each be better with it.
+    Predictions prefer it beyond doubt, and free runs by a tenth over training and over validation data; or
+    free runs prefer it beyond doubt, over both, and predictions do not distinguish the two.
 
     Args:
         rival: The model with the rival in the place of the effect.
         found: The model that was found; `parameter_count` is that of the effect.
         data: Training recordings.
     """
+    if _free_runs_insist(rival, found) and not predictions_apart(found, rival):
+        return True
     more = max(rival.parameter_count - found.parameter_count, 0)
     gains = paired_gain(rival.blocks, found.blocks)[0], _training_gain(rival, found)[0]
     enough = gains[0] > HELD_OUT_NATS and gains[1] > _needed(more, data)
