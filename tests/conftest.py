@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import array_types  # noqa: F401 - before the package, whose functions it checks
 import jax
 import jaxtyping
 import pytest
