@@ -54,12 +54,12 @@ def _at_first(*given: Any, **options: Any) -> Any:
         return part
     if not any(isinstance(hint, str) or holds_array(hint) for hint in part.__annotations__.values()):
         return part
-    checked, calls = _always(part, **options), itertools.count()
+    hooked, calls = _always(part, **options), itertools.count()
 
     @functools.wraps(part)
     def called(*arguments: Any, **named: Any) -> Any:
         __tracebackhide__ = True
-        return (checked if next(calls) < CALLS else part)(*arguments, **named)
+        return (hooked if next(calls) < CALLS else part)(*arguments, **named)
 
     return called
 
