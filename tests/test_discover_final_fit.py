@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import rotflex_jax as rf
 from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
 from rotflex_jax.discover.result import RunErrors
+from rotflex_jax.discover.selection import choose
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
 from rotflex_jax.effects import Coulomb
 from rotflex_jax.parameters import Estimate
@@ -22,14 +24,15 @@ INERTIA, DRIVE, DAMPING = 0.0075, 48.4 * 0.0107 / 3.29, (48.4 * 0.0107) ** 2 / 3
 LEVEL, OFFSET, CANDIDATES = "hub.coulomb.level", "input.voltage_offset.offset", [(Coulomb, "hub")]
 
 
-def run(level: float, offset: float, seed: int, N: int = 3000, Ts: float = 0.002, fine: int = 20):
+def run(level: float, offset: float, seed: int, N: int = 3000, excess: float = 0.0):
     """An arm without a spring under a noisy voltage.
 
         J w' = c (u + offset) - b w - friction
 
-    in explicit steps of 0.1 ms; the friction holds, and has another level in each run. The encoder has steps
-    of 0.5 mrad.
+    in explicit steps of 0.1 ms; the friction holds, and has another level in each run. With an `excess` it
+    falls with the speed (Stribeck), on a scale of 1 rad/s. The encoder has steps of 0.5 mrad.
     """
+    Ts, fine = 0.002, 20
     rng, h = np.random.default_rng(seed), Ts / fine
     u = np.repeat(rng.normal(0.0, 1.5, N // 50), 50)
     y, q, w = np.empty((N, 1)), 0.0, 0.0
@@ -37,10 +40,11 @@ def run(level: float, offset: float, seed: int, N: int = 3000, Ts: float = 0.002
         y[k] = round((q + 1e-4 * rng.standard_normal()) / 5e-4) * 5e-4
         drive = DRIVE * (u[k] + offset)
         for _ in range(fine):
-            if w == 0.0 and abs(drive) <= level:
+            friction = level + excess * np.exp(-(w**2))
+            if w == 0.0 and abs(drive) <= friction:
                 break
             direction = np.sign(w if w else drive)
-            after = w + h * (drive - DAMPING * w - level * direction) / INERTIA
+            after = w + h * (drive - DAMPING * w - friction * direction) / INERTIA
             w = 0.0 if after * w < 0 else after
             q += h * w
     return rf.Recording(u, y, Ts, channels=("theta",), n_init=50)
@@ -184,6 +188,74 @@ def test_it_starts_from_usual_shapes_too_and_takes_the_likelier_end(runs, arm, m
         assert [usual[n] for n in (*sizes, inertia)] == [searched[n] for n in (*sizes, inertia)]
         assert usual["hub.stribeck.speed"] != searched["hub.stribeck.speed"]
     assert found.final_fit.fit.cost == min(end.cost for end in ends[-2:])
+
+
+LAWS = [(Coulomb, "hub"), (rf.effects.Stribeck, "hub")]
+
+
+@pytest.fixture
+def coulomb_found(monkeypatch):
+    """A search that takes the simpler law, whatever the data say, and leaves it where it is."""
+    monkeypatch.setattr(sys.modules[choose.__module__], "_clearly_better", lambda *given: False)
+    monkeypatch.setattr(sys.modules[rf.discover.__module__], "take_better_laws", lambda state: ())
+
+
+def falling(seed: int) -> rf.Recording:
+    """A run with friction that falls with the speed, of a level of its own."""
+    return run((0.02, 0.03, 0.025)[seed], 0.0, seed, excess=0.1)
+
+
+def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(arm, coulomb_found, tmp_path):
+    train, validation, test = map(falling, range(3))
+    found = rf.discover(arm, train, validation, test=test, candidates=LAWS, rounds=1)
+    last = found.final_fit
+    assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
+    assert last.laws == ((("coulomb", "hub"), ("stribeck", "hub")),)
+    values = dict(zip(last.model.mechanism.parameter_names, last.model.mechanism.values, strict=True))
+    assert LEVEL not in values and values["hub.stribeck.excess"] == pytest.approx(0.1, rel=0.2)
+    assert last.test.windows["theta"] == pytest.approx(short_runs_miss(last.model, test), rel=1e-6)
+    assert last.test.windows["theta"] < 0.5 * found.final.test.windows["theta"]
+    told = json.loads(json.dumps(found.to_dict()))["final_fit"]
+    assert told["laws"] == [{"found": ["coulomb", "hub"], "used": ["stribeck", "hub"]}]
+    assert "Stribeck friction at the hub in the place of Coulomb friction at the hub" in str(found)
+    read = rf.Model.load(found.save(tmp_path / "model.json"))
+    np.testing.assert_array_equal(read.mechanism.values, last.model.mechanism.values)
+    assert found.model_of(train).mechanism.effect("stribeck", "hub")
+
+
+def test_a_richer_law_needs_a_use(arm, coulomb_found):
+    """Coulomb friction alone, of another level in each run."""
+    train, validation = run(0.05, 0.0, 0), run(0.075, 0.0, 1)
+    found = rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
+    assert found.final_fit.laws == () and LEVEL in found.model.mechanism.parameter_names
+
+
+def test_a_law_that_validation_data_speak_against_is_not_taken(arm, coulomb_found, monkeypatch):
+    """Fitted to training data alone, its runs of the validation data diverge."""
+    errors_of = MODULE._on_validation
+
+    def diverging(structure, fits, evaluation):
+        errors = errors_of(structure, fits, evaluation)
+        lost = dict.fromkeys(errors.windows, np.inf)
+        return RunErrors(lost, lost) if ("stribeck", "hub") in structure.on else errors
+
+    monkeypatch.setattr(MODULE, "_on_validation", diverging)
+    train, validation, _ = map(falling, range(3))
+    found = rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
+    assert found.final_fit.laws == () and LEVEL in found.model.mechanism.parameter_names
+
+
+def test_half_seconds_of_free_runs_weigh_as_measurements_do(arm, runs):
+    """Log-likelihood by scipy's normal density, summed by half seconds, the last of them shorter."""
+    model = rf.Model.of(arm + Coulomb("hub", level=0.06))
+    train = runs[0].split(0.7)[0]
+    fit = rf.fit(model, train, first="measured", window_seconds=2.0)
+    e = (fit.model.simulate_windows(train, 2.0) - train.y)[:, 0]
+    each = scipy.stats.norm.logpdf(e, scale=fit.noise["theta"]) + 0.5 * np.log(2 * np.pi)
+    expected = [part.sum() for part in np.split(each, range(250, train.N, 250))]
+    assert len(expected) == 9 and train.N == 2100
+    np.testing.assert_allclose(MODULE._blocks(fit, 0, train, 2.0), expected)
+    assert not MODULE._runs_prefer(fit, fit, [train], 2.0)
 
 
 def test_data_may_speak_against_it(runs, arm, monkeypatch):

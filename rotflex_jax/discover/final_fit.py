@@ -10,6 +10,10 @@ starts it from a measured state. So this fit is to free runs over windows from w
 unless validation data speak against that clearly, tried on the training recordings alone. Validation data
 also decide whether recordings have offsets that the search could do without. A run of which nothing is known
 gets what the fitted runs have in common of them.
+
+In a search each free run has a first state of its own, which hides much of what distinguishes one law of
+friction from another. From measured first states it shows: a law that the search cannot exclude takes the
+place of the one that it has found where these runs prefer it beyond doubt.
 """
 
 import dataclasses
@@ -27,14 +31,26 @@ from rotflex_jax.discover.evaluation import (
     errors_with_own_calibration,
     free_runs,
 )
-from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
+from rotflex_jax.discover.hypothesis import (
+    Hypothesis,
+    replacing,
+    usual_start,
+    with_all_calibrations,
+    with_effect,
+    without,
+)
+from rotflex_jax.discover.in_place import other_laws
+from rotflex_jax.discover.likelihood import BLOCK_SECONDS
 from rotflex_jax.discover.result import FinalFit, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
+from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, paired_gain
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.result import Fit
+from rotflex_jax.mechanism import Solver
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
@@ -71,16 +87,32 @@ class _Structure:
     window_seconds: float
 
     @classmethod
-    def of(cls, state: SearchState, h: Hypothesis, window_seconds: float) -> "_Structure":
-        """That of a hypothesis."""
-        s = state.problem.supermodel
+    def of(
+        cls,
+        s: SuperModel,
+        solver: Solver,
+        h: Hypothesis,
+        on: Sequence[EffectLocation],
+        window_seconds: float,
+    ) -> "_Structure":
+        """That of a hypothesis; arguments as the attributes."""
         values = {tuple(v.tolist()): v for v in (h.mean_values(s), _with_usual_shapes(s, h))}
-        starts = tuple(Model(s.clean(v, h.locations), state.model.solver) for v in values.values())
+        starts = tuple(Model(s.clean(v, h.locations), solver) for v in values.values())
         free = starts[0].mechanism.free_names
         local = [s.mechanism.parameter_names[i] for i in h.local]
-        own = tuple(p for p in h.locations if p in s.calibrations and p not in state.order)
+        own = tuple(p for p in h.locations if p in s.calibrations and p not in on)
         local = tuple(n for n in local if n in free)
-        return cls(starts, local, own, tuple(state.order), h, s, window_seconds)
+        return cls(starts, local, own, tuple(on), h, s, window_seconds)
+
+    def with_law(self, found: EffectLocation, law: EffectLocation) -> "_Structure":
+        """The structure with another law in the place of one that was found."""
+        s, h, start = self.supermodel, self.hypothesis, usual_start(self.supermodel, law)
+        if found.effect in CATALOG[law.effect].contains:
+            h = replacing(s, h, [found], start, 1.0)
+        else:
+            h = with_effect(s, without(s, h, found), start, 1.0)
+        on = [law if p == found else p for p in self.on]
+        return _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds)
 
     def fitted(self, recordings: Sequence[Recording]) -> Fit:
         """The structure fitted to free runs of recordings, the likelier of the ends from its starts.
@@ -228,45 +260,137 @@ def _worse(ratio: float, seconds: float) -> str:
     return f"its errors over {seconds:g} s on validation data are {np.exp(ratio):.3g} times as large"
 
 
+class _Tried(NamedTuple):
+    """A structure fitted without the validation data.
+
+    Attributes:
+        structure: What is fitted.
+        fits: To the training recordings; where runs validate each other, one without each of them.
+        errors: On the validation recordings, with their own offsets if these count.
+    """
+
+    structure: _Structure
+    fits: Sequence[Fit]
+    errors: RunErrors
+
+    @classmethod
+    def of(cls, state: SearchState, structure: _Structure, evaluation: Evaluation) -> "_Tried":
+        """A structure, fitted and validated."""
+        train = state.problem.dataset.recordings
+        if state.validation.folds:
+            fits = _without_each(structure, train)
+        else:
+            fits = [structure.fitted(joined(train))]
+        return cls(structure, fits, _on_validation(structure, fits, evaluation))
+
+
 def _fitted_to_all(
     state: SearchState, stage: Stage, h: Hypothesis, evaluation: Evaluation
 ) -> FinalFit | Refused:
-    train, validation = state.problem.dataset.recordings, state.validation
+    train, validation, s = state.problem.dataset.recordings, state.validation, state.problem.supermodel
     held_back = () if validation.folds else validation.problem.dataset.recordings
     searched = stage.calibrated or RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
-    tried = []
-    for given in (h, with_all_calibrations(state.problem.supermodel, h)):
-        if not tried or given.locations != h.locations:
-            structure = _Structure.of(state, given, validation.window_seconds)
-            fits = _without_each(structure, train) if validation.folds else [structure.fitted(joined(train))]
-            tried.append((structure, fits, _on_validation(structure, fits, evaluation)))
-    structure, fits, trained = min(tried, key=lambda each: log_error_ratio(each[2], searched))
-    if (ratio := log_error_ratio(trained, searched)) > MOST_WORSE:
+    variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
+    structures = [
+        _Structure.of(s, state.model.solver, v, state.order, validation.window_seconds)
+        for v in variants.values()
+    ]
+    tried = [_Tried.of(state, structure, evaluation) for structure in structures]
+    best = min(tried, key=lambda each: log_error_ratio(each.errors, searched))
+    if (ratio := log_error_ratio(best.errors, searched)) > MOST_WORSE:
         others = "the other recordings" if validation.folds else "the training recordings"
         worse = _worse(ratio, validation.window_seconds)
         return _refused(state, f"fitted in that way to {others} alone, {worse}")
     recordings = joined((*train, *held_back))
-    found = structure.fitted(recordings)
+    found = best.structure.fitted(recordings)
+    laws = []
+    for location in [p for p in state.order if p in state.scores]:
+        law, best, found = _with_better_law(state, location, best, found, recordings, evaluation, searched)
+        laws += [(location, law)] if law else []
+    structure, fits, trained = best
     # A fit to recordings that does worse on them than one that has not seen them has failed; without their
     # offsets it may be a little worse by chance.
     bare = RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
-
-    def as_carried(structure: _Structure, found: Fit) -> float:
-        return log_error_ratio(_as_carried(structure, [found] * len(fits), evaluation), bare)
-
-    if evaluation.runs.compared and len(recordings) > 1:
-        common = structure.with_common_offsets(found)
-        # What most runs have in common may be far from what a run of validation data has.
-        if as_carried(*common) <= MOST_WORSE:
-            structure, found = common
-    else:
-        structure = _with_offsets_that_help(structure, fits, evaluation)
-    carried = as_carried(structure, found)
+    options = [(structure, found)]
+    if not (evaluation.runs.compared and len(recordings) > 1):
+        options = [(_with_offsets_that_help(structure, fits, evaluation), found)]
+    else:  # what most runs have in common may be far from what a run of validation data has
+        options = [structure.with_common_offsets(found), *options]
+    for structure, found in options:
+        carried = log_error_ratio(_as_carried(structure, [found] * len(fits), evaluation), bare)
+        if carried <= MOST_WORSE:
+            break
     own = log_error_ratio(_on_validation(structure, [found] * len(fits), evaluation), searched)
     if carried > MOST_WORSE or own > 0:
         worse = _worse(carried if carried > MOST_WORSE else own, validation.window_seconds)
         return _refused(state, f"{worse}, although it was fitted to them")
-    return _reported(structure, found, recordings, evaluation, trained, searched)
+    return _reported(structure, found, recordings, evaluation, trained, searched, laws)
+
+
+def _with_better_law(
+    state: SearchState,
+    location: EffectLocation,
+    best: _Tried,
+    found: Fit,
+    recordings: tuple[Recording, ...],
+    evaluation: Evaluation,
+    searched: RunErrors,
+) -> tuple[EffectLocation | None, _Tried, Fit]:
+    """The law that free runs of all recordings prefer in the place of one that was found, if there is one.
+
+    Laws of the same thing that the search cannot exclude take part, and those that contain the one found.
+
+    Args:
+        state: What was found.
+        location: The effect.
+        best: The structure with the law that was found.
+        found: The same fitted to all recordings.
+        recordings: All that had a say.
+        evaluation: With the validation recordings.
+        searched: Errors of the search's own fit on them.
+
+    Returns:
+        The law, or None; the structure to use and its fit.
+    """
+    s, h = state.problem.supermodel, best.structure.hypothesis
+    able = []
+    for law in other_laws(s, location):
+        special_case = law.effect in CATALOG[location.effect].contains
+        possible = law in state.rivals.get(location, []) or location.effect in CATALOG[law.effect].contains
+        if possible and not special_case and law not in h.locations:
+            structure = best.structure.with_law(location, law)
+            end = structure.fitted(recordings)
+            if _runs_prefer(end, found, recordings, best.structure.window_seconds):
+                able.append((end, structure, law))
+    for end, structure, law in sorted(able, key=lambda each: each[0].cost):
+        tried = _Tried.of(state, structure, evaluation)
+        if log_error_ratio(tried.errors, searched) <= MOST_WORSE:
+            return law, tried, end
+    return None, best, found
+
+
+def _runs_prefer(a: Fit, b: Fit, recordings: Sequence[Recording], seconds: float) -> bool:
+    """Whether free runs of a fit leave a tenth less than those of another one, over most half seconds.
+
+    Args:
+        a: Fitted to the recordings.
+        b: The same, of another structure.
+        recordings: Those that were fitted.
+        seconds: How long each free run is [s].
+    """
+    smaller = float(np.mean([np.log(a.noise[c] / b.noise[c]) for c in b.noise]))
+    if not smaller < -FREE_RUN_BETTER:
+        return False
+    blocks = [np.concatenate([_blocks(x, k, r, seconds) for k, r in enumerate(recordings)]) for x in (a, b)]
+    return paired_gain(*blocks)[1] > FREE_RUN_Z
+
+
+def _blocks(found: Fit, k: int, recording: Recording, seconds: float) -> Float[np.ndarray, " B"]:
+    """Log-likelihood of each half second of free runs over a fitted recording, the `k`-th [nat]."""
+    model, noise = found.model_of(k), np.array(list(found.noise.values()))
+    e = (model.simulate_windows(recording, seconds) - model.measured(recording)) / noise
+    starts = np.arange(0, recording.N, max(round(BLOCK_SECONDS / recording.Ts), 1))
+    return np.add.reduceat(-np.sum(0.5 * e**2 + np.log(noise), axis=1), starts)
 
 
 def _with_offsets_that_help(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> _Structure:
@@ -326,6 +450,7 @@ def _reported(
     evaluation: Evaluation,
     trained: RunErrors,
     searched: RunErrors,
+    laws: Sequence[tuple[EffectLocation, EffectLocation]],
 ) -> FinalFit:
     """A fit with its errors on recordings that had no say."""
     test = calibrated = None
@@ -348,4 +473,5 @@ def _reported(
         searched=searched,
         test=test,
         test_calibrated=calibrated,
+        laws=tuple(laws),
     )

@@ -207,6 +207,7 @@ class FinalFit:
         searched: The same errors of the final model as the search has fitted it.
         test: Errors on recordings that had no say, if there are any.
         test_calibrated: The same with each recording's own offsets.
+        laws: Pairs of an effect that the search has found and the law that stands in its place in this model.
     """
 
     fit: Fit
@@ -216,6 +217,7 @@ class FinalFit:
     searched: RunErrors
     test: RunErrors | None = None
     test_calibrated: RunErrors | None = None
+    laws: tuple[tuple[tuple[str, str], tuple[str, str]], ...] = ()
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -229,6 +231,7 @@ class FinalFit:
             "window_seconds": self.fit.options.window_seconds,
             "status": self.fit.status,
             "parameters": _parameters(self.estimates),
+            "laws": [{"found": list(found), "used": list(used)} for found, used in self.laws],
         }
         for name, suffix, errors in (
             ("held_out_rmse_of_training_fit", "", self.trained),

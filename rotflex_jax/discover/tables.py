@@ -9,7 +9,7 @@ import numpy as np
 from rotflex_jax.discover.explanation import advice, coloured_sensors
 from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, Stage
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
-from rotflex_jax.effects.labels import effect_label
+from rotflex_jax.effects.labels import effect_label, effect_phrase
 from rotflex_jax.text.numbers import (
     multiple,
     plain_number,
@@ -159,10 +159,15 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     own = f", each with the offsets of its own first {calibrated:g} s" if calibrated else ""
     ending = "" if found.fit.status == "converged" else f" The fit {found.fit.status}."
     remarks = "".join(f" {remark.sentence}." for remark in found.fit.remarks)
+    laws = "".join(
+        f" It has {effect_phrase(*used)} in the place of {effect_phrase(*replaced)}, which the search has "
+        "found: such runs of all that was fitted prefer it by far, and the search could not exclude it."
+        for replaced, used in found.laws
+    )
     return (
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
-        f"measured first states. Fitted in the same way without the validation data, its errors on these "
-        f"over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
+        f"measured first states.{laws} Fitted in the same way without the validation data, its errors on "
+        f"these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
     )
 
 
