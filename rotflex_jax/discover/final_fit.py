@@ -311,11 +311,11 @@ def _fitted_to_all(
     # A fit to recordings that does worse on them than one that has not seen them has failed; without their
     # offsets it may be a little worse by chance.
     bare = RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
-    options = [(structure, found)]
-    if not (evaluation.runs.compared and len(recordings) > 1):
+    if evaluation.runs.compared and len(recordings) > 1:
+        # What most runs have in common may be far from what a run of validation data has.
+        options = [structure.with_common_offsets(found), (structure, found)]
+    else:
         options = [(_with_offsets_that_help(structure, fits, evaluation), found)]
-    else:  # what most runs have in common may be far from what a run of validation data has
-        options = [structure.with_common_offsets(found), *options]
     for structure, found in options:
         carried = log_error_ratio(_as_carried(structure, [found] * len(fits), evaluation), bare)
         if carried <= MOST_WORSE:
