@@ -5,17 +5,20 @@ import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
-import scipy.stats
 
 import rotflex_jax as rf
+from rotflex_jax.discover import conclusion
 from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.selection import choose
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
 from rotflex_jax.effects import Coulomb
+from rotflex_jax.experiment import until_decided
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording.recording import digest_of_recordings
 
@@ -170,8 +173,8 @@ def test_what_runs_have_in_common(values, common):
         assert found.ci95 == pytest.approx((common - half, common + half))
 
 
-def test_it_starts_from_usual_shapes_too_and_takes_the_likelier_end(runs, arm, monkeypatch):
-    """Of what was found the sizes are kept, and the shape is a usual one."""
+def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, monkeypatch):
+    """Of what was found first the sizes are kept, then nothing; the user's model is then as given."""
     begun, ends, fit = [], [], MODULE.fit
 
     def noted(model, *given, **how):
@@ -184,10 +187,14 @@ def test_it_starts_from_usual_shapes_too_and_takes_the_likelier_end(runs, arm, m
     train, validation, _ = runs
     found = rf.discover(arm, train, validation, candidates=[(rf.effects.Stribeck, "hub")], rounds=1)
     sizes, inertia = ["hub.stribeck.level", "hub.stribeck.excess"], "hub.inertia.inertia"
-    for searched, usual in zip(begun[::2], begun[1::2], strict=True):
+    given = dict(zip(arm.parameter_names, arm.values, strict=True))
+    for searched, usual, fresh in zip(begun[::3], begun[1::3], begun[2::3], strict=True):
         assert [usual[n] for n in (*sizes, inertia)] == [searched[n] for n in (*sizes, inertia)]
         assert usual["hub.stribeck.speed"] != searched["hub.stribeck.speed"]
-    assert found.final_fit.fit.cost == min(end.cost for end in ends[-2:])
+        assert fresh["hub.stribeck.speed"] == usual["hub.stribeck.speed"]
+        assert all(fresh[n] != searched[n] for n in sizes)
+        assert {n: fresh[n] for n in given} == pytest.approx(given)
+    assert found.final_fit.fit.cost == min(end.cost for end in ends[-3:])
 
 
 LAWS = [(Coulomb, "hub"), (rf.effects.Stribeck, "hub")]
@@ -205,7 +212,9 @@ def falling(seed: int) -> rf.Recording:
     return run((0.02, 0.03, 0.025)[seed], 0.0, seed, excess=0.1)
 
 
-def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(arm, coulomb_found, tmp_path):
+def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
+    arm, coulomb_found, tmp_path, monkeypatch
+):
     train, validation, test = map(falling, range(3))
     found = rf.discover(arm, train, validation, test=test, candidates=LAWS, rounds=1)
     last = found.final_fit
@@ -221,6 +230,22 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(arm, coul
     read = rf.Model.load(found.save(tmp_path / "model.json"))
     np.testing.assert_array_equal(read.mechanism.values, last.model.mechanism.values)
     assert found.model_of(train).mechanism.effect("stribeck", "hub")
+    # The table of a report says what the new parameters are.
+    (row,) = [r for r in parameter_rows(found) if r.name == "hub.stribeck.excess"]
+    assert row.meaning and not row.held
+    # What to record next compares what was found with an equal of it, not with the law in its place.
+    asked = []
+    monkeypatch.setattr(
+        conclusion, "next_experiment", lambda model, *pair, **how: asked.append((model, pair))
+    )
+    added = dataclasses.replace(found.rounds[0], equivalent=(("stribeck", "hub"),))
+    conclusion.proposed(dataclasses.replace(found, rounds=(added,)))
+    assert asked == [(found.final.model, (("coulomb", "hub"), ("stribeck", "hub")))]
+    # Models of probable sets start from what was fitted.
+    monkeypatch.setattr(until_decided, "fit", lambda model, recordings: model)
+    models, _ = until_decided.models_of(found, lambda line: None)
+    (coulomb,) = [m for name, m in models.items() if name == "coulomb@hub"]
+    assert level_of(rf.Model.of(coulomb.mechanism)) == level_of(found.final.model)
 
 
 def test_a_richer_law_needs_a_use(arm, coulomb_found):
@@ -245,17 +270,42 @@ def test_a_law_that_validation_data_speak_against_is_not_taken(arm, coulomb_foun
     assert found.final_fit.laws == () and LEVEL in found.model.mechanism.parameter_names
 
 
-def test_half_seconds_of_free_runs_weigh_as_measurements_do(arm, runs):
-    """Log-likelihood by scipy's normal density, summed by half seconds, the last of them shorter."""
-    model = rf.Model.of(arm + Coulomb("hub", level=0.06))
+def comparing(recordings: list[rf.Recording], noise: float) -> Any:
+    """What compares fits, with nothing but recordings, the noise of the sensor and the length of a run."""
+    state: Any = SimpleNamespace(
+        validation=SimpleNamespace(window_seconds=2.0, folds=True),
+        problem=SimpleNamespace(
+            noise=np.array([noise]), dataset=SimpleNamespace(recordings=tuple(recordings))
+        ),
+    )
+    return MODULE._LastFit(state, cast(Any, None), cast(Any, None))
+
+
+def test_free_runs_are_compared_by_the_errors_of_half_seconds(arm, runs):
+    """The last of them is longer."""
     train = runs[0].split(0.7)[0]
-    fit = rf.fit(model, train, first="measured", window_seconds=2.0)
+    fit = rf.fit(arm + Coulomb("hub", level=0.06), train, first="measured", window_seconds=2.0)
     e = (fit.model.simulate_windows(train, 2.0) - train.y)[:, 0]
-    each = scipy.stats.norm.logpdf(e, scale=fit.noise["theta"]) + 0.5 * np.log(2 * np.pi)
-    expected = [part.sum() for part in np.split(each, range(250, train.N, 250))]
-    assert len(expected) == 9 and train.N == 2100
-    np.testing.assert_allclose(MODULE._blocks(fit, 0, train, 2.0), expected)
-    assert not MODULE._runs_prefer(fit, fit, [train], 2.0)
+    assert train.N == 2100
+    expected = [-0.5 * np.log(np.mean(part**2) + 1e-6) for part in np.split(e, range(250, 2000, 250))]
+    last = comparing([train], 1e-3)
+    np.testing.assert_allclose(last.blocks(fit), expected)
+    assert not last.runs_prefer(fit, fit)
+
+
+@pytest.mark.parametrize(
+    ("falls", "smaller", "preferred"),
+    [
+        ([0.2, 0.25, 0.15, 0.2], 0.2, True),
+        ([0.2, 0.25, 0.15, 0.2], 0.09, False),  # by less than a tenth
+        ([1.0, -0.1, -0.1, 0.0], 0.2, False),  # in one half second only
+    ],
+)
+def test_a_law_is_preferred_where_free_runs_are_better_everywhere(falls, smaller, preferred, monkeypatch):
+    last, before = comparing([], 1e-3), np.array([1.0, 3.0, 2.0, 5.0])
+    a, b = (SimpleNamespace(noise={"theta": x}) for x in (np.exp(-smaller), 1.0))
+    monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: before + falls if f is a else before)
+    assert last.runs_prefer(a, b) == preferred
 
 
 def test_data_may_speak_against_it(runs, arm, monkeypatch):

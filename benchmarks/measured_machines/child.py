@@ -57,6 +57,7 @@ def row(
         "verdict": told["verdict"],
         "sentence": told["sentence"],
         "notes": told["notes"],
+        "laws": told["final_fit"]["laws"] if told["final_fit"] else [],
         "estimates": estimates(result.final),
         # What the search itself reports, all keys that it has, and the same again by the public interface.
         "reported": {

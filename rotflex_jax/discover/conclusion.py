@@ -126,7 +126,8 @@ def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
         "process_noise": found.final.process_noise,
         "reference": longest.u[: round(PROPOSAL_SECONDS / longest.Ts)],
     }
-    return next_experiment(found.model, first, second, **(settings | changes))
+    # The model to use may have another law in the place of the first (`FinalFit.laws`).
+    return next_experiment(found.final.model, first, second, **(settings | changes))
 
 
 def seen_limits(recordings: tuple[Recording, ...]) -> Limits:

@@ -12,11 +12,12 @@ also decide whether recordings have offsets that the search could do without. A 
 gets what the fitted runs have in common of them.
 
 In a search each free run has a first state of its own, which hides much of what distinguishes one law of
-friction from another. From measured first states it shows: a law that the search cannot exclude takes the
-place of the one that it has found where these runs prefer it beyond doubt.
+friction from another. From measured first states it shows: a law that the search cannot exclude, or that
+contains the one found, takes its place where these runs prefer it beyond doubt.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -36,11 +37,9 @@ from rotflex_jax.discover.hypothesis import (
     replacing,
     usual_start,
     with_all_calibrations,
-    with_effect,
-    without,
 )
 from rotflex_jax.discover.in_place import other_laws
-from rotflex_jax.discover.likelihood import BLOCK_SECONDS
+from rotflex_jax.discover.likelihood import block_edges
 from rotflex_jax.discover.result import FinalFit, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, paired_gain
@@ -68,8 +67,9 @@ class _Structure:
     """What is fitted.
 
     Attributes:
-        starts: The final model, with the calibrations of its recordings, as the search has fitted it and
-            with the usual shapes of what was found.
+        starts: The final model, with the calibrations of its recordings: as the search has fitted it, with
+            the usual shapes of what was found, and as a user would start it, with the values given and usual
+            ones of what was found.
         local: Parameters that each recording has for itself.
         own: Calibrations that are not carried over to other recordings.
         on: What is on in the model that a user gets.
@@ -96,7 +96,8 @@ class _Structure:
         window_seconds: float,
     ) -> "_Structure":
         """That of a hypothesis; arguments as the attributes."""
-        values = {tuple(v.tolist()): v for v in (h.mean_values(s), _with_usual_shapes(s, h))}
+        begun = h.mean_values(s), _with_usual_shapes(s, h), _as_given(s, h)
+        values = {tuple(v.tolist()): v for v in begun}
         starts = tuple(Model(s.clean(v, h.locations), solver) for v in values.values())
         free = starts[0].mechanism.free_names
         local = [s.mechanism.parameter_names[i] for i in h.local]
@@ -104,21 +105,23 @@ class _Structure:
         local = tuple(n for n in local if n in free)
         return cls(starts, local, own, tuple(on), h, s, window_seconds)
 
-    def with_law(self, found: EffectLocation, law: EffectLocation) -> "_Structure":
-        """The structure with another law in the place of one that was found."""
-        s, h, start = self.supermodel, self.hypothesis, usual_start(self.supermodel, law)
-        if found.effect in CATALOG[law.effect].contains:
-            h = replacing(s, h, [found], start, 1.0)
-        else:
-            h = with_effect(s, without(s, h, found), start, 1.0)
-        on = [law if p == found else p for p in self.on]
-        return _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds)
+    def with_law(self, law: EffectLocation) -> "_Structure":
+        """The structure with a law in the place of all others of the same thing at its port.
+
+        It starts from what it has in common with them, and from the values that a user would start with.
+        """
+        s, h = self.supermodel, self.hypothesis
+        replaced = [p for p in self.on if p in other_laws(s, law)]
+        h = replacing(s, h, replaced, usual_start(s, law), 1.0)
+        on = list(dict.fromkeys(law if p in replaced else p for p in self.on))
+        structure = _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds)
+        return dataclasses.replace(structure, starts=(structure.starts[0], structure.starts[-1]))
 
     def fitted(self, recordings: Sequence[Recording]) -> Fit:
         """The structure fitted to free runs of recordings, the likelier of the ends from its starts.
 
         Parameters of predictions may lead to another local minimum of free runs than usual ones: to stiff,
-        damped bristles of a friction instead of soft ones.
+        damped bristles of a friction instead of soft ones. Those of the search's free runs may, too.
         """
         how = {"first": "measured", "window_seconds": self.window_seconds}
         ends = [fit(model, list(recordings), local=self.local, **how) for model in self.starts]
@@ -213,6 +216,15 @@ def _with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
     return values
 
 
+def _as_given(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
+    """Values of the user's model as given and usual ones of what was found; calibrations as fitted."""
+    values, given = h.mean_values(s), list(s.baseline_free)
+    values[given] = s.mechanism.values[given]
+    for location in s.without_calibrations(h.locations):
+        values[s.parameter_indices(location)] = np.array(s.candidates[location].probes[0][0])
+    return values
+
+
 class Refused(NamedTuple):
     """Why the final model was not fitted to all that had a say.
 
@@ -242,7 +254,7 @@ def fit_to_all(
         return _refused(state, "it has a periodic disturbance, whose phase no other recording shares")
     state.say("fitting what was chosen to all recordings that had a say")
     try:
-        return _fitted_to_all(state, stage, final.hypothesis, evaluation)
+        return _LastFit(state, stage, evaluation).made(final.hypothesis)
     except InputError as error:  # some recordings cannot be fitted alone: no reason to lose what was found
         return _refused(state, str(error).rstrip("."))
 
@@ -273,124 +285,174 @@ class _Tried(NamedTuple):
     fits: Sequence[Fit]
     errors: RunErrors
 
-    @classmethod
-    def of(cls, state: SearchState, structure: _Structure, evaluation: Evaluation) -> "_Tried":
-        """A structure, fitted and validated."""
-        train = state.problem.dataset.recordings
-        if state.validation.folds:
+
+class _Candidate(NamedTuple):
+    """A structure that has passed without the validation data, fitted to all recordings.
+
+    Attributes:
+        tried: The structure without the validation data.
+        found: The fit to all.
+        laws: Pairs of an effect that was found and the law that stands in its place.
+    """
+
+    tried: _Tried
+    found: Fit
+    laws: tuple[tuple[EffectLocation, EffectLocation], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class _LastFit:
+    """The final fit of one search.
+
+    Attributes:
+        state: What was found.
+        stage: The final model as it is reported.
+        evaluation: The recordings that errors are reported on.
+    """
+
+    state: SearchState
+    stage: Stage
+    evaluation: Evaluation
+
+    @functools.cached_property
+    def recordings(self) -> tuple[Recording, ...]:
+        """All that had a say, parts of one run that follow on each other as one."""
+        validation = self.state.validation
+        held_back = () if validation.folds else validation.problem.dataset.recordings
+        return joined((*self.state.problem.dataset.recordings, *held_back))
+
+    @property
+    def carried_over(self) -> RunErrors:
+        """Errors of the search's own fit on the validation recordings, with nothing of these."""
+        return RunErrors(self.stage.held_out_rmse, self.stage.held_out_rmse_windows)
+
+    @property
+    def searched(self) -> RunErrors:
+        """The same with their own offsets, if these count."""
+        return self.stage.calibrated or self.carried_over
+
+    def made(self, h: Hypothesis) -> FinalFit | Refused:
+        """The fit of a final model; or why there is none."""
+        state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
+        variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
+        structures = [
+            _Structure.of(s, state.model.solver, v, state.order, seconds) for v in variants.values()
+        ]
+        best = min(map(self.tried, structures), key=lambda each: log_error_ratio(each.errors, self.searched))
+        if (ratio := log_error_ratio(best.errors, self.searched)) > MOST_WORSE:
+            others = "the other recordings" if state.validation.folds else "the training recordings"
+            return _refused(state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
+        as_found = _Candidate(best, best.structure.fitted(self.recordings))
+        with_laws = self.with_better_laws(as_found)
+        made = self.accepted(with_laws)
+        if isinstance(made, Refused) and with_laws.laws:
+            return self.accepted(as_found)
+        return made
+
+    def tried(self, structure: _Structure) -> _Tried:
+        """A structure fitted to the training recordings, and validated."""
+        train = self.state.problem.dataset.recordings
+        if self.state.validation.folds:
             fits = _without_each(structure, train)
         else:
             fits = [structure.fitted(joined(train))]
-        return cls(structure, fits, _on_validation(structure, fits, evaluation))
+        return _Tried(structure, fits, _on_validation(structure, fits, self.evaluation))
 
+    def with_better_laws(self, candidate: _Candidate) -> _Candidate:
+        """The same with laws that free runs of all recordings prefer in the places of those that were found.
 
-def _fitted_to_all(
-    state: SearchState, stage: Stage, h: Hypothesis, evaluation: Evaluation
-) -> FinalFit | Refused:
-    train, validation, s = state.problem.dataset.recordings, state.validation, state.problem.supermodel
-    held_back = () if validation.folds else validation.problem.dataset.recordings
-    searched = stage.calibrated or RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
-    variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
-    structures = [
-        _Structure.of(s, state.model.solver, v, state.order, validation.window_seconds)
-        for v in variants.values()
-    ]
-    tried = [_Tried.of(state, structure, evaluation) for structure in structures]
-    best = min(tried, key=lambda each: log_error_ratio(each.errors, searched))
-    if (ratio := log_error_ratio(best.errors, searched)) > MOST_WORSE:
-        others = "the other recordings" if validation.folds else "the training recordings"
-        worse = _worse(ratio, validation.window_seconds)
-        return _refused(state, f"fitted in that way to {others} alone, {worse}")
-    recordings = joined((*train, *held_back))
-    found = best.structure.fitted(recordings)
-    laws = []
-    for location in [p for p in state.order if p in state.scores]:
-        law, best, found = _with_better_law(state, location, best, found, recordings, evaluation, searched)
-        laws += [(location, law)] if law else []
-    structure, fits, trained = best
-    # A fit to recordings that does worse on them than one that has not seen them has failed; without their
-    # offsets it may be a little worse by chance.
-    bare = RunErrors(stage.held_out_rmse, stage.held_out_rmse_windows)
-    if evaluation.runs.compared and len(recordings) > 1:
-        # What most runs have in common may be far from what a run of validation data has.
-        options = [structure.with_common_offsets(found), (structure, found)]
-    else:
-        options = [(_with_offsets_that_help(structure, fits, evaluation), found)]
-    for structure, found in options:
-        carried = log_error_ratio(_as_carried(structure, [found] * len(fits), evaluation), bare)
-        if carried <= MOST_WORSE:
-            break
-    own = log_error_ratio(_on_validation(structure, [found] * len(fits), evaluation), searched)
-    if carried > MOST_WORSE or own > 0:
-        worse = _worse(carried if carried > MOST_WORSE else own, validation.window_seconds)
-        return _refused(state, f"{worse}, although it was fitted to them")
-    return _reported(structure, found, recordings, evaluation, trained, searched, laws)
+        Laws of the same thing that the search cannot exclude take part, and those that contain the one found.
+        """
+        state, s = self.state, self.state.problem.supermodel
+        for location in [p for p in state.order if p in state.scores]:
+            structure, able = candidate.tried.structure, []
+            if location not in structure.on:  # replaced with another one
+                continue
+            contains = CATALOG[location.effect].contains
+            laws = [p for p in other_laws(s, location) if p not in structure.on and p.effect not in contains]
+            possible = state.rivals.get(location, [])
+            laws = [p for p in laws if p in possible or location.effect in CATALOG[p.effect].contains]
+            for law in laws:
+                state.say(f"  with {law} in the place of {location}")
+                other = structure.with_law(law)
+                found = other.fitted(self.recordings)
+                physical = state.is_plausible(other.as_hypothesis(found), law)
+                if physical and self.runs_prefer(found, candidate.found):
+                    able.append((found, other, law))
+            for found, other, law in sorted(able, key=lambda each: each[0].cost):
+                tried = self.tried(other)
+                # As little as validation data may speak against the fit, they may against the law.
+                before = (self.searched, candidate.tried.errors)
+                if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in before):
+                    replaced = [(p, law) for p in structure.on if p not in other.on]
+                    candidate = _Candidate(tried, found, (*candidate.laws, *replaced))
+                    break
+        return candidate
 
+    def runs_prefer(self, a: Fit, b: Fit) -> bool:
+        """Whether free runs of fit `a` leave a tenth less than those of `b`, beyond doubt."""
+        smaller = float(np.mean([np.log(a.noise[c] / b.noise[c]) for c in b.noise]))
+        return smaller < -FREE_RUN_BETTER and paired_gain(self.blocks(a), self.blocks(b))[1] > FREE_RUN_Z
 
-def _with_better_law(
-    state: SearchState,
-    location: EffectLocation,
-    best: _Tried,
-    found: Fit,
-    recordings: tuple[Recording, ...],
-    evaluation: Evaluation,
-    searched: RunErrors,
-) -> tuple[EffectLocation | None, _Tried, Fit]:
-    """The law that free runs of all recordings prefer in the place of one that was found, if there is one.
+    def blocks(self, found: Fit) -> Float[np.ndarray, " B"]:
+        """Minus the logarithm of the error of free runs in each half second, mean over channels.
 
-    Laws of the same thing that the search cannot exclude take part, and those that contain the one found.
+        As free runs are compared in a search (`LikelihoodProblem`): by which factor the error falls counts in
+        every block alike.
+        """
+        out = []
+        for k, r in enumerate(self.recordings):
+            model, edges = found.model_of(k), block_edges(r.N, r.Ts)
+            e = model.simulate_windows(r, self.state.validation.window_seconds) - model.measured(r)
+            squares = np.add.reduceat(e**2, edges) / np.diff([*edges, r.N])[:, None]
+            out.append(-0.5 * np.mean(np.log(squares + self.state.problem.noise**2), axis=1))
+        return np.concatenate(out)
 
-    Args:
-        state: What was found.
-        location: The effect.
-        best: The structure with the law that was found.
-        found: The same fitted to all recordings.
-        recordings: All that had a say.
-        evaluation: With the validation recordings.
-        searched: Errors of the search's own fit on them.
+    def accepted(self, candidate: _Candidate) -> FinalFit | Refused:
+        """The result with a candidate, unless it fails on validation data, to which it was fitted."""
+        (structure, fits, trained), found, laws = candidate
+        # A fit to recordings that does worse on them than one that has not seen them has failed; without
+        # their offsets it may be a little worse by chance.
+        if self.evaluation.runs.compared and len(self.recordings) > 1:
+            # What most runs have in common may be far from what a run of validation data has.
+            options = [structure.with_common_offsets(found), (structure, found)]
+        else:
+            options = [(_with_offsets_that_help(structure, fits, self.evaluation), found)]
+        for structure, found in options:
+            each = [found] * len(fits)
+            carried = log_error_ratio(_as_carried(structure, each, self.evaluation), self.carried_over)
+            if carried <= MOST_WORSE:
+                break
+        own = log_error_ratio(_on_validation(structure, each, self.evaluation), self.searched)
+        if carried > MOST_WORSE or own > 0:
+            seconds = self.state.validation.window_seconds
+            worse = _worse(carried if carried > MOST_WORSE else own, seconds)
+            return _refused(self.state, f"{worse}, although it was fitted to them")
+        made = FinalFit(
+            fit=found,
+            recordings=self.recordings,
+            model=structure.carried(found),
+            trained=trained,
+            searched=self.searched,
+            laws=laws,
+        )
+        return self.tested(made, structure) if self.evaluation.test else made
 
-    Returns:
-        The law, or None; the structure to use and its fit.
-    """
-    s, h = state.problem.supermodel, best.structure.hypothesis
-    able = []
-    for law in other_laws(s, location):
-        special_case = law.effect in CATALOG[location.effect].contains
-        possible = law in state.rivals.get(location, []) or location.effect in CATALOG[law.effect].contains
-        if possible and not special_case and law not in h.locations:
-            structure = best.structure.with_law(location, law)
-            end = structure.fitted(recordings)
-            if _runs_prefer(end, found, recordings, best.structure.window_seconds):
-                able.append((end, structure, law))
-    for end, structure, law in sorted(able, key=lambda each: each[0].cost):
-        tried = _Tried.of(state, structure, evaluation)
-        if log_error_ratio(tried.errors, searched) <= MOST_WORSE:
-            return law, tried, end
-    return None, best, found
-
-
-def _runs_prefer(a: Fit, b: Fit, recordings: Sequence[Recording], seconds: float) -> bool:
-    """Whether free runs of a fit leave a tenth less than those of another one, over most half seconds.
-
-    Args:
-        a: Fitted to the recordings.
-        b: The same, of another structure.
-        recordings: Those that were fitted.
-        seconds: How long each free run is [s].
-    """
-    smaller = float(np.mean([np.log(a.noise[c] / b.noise[c]) for c in b.noise]))
-    if not smaller < -FREE_RUN_BETTER:
-        return False
-    blocks = [np.concatenate([_blocks(x, k, r, seconds) for k, r in enumerate(recordings)]) for x in (a, b)]
-    return paired_gain(*blocks)[1] > FREE_RUN_Z
-
-
-def _blocks(found: Fit, k: int, recording: Recording, seconds: float) -> Float[np.ndarray, " B"]:
-    """Log-likelihood of each half second of free runs over a fitted recording, the `k`-th [nat]."""
-    model, noise = found.model_of(k), np.array(list(found.noise.values()))
-    e = (model.simulate_windows(recording, seconds) - model.measured(recording)) / noise
-    starts = np.arange(0, recording.N, max(round(BLOCK_SECONDS / recording.Ts), 1))
-    return np.add.reduceat(-np.sum(0.5 * e**2 + np.log(noise), axis=1), starts)
+    def tested(self, made: FinalFit, structure: _Structure) -> FinalFit:
+        """A final fit with its errors on recordings that had no say."""
+        test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
+        assert test
+        h = structure.as_hypothesis(made.fit)
+        runs = self.evaluation.runs._replace(recordings=self.recordings)
+        own = structure.own_values(made.fit, len(self.recordings))
+        # Of one run alone, validation data have said already whether its own offsets do any good.
+        of_runs = structure.own if runs.compared else ()
+        errors = errors_on_test(test, h, own, structure.on, runs, of_runs)
+        calibrated = None
+        if seconds:
+            validated = structure.validated(h)
+            calibrated = errors_with_own_calibration(test, validated, structure.on, seconds)
+        return dataclasses.replace(made, test=errors, test_calibrated=calibrated)
 
 
 def _with_offsets_that_help(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> _Structure:
@@ -441,37 +503,3 @@ def _as_carried(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluati
     if not validation.folds:
         return errors_as_trained(validation, each[0], structure.on)
     return free_runs(validation, [validation.model_of(h, structure.on, 0) for h in each]).errors
-
-
-def _reported(
-    structure: _Structure,
-    found: Fit,
-    fitted: tuple[Recording, ...],
-    evaluation: Evaluation,
-    trained: RunErrors,
-    searched: RunErrors,
-    laws: Sequence[tuple[EffectLocation, EffectLocation]],
-) -> FinalFit:
-    """A fit with its errors on recordings that had no say."""
-    test = calibrated = None
-    seconds = evaluation.calibrate_seconds
-    if evaluation.test:
-        h = structure.as_hypothesis(found)
-        runs = evaluation.runs._replace(recordings=fitted)
-        own = structure.own_values(found, len(fitted))
-        # Of one run alone, validation data have said already whether its own offsets do any good.
-        of_runs = structure.own if runs.compared else ()
-        test = errors_on_test(evaluation.test, h, own, structure.on, runs, of_runs)
-        if seconds:
-            validated = structure.validated(h)
-            calibrated = errors_with_own_calibration(evaluation.test, validated, structure.on, seconds)
-    return FinalFit(
-        fit=found,
-        recordings=fitted,
-        model=structure.carried(found),
-        trained=trained,
-        searched=searched,
-        test=test,
-        test_calibrated=calibrated,
-        laws=tuple(laws),
-    )

@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet, Used
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener, fit_whitener
@@ -257,14 +257,18 @@ def _multiple_of_four(count: int) -> int:
     return -(-count // 4) * 4
 
 
+def block_edges(N: int, Ts: float) -> Int[np.ndarray, " B"]:
+    """First sample of each block of N samples; the last, shorter block joins its neighbour."""
+    width = max(round(BLOCK_SECONDS / Ts), 1)
+    return np.arange(0, max(N - width, 0) + 1, width)
+
+
 def in_blocks(values: Float[np.ndarray, "R N"], data: StackedRecordings) -> Float[np.ndarray, " B"]:
-    """Sums over blocks; the last, shorter block of each recording joins its neighbour."""
+    """Sums over blocks of each recording."""
     out = []
     for row, seen, Ts in zip(values, data.seen, data.Ts, strict=True):
         N = int(seen.sum())
-        width = max(round(BLOCK_SECONDS / float(Ts)), 1)
-        edges = np.arange(0, max(N - width, 0) + 1, width)
-        out.append(np.add.reduceat(row[:N], edges) if N else np.zeros(0))
+        out.append(np.add.reduceat(row[:N], block_edges(N, float(Ts))) if N else np.zeros(0))
     return np.concatenate(out)
 
 

@@ -1,15 +1,17 @@
 """What a card, a terminal and a report list of a search: errors, parameters, outcomes, labels."""
 
 import dataclasses
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from rotflex_jax.discover.explanation import advice, coloured_sensors
-from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, Stage
+from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
 from rotflex_jax.effects.labels import effect_label, effect_phrase
+from rotflex_jax.models.model import Model
 from rotflex_jax.text.numbers import (
     multiple,
     plain_number,
@@ -161,7 +163,7 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     remarks = "".join(f" {remark.sentence}." for remark in found.fit.remarks)
     laws = "".join(
         f" It has {effect_phrase(*used)} in the place of {effect_phrase(*replaced)}, which the search has "
-        "found: such runs of all that was fitted prefer it by far, and the search could not exclude it."
+        "found: such runs of all that was fitted prefer it by far."
         for replaced, used in found.laws
     )
     return (
@@ -215,7 +217,7 @@ def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
     if discovery.final_fit:
         stages.append({e.name: e for e in discovery.estimates})
     names = list(dict.fromkeys(n for s in reversed(stages) for n in s))
-    meanings = _meanings(discovery.stages)
+    meanings = _meanings([*(s.model for s in discovery.stages), discovery.model])
     rows = []
     for name in names:
         last = next(s[name] for s in reversed(stages) if name in s)
@@ -225,10 +227,10 @@ def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
     return tuple(sorted(rows, key=lambda r: r.held))
 
 
-def _meanings(stages: tuple[Stage, ...]) -> dict[str, str]:
+def _meanings(models: Sequence[Model]) -> dict[str, str]:
     found: dict[str, str] = {}
-    for stage in stages:
-        m = stage.model.mechanism
+    for model in models:
+        m = model.mechanism
         pairs = zip(m.parameter_names, m.parameter_specifications, strict=True)
         found |= {name: spec.meaning for name, spec in pairs}
     return found

@@ -129,12 +129,14 @@ def models_of(given: Any, say: Progress) -> tuple[Any, Mapping[str, float] | Non
     if known is None or not train:
         return given, None
     models, found = {}, {}
+    # The model to use may have another law in the place of one that was found (`FinalFit.laws`).
+    fitted = (*given.final.model.mechanism.effects, *given.model.mechanism.effects)
+    final = {(e.name, e.at): e for e in fitted}
     for s in known.sets[:MOST_SETS]:
         if s.probability < LEAST_PROBABLE and len(models) >= 2:
             continue
         m, label = given.baseline.model, " + ".join(sorted(s.effects)) or "nothing more"
         have = {(e.name, e.at) for e in m.mechanism.effects}
-        final = {(e.name, e.at): e for e in given.model.mechanism.effects}
         for name in sorted(s.effects):
             at = tuple(name.split("@"))
             # The phase of a disturbance in the next seconds is not known.
