@@ -129,3 +129,7 @@ def test_page_takes_what_the_search_reports_and_says_so():
     assert f"|  |  |  | final | {three} | {three} | {three} | {three} | 11.5 / 5.73 | the search |" in text
     assert "| (lag@input) | 100 / 200 | 10 / 20 | yes | abc, changed |" in text
     assert "- so101: left out, no model" in text
+    used = [{"found": ["dahl", "hub"], "used": ["lugre", "hub"]}]
+    row |= {"laws": used, "reported": row["reported"] | {"fitted to all": row["reported"]["final"]}}
+    text = page({"rows": {"rotflex: A to B": row}})
+    assert f"|  |  |  | fitted to all, lugre@hub for dahl@hub | {three} | {three} | {three} |" in text

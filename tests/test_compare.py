@@ -246,9 +246,13 @@ def test_discovered_chooses_within_the_training_data(monkeypatch: pytest.MonkeyP
         model: Model, train: list[Recording], test: list[Recording], progress: Callable
     ) -> SimpleNamespace:
         asked.append((train, test))
-        found = SimpleNamespace(effect="coulomb", port="hub")
+        # The model to use has another law than the one that was found: the note names what it has.
+        found, laws = SimpleNamespace(effect="dahl", port="hub"), ((("dahl", "hub"), ("coulomb", "hub")),)
         return SimpleNamespace(
-            rounds=[found], verdict="found", model=model + rf.effects.Coulomb(at="hub", level=0.01)
+            rounds=[found],
+            verdict="unexplained",
+            final_fit=SimpleNamespace(laws=laws),
+            model=model + rf.effects.Coulomb(at="hub", level=0.01),
         )
 
     monkeypatch.setattr(physics, "discover", fake)

@@ -72,6 +72,12 @@ def said(row: Row) -> str:
     return ", ".join(parts) or "nothing"
 
 
+def laws(row: Row) -> str:
+    """Laws that the fit to all has in the places of those that were found."""
+    pairs = (("@".join(x["used"]), "@".join(x["found"])) for x in row.get("laws", []))
+    return "".join(f", {used} for {found}" for used, found in pairs)
+
+
 def best(row: Row) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:
     """Best of the other methods: its name and its two errors on the test."""
     rows = [r for r in (row["others"] or {"rows": []})["rows"] if r["status"] == "ok"]
@@ -106,7 +112,8 @@ def page(results: dict[str, Any]) -> str:
             head = [row["machine"], row["direction"], machine.unit] if stage == "baseline" else ["", "", ""]
             cells = [told(errors[kind], machine.factor) for kind in KINDS]
             cells.append(told(held_out(row, stage)["windows"], machine.factor) if stage not in last else "")
-            lines.append("| " + " | ".join([*head, stage, *cells, source]) + " |")
+            name = stage + laws(row) if stage in last else stage
+            lines.append("| " + " | ".join([*head, name, *cells, source]) + " |")
         name, whole, windows = best(row)
         cells = [told(whole, machine.factor), told(windows, machine.factor), "", "", "", "`compare`"]
         lines.append("| " + " | ".join(["", "", "", f"best other: {name}", *cells]) + " |")
