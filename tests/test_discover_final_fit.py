@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import rotflex_jax as rf
 from rotflex_jax.discover import conclusion
@@ -270,25 +271,24 @@ def test_a_law_that_validation_data_speak_against_is_not_taken(arm, coulomb_foun
     assert found.final_fit.laws == () and LEVEL in found.model.mechanism.parameter_names
 
 
-def comparing(recordings: list[rf.Recording], noise: float) -> Any:
-    """What compares fits, with nothing but recordings, the noise of the sensor and the length of a run."""
+def comparing(recordings: list[rf.Recording]) -> Any:
+    """What compares fits, with nothing but recordings and the length of a run."""
     state: Any = SimpleNamespace(
         validation=SimpleNamespace(window_seconds=2.0, folds=True),
-        problem=SimpleNamespace(
-            noise=np.array([noise]), dataset=SimpleNamespace(recordings=tuple(recordings))
-        ),
+        problem=SimpleNamespace(dataset=SimpleNamespace(recordings=tuple(recordings))),
     )
     return MODULE._LastFit(state, cast(Any, None), cast(Any, None))
 
 
-def test_free_runs_are_compared_by_the_errors_of_half_seconds(arm, runs):
-    """The last of them is longer."""
+def test_free_runs_are_compared_by_the_likelihood_of_half_seconds(arm, runs):
+    """By scipy's normal density; the last half second is a longer one."""
     train = runs[0].split(0.7)[0]
     fit = rf.fit(arm + Coulomb("hub", level=0.06), train, first="measured", window_seconds=2.0)
     e = (fit.model.simulate_windows(train, 2.0) - train.y)[:, 0]
+    each = scipy.stats.norm.logpdf(e, scale=fit.noise["theta"]) + 0.5 * np.log(2 * np.pi)
     assert train.N == 2100
-    expected = [-0.5 * np.log(np.mean(part**2) + 1e-6) for part in np.split(e, range(250, 2000, 250))]
-    last = comparing([train], 1e-3)
+    expected = [part.sum() for part in np.split(each, range(250, 2000, 250))]
+    last = comparing([train])
     np.testing.assert_allclose(last.blocks(fit), expected)
     assert not last.runs_prefer(fit, fit)
 
@@ -302,7 +302,7 @@ def test_free_runs_are_compared_by_the_errors_of_half_seconds(arm, runs):
     ],
 )
 def test_a_law_is_preferred_where_free_runs_are_better_everywhere(falls, smaller, preferred, monkeypatch):
-    last, before = comparing([], 1e-3), np.array([1.0, 3.0, 2.0, 5.0])
+    last, before = comparing([]), np.array([1.0, 3.0, 2.0, 5.0])
     a, b = (SimpleNamespace(noise={"theta": x}) for x in (np.exp(-smaller), 1.0))
     monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: before + falls if f is a else before)
     assert last.runs_prefer(a, b) == preferred

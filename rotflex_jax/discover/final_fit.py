@@ -395,17 +395,17 @@ class _LastFit:
         return smaller < -FREE_RUN_BETTER and paired_gain(self.blocks(a), self.blocks(b))[1] > FREE_RUN_Z
 
     def blocks(self, found: Fit) -> Float[np.ndarray, " B"]:
-        """Minus the logarithm of the error of free runs in each half second, mean over channels.
+        """Log-likelihood of free runs in each half second, as the fit maximises it, up to a constant [nat].
 
-        As free runs are compared in a search (`LikelihoodProblem`): by which factor the error falls counts in
-        every block alike.
+        Unlike in a search, where an effect has to help everywhere, large errors count by their square: they
+        are what a user of the model sees. If a few half seconds decide, their scatter is as large.
         """
-        out = []
+        out, noise = [], np.array(list(found.noise.values()))
         for k, r in enumerate(self.recordings):
-            model, edges = found.model_of(k), block_edges(r.N, r.Ts)
+            model = found.model_of(k)
             e = model.simulate_windows(r, self.state.validation.window_seconds) - model.measured(r)
-            squares = np.add.reduceat(e**2, edges) / np.diff([*edges, r.N])[:, None]
-            out.append(-0.5 * np.mean(np.log(squares + self.state.problem.noise**2), axis=1))
+            each = -np.sum(0.5 * (e / noise) ** 2 + np.log(noise), axis=1)
+            out.append(np.add.reduceat(each, block_edges(r.N, r.Ts)))
         return np.concatenate(out)
 
     def accepted(self, candidate: _Candidate) -> FinalFit | Refused:
