@@ -157,6 +157,7 @@ KNOWN = {
     "load_data.md": {"7.3": "version of a file of MATLAB"},
     "method.md": {
         **dict.fromkeys(["1.5", "0.07"], "numbers of the decision, compared in test_docs.py"),
+        "2.5": "selection.FREE_RUN_Z",
         "13.4": "section of a book",
     },
     "read_report.md": {"1.5": "result.NEAR_FLOOR"},
@@ -198,8 +199,13 @@ KNOWN = {
         **dict.fromkeys(
             ["0.70", "0.21", "0.18", "5.72", "2.92", "2.95", "0.48"], "errors before, by final fits"
         ),
-        **dict.fromkeys(["0.045", "0.03", "0.01", "-0.005", "0.015"], "offsets of windows, by hand [V]"),
-        **dict.fromkeys(["0.38", "0.28", "1.93", "0.61", "0.20"], "errors with one offset for both, by hand"),
+        **dict.fromkeys(["1.59", "0.72", "0.83", "0.24", "0.37", "0.32"], "errors before, by final fits"),
+        **dict.fromkeys(
+            ["0.046", "0.028", "0.012", "0.018", "0.01", "-0.004", "-0.008"],
+            "offsets of windows, by hand [V]",
+        ),
+        **dict.fromkeys(["1.3", "1.4", "1.9", "0.13"], "errors with the best offset for A, by hand"),
+        **dict.fromkeys(["0.0252", "0.0063", "0.0185", "0.0094"], "friction of both runs, by hand"),
         "2405.10779": "name of a preprint",
     },
     "seed_paper.md": {
