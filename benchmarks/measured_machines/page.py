@@ -20,7 +20,8 @@ HEAD = """# B9: measured machines
 Written by `python benchmarks/B9_measured.py`. Learnt from some recordings, decided on the ends of these,
 evaluated on others that had no say. Root mean square errors of free runs over the whole test and over windows
 of 2 s, of all channels; calibrated: with the voltage offset that the first 2 s of each test recording ask
-for. Provisional rounds are in brackets, look-alikes after an equals sign.
+for. Provisional rounds are in brackets, look-alikes after an equals sign. "fitted to all, A for B": that fit
+has law A in the place of the law B that was found.
 
 """
 
@@ -112,8 +113,8 @@ def page(results: dict[str, Any]) -> str:
             head = [row["machine"], row["direction"], machine.unit] if stage == "baseline" else ["", "", ""]
             cells = [told(errors[kind], machine.factor) for kind in KINDS]
             cells.append(told(held_out(row, stage)["windows"], machine.factor) if stage not in last else "")
-            name = stage + laws(row) if stage in last else stage
-            lines.append("| " + " | ".join([*head, name, *cells, source]) + " |")
+            label = stage + laws(row) if stage in last else stage
+            lines.append("| " + " | ".join([*head, label, *cells, source]) + " |")
         name, whole, windows = best(row)
         cells = [told(whole, machine.factor), told(windows, machine.factor), "", "", "", "`compare`"]
         lines.append("| " + " | ".join(["", "", "", f"best other: {name}", *cells]) + " |")
