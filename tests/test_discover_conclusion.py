@@ -555,8 +555,8 @@ def test_the_first_effect_with_an_equal_is_asked_about(monkeypatch: pytest.Monke
         train=(short,),
         validation=(long,),
         noise_floor={"theta": 1e-3},
-        final=SimpleNamespace(process_noise={"hub": 0.0}),
-        model="the model",
+        final=SimpleNamespace(process_noise={"hub": 0.0}, model="the model"),
+        model="one of the final fit",
     )
     given, settings = proposed(found, Ts=0.5)  # pyright: ignore[reportGeneralTypeIssues]
     assert given == ("the model", ("coulomb", "hub"), ("stribeck", "hub"))

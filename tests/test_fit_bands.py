@@ -141,8 +141,9 @@ def test_bands_of_a_search_are_those_of_its_probable_sets():
     shares = {frozenset(): 0.7, frozenset({"viscous@hub"}): 0.2, frozenset({"coulomb@hub"}): 0.01}
     found = Probabilities(tuple(SetProbability(s, p) for s, p in shares.items()), {}, 0.09)
     model = rf.Model(axis())
+    stage = SimpleNamespace(model=model)
     search = SimpleNamespace(
-        probabilities=found, train=(train,), baseline=SimpleNamespace(model=model), model=model
+        probabilities=found, train=(train,), baseline=stage, final=stage, model=model
     )
     bands = Discovery.prediction_bands(search, rec, 0.8)
     damped = rf.fit(axis() + rf.effects.Viscous("hub"), train)
