@@ -10,7 +10,7 @@ from rotflex_jax.arena.simulator.plant import Plant
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, simulate, simulate_states
-from rotflex_jax.mechanism.initial_state import initial_states, rough_state
+from rotflex_jax.mechanism.initial_state import initial_states, rough_states
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -54,7 +54,7 @@ def test_recovers_the_true_state_from_noise_free_samples(truth):
     np.testing.assert_allclose(found[:, :2], true[:, :2], atol=2e-5)
     np.testing.assert_allclose(found[:, 2:], true[:, 2:], atol=2e-3)
     # The fit through the simulator is what does it: the straight line is far off.
-    rough = np.array([rough_state(mechanism.structure, s, r["Ts"]) for s in y])
+    rough = rough_states(mechanism.structure, y, r["Ts"])
     assert np.abs(rough - true).max() > 0.3
 
 
@@ -112,7 +112,7 @@ def test_a_measured_speed_is_read_as_a_speed():
     mechanism = dataclasses.replace(paper(), outputs={"omega": ("hub", "speed"), "alpha": "joint"})
     t = np.arange(20) * 0.01
     y = np.column_stack([1.5 + 4 * t, 0.02 - 0.3 * t])
-    state = rough_state(mechanism.structure, y, 0.01)
+    state = rough_states(mechanism.structure, y[None], 0.01)[0]
     assert state[2] == pytest.approx(1.5) and state[1] == pytest.approx(0.02)
 
 

@@ -28,7 +28,7 @@ from rotflex_jax.effects import (
 )
 from rotflex_jax.effects.base import Scale
 from rotflex_jax.errors import InputError
-from rotflex_jax.mechanism.initial_state import rough_state
+from rotflex_jax.mechanism.initial_state import rough_states
 from rotflex_jax.mechanism.roles import calibrations, search_places
 from rotflex_jax.models.model import Model
 from rotflex_jax.notebook import Live
@@ -140,7 +140,7 @@ def test_first_guess_of_the_state_uses_springs_where_sensors_are_silent():
     t = np.arange(25) * 0.004
     for way in (1.0, -1.0):
         y = np.column_stack([12.0 + 3.0 * way * t, np.full(25, 3.0)])
-        state = rough_state(turntable.structure, y, 0.004)
+        state = rough_states(turntable.structure, y[None], 0.004)[0]
         np.testing.assert_allclose(state, [12.0, 12.0, 3.0 * way, 3.0 * way], atol=1e-9)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.initial_state import rough_state
+from rotflex_jax.mechanism.initial_state import rough_states
 from rotflex_jax.mechanism.linear import inverse_mass, linearise
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
@@ -171,7 +171,9 @@ def first_states(model: Model, recordings: Sequence[Recording]) -> Float[np.ndar
     """First positions and speeds (R, 2 n): straight lines through the first samples, where a fit starts."""
     heads = [model.measured(r)[: r.n_init].astype(float) for r in recordings]
     structure = model.mechanism.structure
-    return np.array([rough_state(structure, y, r.Ts) for y, r in zip(heads, recordings, strict=True)])
+    return np.concatenate(
+        [rough_states(structure, y[None], r.Ts) for y, r in zip(heads, recordings, strict=True)]
+    )
 
 
 def sensor_noise(recordings: Sequence[Recording], model: Model) -> Float[np.ndarray, " C"]:
@@ -261,9 +263,8 @@ class Windows:
         for r, (recording, begins) in enumerate(zip(dataset.recordings, starts, strict=True)):
             y = model.measured(recording).astype(float)
             index[r] = np.searchsorted(begins, np.arange(N), side="right") - 1
-            for w, k in enumerate(begins):
-                head = y[k : k + recording.n_init]
-                first[r, w] = rough_state(model.mechanism.structure, head, recording.Ts)
+            heads = y[begins[:, None] + np.arange(recording.n_init)]
+            first[r, : len(begins)] = rough_states(model.mechanism.structure, heads, recording.Ts)
         return cls(index, counts, first)
 
     @property

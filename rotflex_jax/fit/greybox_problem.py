@@ -224,8 +224,8 @@ class GreyBoxProblem:
                 point = self._at_windows(point, stage.windows)
             follows, best = self._follows(stage), None
             renews = stage.process_noise is not None
+            point, K = self._with_shown_states(point, stage), self._gains(point, stage)
             for repetition in range(MOST_REPETITIONS if last and (follows or renews) else 1):
-                point, K = self._with_shown_states(point, stage), self._gains(point, stage)
                 found = self._minimum(
                     point, stage, K, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE
                 )

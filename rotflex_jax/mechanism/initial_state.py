@@ -25,8 +25,10 @@ MAX_EVALUATIONS = 25
 RULES = Rules(enough_share=1e-14, least=1e-6)
 
 
-def rough_state(structure: Mechanism, y: Float[np.ndarray, "N C"], Ts: float) -> Float[np.ndarray, " s"]:
-    """Positions and speeds from a straight line through the samples.
+def rough_states(
+    structure: Mechanism, y: Float[np.ndarray, "W N C"], Ts: float
+) -> Float[np.ndarray, "W s"]:
+    """Positions and speeds at the start of W segments, from straight lines through their samples.
 
     What the sensors do not determine follows from the springs, which are relaxed, and is zero where there is
     none. Speeds come from the slopes of positions before they come from sensors of speed, whose sign a
@@ -34,31 +36,33 @@ def rough_state(structure: Mechanism, y: Float[np.ndarray, "N C"], Ts: float) ->
 
     Args:
         structure: Mechanism.
-        y: First samples of the outputs.
+        y: Samples of the outputs.
         Ts: Sampling period [s].
     """
-    layout = Layout.of(structure)
-    t = np.arange(len(y)) * Ts
-    slope, start = np.polyfit(t, y, 1) if len(y) > 1 else (0 * y[0], y[0])
+    layout, (W, N, C) = Layout.of(structure), y.shape
+    slope, start = np.zeros((C, W)), y[:, 0].T
+    if N > 1:
+        samples = np.moveaxis(y, 1, 0).reshape(N, W * C)
+        slope, start = (line.reshape(W, C).T for line in np.polyfit(np.arange(N) * Ts, samples, 1))
     rows = np.array(layout.output_rows)
     n, is_position = layout.n, np.array([q.is_position for q in structure.quantities])
-    C, V = rows[is_position, :n], rows[~is_position, n:]
+    positions, speeds = rows[is_position, :n], rows[~is_position, n:]
     ports = {e.at for e in structure.effects if e.name == "spring"}
     springs = np.array([structure.port_vectors[p] for p in sorted(ports)]).reshape(-1, n)
-    relaxed = np.zeros(len(springs))
-    q = _lexicographic_fit([(C, start[is_position]), (springs, relaxed)], n)
-    dq = _lexicographic_fit([(C, slope[is_position]), (springs, relaxed), (V, start[~is_position])], n)
-    return np.concatenate([q, dq])
+    relaxed = springs, np.zeros((len(springs), W))
+    q = _lexicographic_fit([(positions, start[is_position]), relaxed], n)
+    dq = _lexicographic_fit([(positions, slope[is_position]), relaxed, (speeds, start[~is_position])], n)
+    return np.concatenate([q, dq]).T
 
 
-def _lexicographic_fit(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> np.ndarray:
-    """The smallest `x` with `A x = b` for the first pair, then for the next as far as it is undetermined."""
-    x, free = np.zeros(n), np.eye(n)
-    for A, b in rows:
+def _lexicographic_fit(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> Float[np.ndarray, "n W"]:
+    """The smallest `X` with `A X = B` for the first pair, then for the next as far as it is undetermined."""
+    X, free = np.zeros((n, rows[0][1].shape[1])), np.eye(n)
+    for A, B in rows:
         left = A @ free
-        x = x + free @ np.linalg.pinv(left) @ (b - A @ x)
+        X = X + free @ np.linalg.pinv(left) @ (B - A @ X)
         free = free @ scipy.linalg.null_space(left)
-    return x
+    return X
 
 
 @persistent_jit(static=2, runs_rarely=True)
@@ -126,7 +130,7 @@ def initial_states(
     if hidden is None:
         rest = rest_state(structure, np.float64)[2 * Layout.of(structure).n :]
         hidden = np.tile(rest, (len(u), 1))
-    guess = np.array([rough_state(structure, segment, Ts) for segment in y])
+    guess = rough_states(structure, y, Ts)
     # Filled up with copies of the last, so that few numbers of segments are compiled for.
     rows = np.minimum(np.arange(max(LEAST_SEGMENTS_PER_CALL, 2 ** (len(u) - 1).bit_length())), len(u) - 1)
     with double_precision():
