@@ -249,6 +249,32 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
     assert level_of(rf.Model.of(coulomb.mechanism)) == level_of(found.final.model)
 
 
+def test_a_law_starts_from_the_fit_without_the_validation_data(arm, coulomb_found, monkeypatch):
+    """With the sizes that it shares with the law that was found, then with usual ones."""
+    fits, fit = [], MODULE.fit
+
+    def noted(model, recordings, **how):
+        fits.append((model, recordings, fit(model, recordings, **how)))
+        return fits[-1][2]
+
+    monkeypatch.setattr(MODULE, "fit", noted)
+    train, validation, _ = map(falling, range(3))
+    rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
+
+    def values(model):
+        return dict(zip(model.mechanism.parameter_names, model.mechanism.values, strict=True))
+
+    alone = [end for _, given, end in fits if len(given) == 1 and LEVEL in values(end.model)]
+    both = [end for _, given, end in fits if len(given) == 2 and LEVEL in values(end.model)]
+    law, usual = [values(m) for m, _, _ in fits if "hub.stribeck.level" in values(m)][:2]
+    shared = {"hub.stribeck.level": LEVEL} | dict.fromkeys(["hub.inertia.inertia"], "hub.inertia.inertia")
+    begun = {name: law[name] for name in shared}
+    assert any(begun == pytest.approx({n: end[of].value for n, of in shared.items()}) for end in alone)
+    assert not any(begun == pytest.approx({n: end[of].value for n, of in shared.items()}) for end in both)
+    assert usual["hub.inertia.inertia"] == values(rf.Model(arm))["hub.inertia.inertia"]
+    assert usual["hub.stribeck.level"] != begun["hub.stribeck.level"]
+
+
 def test_a_richer_law_needs_a_use(arm, coulomb_found):
     """Coulomb friction alone, of another level in each run."""
     train, validation = run(0.05, 0.0, 0), run(0.075, 0.0, 1)

@@ -142,9 +142,7 @@ def test_bands_of_a_search_are_those_of_its_probable_sets():
     found = Probabilities(tuple(SetProbability(s, p) for s, p in shares.items()), {}, 0.09)
     model = rf.Model(axis())
     stage = SimpleNamespace(model=model)
-    search = SimpleNamespace(
-        probabilities=found, train=(train,), baseline=stage, final=stage, model=model
-    )
+    search = SimpleNamespace(probabilities=found, train=(train,), baseline=stage, final=stage, model=model)
     bands = Discovery.prediction_bands(search, rec, 0.8)
     damped = rf.fit(axis() + rf.effects.Viscous("hub"), train)
     expected = rf.prediction_bands([(fitted(), 0.7), (damped, 0.2)], rec, 0.8)

@@ -102,9 +102,7 @@ class Discovered:
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Discover on parts of the training recordings, then fit to all of each."""
         result = discover(model, *split_for_validation(train, self.share), progress=say)
-        used = dict(result.final_fit.laws) if result.final_fit else {}
-        added = dict.fromkeys(used.get((r.effect, r.port), (r.effect, r.port)) for r in result.rounds)
-        found = ", ".join(effect_label(*pair) for pair in added)
+        found = ", ".join(effect_label(*pair) for pair in result.added)
         note = f"added {found}" if found else f"added nothing ({result.verdict.replace('_', ' ')})"
         return fit_mechanism(result.model, train, say, note=note)
 

@@ -38,14 +38,13 @@ from rotflex_jax.discover.hypothesis import (
     usual_start,
     with_all_calibrations,
 )
-from rotflex_jax.discover.in_place import other_laws
+from rotflex_jax.discover.in_place import laws_in_question, other_laws
 from rotflex_jax.discover.likelihood import block_edges
 from rotflex_jax.discover.result import FinalFit, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, paired_gain
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
-from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.result import Fit
@@ -67,9 +66,7 @@ class _Structure:
     """What is fitted.
 
     Attributes:
-        starts: The final model, with the calibrations of its recordings: as the search has fitted it, with
-            the usual shapes of what was found, and as a user would start it, with the values given and usual
-            ones of what was found.
+        starts: Models from which fits start, with the calibrations of the recordings.
         local: Parameters that each recording has for itself.
         own: Calibrations that are not carried over to other recordings.
         on: What is on in the model that a user gets.
@@ -94,10 +91,10 @@ class _Structure:
         h: Hypothesis,
         on: Sequence[EffectLocation],
         window_seconds: float,
+        *others: Float[np.ndarray, " P"],
     ) -> "_Structure":
-        """That of a hypothesis; arguments as the attributes."""
-        begun = h.mean_values(s), _with_usual_shapes(s, h), _as_given(s, h)
-        values = {tuple(v.tolist()): v for v in begun}
+        """That of a hypothesis; arguments as the attributes, then values of parameters to start from too."""
+        values = {tuple(v.tolist()): v for v in (h.mean_values(s), *others)}
         starts = tuple(Model(s.clean(v, h.locations), solver) for v in values.values())
         free = starts[0].mechanism.free_names
         local = [s.mechanism.parameter_names[i] for i in h.local]
@@ -105,17 +102,20 @@ class _Structure:
         local = tuple(n for n in local if n in free)
         return cls(starts, local, own, tuple(on), h, s, window_seconds)
 
-    def with_law(self, law: EffectLocation) -> "_Structure":
+    def with_law(self, law: EffectLocation, found: Fit) -> "_Structure":
         """The structure with a law in the place of all others of the same thing at its port.
 
-        It starts from what it has in common with them, and from the values that a user would start with.
+        It starts from a fit with these, whose sizes it takes over, and from what a user would start with.
+
+        Args:
+            law: It, a candidate at the port.
+            found: The structure as it is, fitted without the validation data.
         """
-        s, h = self.supermodel, self.hypothesis
+        s = self.supermodel
         replaced = [p for p in self.on if p in other_laws(s, law)]
-        h = replacing(s, h, replaced, usual_start(s, law), 1.0)
+        h = replacing(s, self.as_hypothesis(found), replaced, usual_start(s, law), 1.0)
         on = list(dict.fromkeys(law if p in replaced else p for p in self.on))
-        structure = _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds)
-        return dataclasses.replace(structure, starts=(structure.starts[0], structure.starts[-1]))
+        return _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds, _as_given(s, h))
 
     def fitted(self, recordings: Sequence[Recording]) -> Fit:
         """The structure fitted to free runs of recordings, the likelier of the ends from its starts.
@@ -336,7 +336,10 @@ class _LastFit:
         state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
         variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
         structures = [
-            _Structure.of(s, state.model.solver, v, state.order, seconds) for v in variants.values()
+            _Structure.of(
+                s, state.model.solver, v, state.order, seconds, _with_usual_shapes(s, v), _as_given(s, v)
+            )
+            for v in variants.values()
         ]
         best = min(map(self.tried, structures), key=lambda each: log_error_ratio(each.errors, self.searched))
         if (ratio := log_error_ratio(best.errors, self.searched)) > MOST_WORSE:
@@ -359,34 +362,30 @@ class _LastFit:
         return _Tried(structure, fits, _on_validation(structure, fits, self.evaluation))
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
-        """The same with laws that free runs of all recordings prefer in the places of those that were found.
+        """The same with laws that free runs of all recordings prefer in the places of those found."""
+        for location in self.state.order:
+            if location in candidate.tried.structure.on:  # unless a law at its port has taken its place
+                candidate = self.with_best_law(candidate, location)
+        return candidate
 
-        Laws of the same thing that the search cannot exclude take part, and those that contain the one found.
-        """
-        state, s = self.state, self.state.problem.supermodel
-        for location in [p for p in state.order if p in state.scores]:
-            structure, able = candidate.tried.structure, []
-            if location not in structure.on:  # replaced with another one
-                continue
-            contains = CATALOG[location.effect].contains
-            laws = [p for p in other_laws(s, location) if p not in structure.on and p.effect not in contains]
-            possible = state.rivals.get(location, [])
-            laws = [p for p in laws if p in possible or location.effect in CATALOG[p.effect].contains]
-            for law in laws:
-                state.say(f"  with {law} in the place of {location}")
-                other = structure.with_law(law)
-                found = other.fitted(self.recordings)
-                physical = state.is_plausible(other.as_hypothesis(found), law)
-                if physical and self.runs_prefer(found, candidate.found):
-                    able.append((found, other, law))
-            for found, other, law in sorted(able, key=lambda each: each[0].cost):
-                tried = self.tried(other)
-                # As little as validation data may speak against the fit, they may against the law.
-                before = (self.searched, candidate.tried.errors)
-                if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in before):
-                    replaced = [(p, law) for p in structure.on if p not in other.on]
-                    candidate = _Candidate(tried, found, (*candidate.laws, *replaced))
-                    break
+    def with_best_law(self, candidate: _Candidate, location: EffectLocation) -> _Candidate:
+        """The same with the best of such laws in the place of one effect; as it is without any."""
+        state, structure, able = self.state, candidate.tried.structure, []
+        for law in laws_in_question(state, location, structure.on):
+            state.say(f"  with {law} in the place of {location}")
+            other = structure.with_law(law, candidate.tried.fits[0])
+            found = other.fitted(self.recordings)
+            physical = state.is_plausible(other.as_hypothesis(found), law)
+            if physical and self.runs_prefer(found, candidate.found):
+                able.append((found, other))
+        for found, other in sorted(able, key=lambda each: each[0].cost):
+            tried = self.tried(other)
+            # As little as validation data may speak against the fit, they may against the law.
+            known = (self.searched, candidate.tried.errors)
+            if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in known):
+                (law,) = (p for p in other.on if p not in structure.on)
+                replaced = [(p, law) for p in structure.on if p not in other.on]
+                return _Candidate(tried, found, (*candidate.laws, *replaced))
         return candidate
 
     def runs_prefer(self, a: Fit, b: Fit) -> bool:

@@ -37,6 +37,26 @@ def other_laws(s: SuperModel, location: EffectLocation) -> list[EffectLocation]:
     return [p for p in at_port if law and law_of(p.effect) == law]
 
 
+def laws_in_question(
+    state: SearchState, location: EffectLocation, on: Sequence[EffectLocation]
+) -> list[EffectLocation]:
+    """Laws that may describe better what an effect was found for, from measured first states.
+
+    They are those of the same thing that the search cannot exclude in its place, and those that contain it.
+
+    Args:
+        state: A search that is done, with the rivals that remain.
+        location: An effect of a model. One that was there from the start, or is none of a law, has none.
+        on: All effects of the model.
+    """
+    if location not in state.scores:
+        return []
+    contains = CATALOG[location.effect].contains
+    laws = [p for p in other_laws(state.problem.supermodel, location) if p not in on]
+    remaining = [p for p in state.rivals.get(location, []) if p.effect not in contains]
+    return [p for p in laws if p in remaining or location.effect in CATALOG[p.effect].contains]
+
+
 def take_better_laws(state: SearchState) -> tuple[str, ...]:
     """Put laws that data prefer (`better_in_place`) in the places of effects of a poor model.
 

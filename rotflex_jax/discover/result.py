@@ -513,11 +513,17 @@ class SearchResult:
         return dataclasses.replace(self.model, mechanism=m)
 
     @property
+    def added(self) -> tuple[tuple[str, str], ...]:
+        """Effects that `model` has and the model as it was given lacks, as (effect, port)."""
+        before, after = (
+            [(e.name, e.at) for e in m.mechanism.effects] for m in (self.baseline.model, self.model)
+        )
+        return tuple(p for p in after if p not in before)
+
+    @property
     def offsets(self) -> tuple[tuple[str, str], ...]:
-        """Offsets and biases in `model` that the search has added, as (effect, port)."""
-        given, m = self.baseline.model.mechanism, self.model.mechanism
-        before, after = ({(e.name, e.at) for e in each.effects} for each in (given, m))
-        return tuple(p for p in calibrations(given) if p in after - before)
+        """Offsets and biases among `added`."""
+        return tuple(p for p in calibrations(self.baseline.model.mechanism) if p in self.added)
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

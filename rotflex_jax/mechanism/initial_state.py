@@ -25,9 +25,7 @@ MAX_EVALUATIONS = 25
 RULES = Rules(enough_share=1e-14, least=1e-6)
 
 
-def rough_states(
-    structure: Mechanism, y: Float[np.ndarray, "W N C"], Ts: float
-) -> Float[np.ndarray, "W s"]:
+def rough_states(structure: Mechanism, y: Float[np.ndarray, "W N C"], Ts: float) -> Float[np.ndarray, "W s"]:
     """Positions and speeds at the start of W segments, from straight lines through their samples.
 
     What the sensors do not determine follows from the springs, which are relaxed, and is zero where there is
