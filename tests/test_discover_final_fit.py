@@ -184,6 +184,7 @@ def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, m
         return ends[-1]
 
     monkeypatch.setattr(MODULE, "fit", noted)
+    monkeypatch.setattr(MODULE, "on_threads", lambda run, jobs: list(map(run, jobs)))  # in their order
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
     train, validation, _ = runs
     found = rf.discover(arm, train, validation, candidates=[(rf.effects.Stribeck, "hub")], rounds=1)
@@ -258,6 +259,7 @@ def test_a_law_starts_from_the_fit_without_the_validation_data(arm, coulomb_foun
         return fits[-1][2]
 
     monkeypatch.setattr(MODULE, "fit", noted)
+    monkeypatch.setattr(MODULE, "on_threads", lambda run, jobs: list(map(run, jobs)))  # in their order
     train, validation, _ = map(falling, range(3))
     rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
 
@@ -297,7 +299,7 @@ def test_a_law_that_validation_data_speak_against_is_not_taken(arm, coulomb_foun
     assert found.final_fit.laws == () and LEVEL in found.model.mechanism.parameter_names
 
 
-def comparing(recordings: list[rf.Recording]) -> Any:
+def comparing(recordings: list[Any]) -> Any:
     """What compares fits, with nothing but recordings and the length of a run."""
     state: Any = SimpleNamespace(
         validation=SimpleNamespace(window_seconds=2.0, folds=True),
@@ -430,16 +432,16 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
 
 def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
     train, validation, _ = runs
-    fitted = MODULE._Structure.fitted
+    fit = MODULE.fit
 
-    def lost(structure, recordings):
-        found = fitted(structure, recordings)
+    def lost(model, recordings, **how):
+        found = fit(model, recordings, **how)
         if len(recordings) < 2:
             return found
         m = found.model.mechanism.with_values({"hub.inertia.inertia": 1.0})
         return dataclasses.replace(found, model=rf.Model(m, found.model.solver))
 
-    monkeypatch.setattr(MODULE._Structure, "fitted", lost)
+    monkeypatch.setattr(MODULE, "fit", lost)
     found = rf.discover(arm, train, validation, candidates=[], rounds=0)
     assert found.verdict == "unexplained" and found.final_fit is None
     (note,) = refusals(found)
@@ -447,10 +449,10 @@ def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
 
 
 def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
-    def refuse(structure, recordings):
+    def refuse(model, recordings, **how):
         raise rf.InputError("One channel does not move.")
 
-    monkeypatch.setattr(MODULE._Structure, "fitted", refuse)
+    monkeypatch.setattr(MODULE, "fit", refuse)
     train, validation, _ = runs
     found = rf.discover(arm, train, validation, candidates=[], rounds=0)
     assert found.verdict == "unexplained" and found.final_fit is None
@@ -458,13 +460,14 @@ def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
     assert note.endswith("recordings together: One channel does not move.")
 
 
-def test_of_many_runs_each_third_is_left_out():
-    class Structure:
-        def fitted(self, recordings):
-            return tuple(recordings)
-
-    fits = MODULE._without_each(Structure(), list(range(5)))
-    assert fits == [(1, 2, 4), (0, 2, 3), (0, 1, 3, 4), (1, 2, 4), (0, 2, 3)]
+def test_of_many_runs_each_third_is_left_out(monkeypatch):
+    """Each is validated by a fit without it."""
+    monkeypatch.setattr(MODULE, "_fitted", lambda asked: [tuple(part) for _, part in asked])
+    monkeypatch.setattr(MODULE, "_on_validation", lambda structure, fits, evaluation: structure)
+    first, second = comparing(list(range(5))).tried(["first", "second"])
+    for tried, name in ((first, "first"), (second, "second")):
+        assert tried.fits == [(1, 2, 4), (0, 2, 3), (0, 1, 3, 4), (1, 2, 4), (0, 2, 3)]
+        assert tried.errors == name
 
 
 def test_the_ratio_of_errors_weighs_channels_alike():

@@ -25,6 +25,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
+from rotflex_jax.discover.batched_predictor import on_threads
 from rotflex_jax.discover.evaluation import (
     Evaluation,
     errors_as_trained,
@@ -116,16 +117,6 @@ class _Structure:
         h = replacing(s, self.as_hypothesis(found), replaced, usual_start(s, law), 1.0)
         on = list(dict.fromkeys(law if p in replaced else p for p in self.on))
         return _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds, _as_given(s, h))
-
-    def fitted(self, recordings: Sequence[Recording]) -> Fit:
-        """The structure fitted to free runs of recordings, the likelier of the ends from its starts.
-
-        Parameters of predictions may lead to another local minimum of free runs than usual ones: to stiff,
-        damped bristles of a friction instead of soft ones. Those of the search's free runs may, too.
-        """
-        how = {"first": "measured", "window_seconds": self.window_seconds}
-        ends = [fit(model, list(recordings), local=self.local, **how) for model in self.starts]
-        return min(ends, key=lambda end: float(np.nan_to_num(end.cost, nan=np.inf)))
 
     def as_hypothesis(self, found: Fit) -> Hypothesis:
         """A fit in the terms of the search, what recordings have for themselves at its mean."""
@@ -341,25 +332,30 @@ class _LastFit:
             )
             for v in variants.values()
         ]
-        best = min(map(self.tried, structures), key=lambda each: log_error_ratio(each.errors, self.searched))
+        best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
         if (ratio := log_error_ratio(best.errors, self.searched)) > MOST_WORSE:
             others = "the other recordings" if state.validation.folds else "the training recordings"
             return _refused(state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
-        as_found = _Candidate(best, best.structure.fitted(self.recordings))
+        (found,) = _fitted([(best.structure, self.recordings)])
+        as_found = _Candidate(best, found)
         with_laws = self.with_better_laws(as_found)
         made = self.accepted(with_laws)
         if isinstance(made, Refused) and with_laws.laws:
             return self.accepted(as_found)
         return made
 
-    def tried(self, structure: _Structure) -> _Tried:
-        """A structure fitted to the training recordings, and validated."""
+    def tried(self, structures: Sequence[_Structure]) -> list[_Tried]:
+        """Structures fitted to the training recordings, and validated."""
         train = self.state.problem.dataset.recordings
-        if self.state.validation.folds:
-            fits = _without_each(structure, train)
-        else:
-            fits = [structure.fitted(joined(train))]
-        return _Tried(structure, fits, _on_validation(structure, fits, self.evaluation))
+        parts = _without_each(train) if self.state.validation.folds else [joined(train)]
+        fits = _fitted([(structure, part) for structure in structures for part in parts])
+        tried = []
+        for k, structure in enumerate(structures):
+            own = fits[k * len(parts) : (k + 1) * len(parts)]
+            if self.state.validation.folds:  # for each recording the fit without it
+                own = [own[i % len(parts)] for i in range(len(train))]
+            tried.append(_Tried(structure, own, _on_validation(structure, own, self.evaluation)))
+        return tried
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
         """The same with laws that free runs of all recordings prefer in the places of those found."""
@@ -370,16 +366,20 @@ class _LastFit:
 
     def with_best_law(self, candidate: _Candidate, location: EffectLocation) -> _Candidate:
         """The same with the best of such laws in the place of one effect; as it is without any."""
-        state, structure, able = self.state, candidate.tried.structure, []
-        for law in laws_in_question(state, location, structure.on):
-            state.say(f"  with {law} in the place of {location}")
-            other = structure.with_law(law, candidate.tried.fits[0])
-            found = other.fitted(self.recordings)
-            physical = state.is_plausible(other.as_hypothesis(found), law)
-            if physical and self.runs_prefer(found, candidate.found):
-                able.append((found, other))
+        state, structure = self.state, candidate.tried.structure
+        laws = laws_in_question(state, location, structure.on)
+        if laws:
+            state.say(f"  in the place of {location}: {', '.join(map(str, laws))}")
+        others = [structure.with_law(law, candidate.tried.fits[0]) for law in laws]
+        fits = _fitted([(other, self.recordings) for other in others])
+        able = [
+            (found, other)
+            for law, other, found in zip(laws, others, fits, strict=True)
+            if state.is_plausible(other.as_hypothesis(found), law)
+            and self.runs_prefer(found, candidate.found)
+        ]
         for found, other in sorted(able, key=lambda each: each[0].cost):
-            tried = self.tried(other)
+            (tried,) = self.tried([other])
             # As little as validation data may speak against the fit, they may against the law.
             known = (self.searched, candidate.tried.errors)
             if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in known):
@@ -479,11 +479,29 @@ def log_error_ratio(a: RunErrors, b: RunErrors) -> float:
     return float(np.mean(np.log(np.maximum(after, least) / np.maximum(before, least))))
 
 
-def _without_each(structure: _Structure, train: Sequence[Recording]) -> list[Fit]:
-    """For each training recording a fit to others; of many, every third one is left out at a time."""
+def _fitted(asked: Sequence[tuple[_Structure, Sequence[Recording]]]) -> list[Fit]:
+    """Structures fitted to free runs of recordings, each the likelier of the ends from its starts.
+
+    Parameters of predictions may lead to another local minimum of free runs than usual ones: to stiff,
+    damped bristles of a friction instead of soft ones. Those of the search's free runs may, too.
+    """
+
+    def end(start: tuple[int, Model]) -> Fit:
+        structure, recordings = asked[start[0]]
+        how = {"first": "measured", "window_seconds": structure.window_seconds}
+        return fit(start[1], list(recordings), local=structure.local, **how)
+
+    starts = [(k, model) for k, (structure, _) in enumerate(asked) for model in structure.starts]
+    ends: list[list[Fit]] = [[] for _ in asked]
+    for (k, _), found in zip(starts, on_threads(end, starts), strict=True):
+        ends[k].append(found)
+    return [min(each, key=lambda found: float(np.nan_to_num(found.cost, nan=np.inf))) for each in ends]
+
+
+def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
+    """Training recordings without each in turn; of many, without every third one at a time."""
     folds, each = min(len(train), MOST_FOLDS), range(len(train))
-    fits = [structure.fitted([train[k] for k in each if k % folds != fold]) for fold in range(folds)]
-    return [fits[k % folds] for k in each]
+    return [[train[k] for k in each if k % folds != fold] for fold in range(folds)]
 
 
 def _on_validation(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> RunErrors:
