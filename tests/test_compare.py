@@ -246,12 +246,9 @@ def test_discovered_chooses_within_the_training_data(monkeypatch: pytest.MonkeyP
         model: Model, train: list[Recording], test: list[Recording], progress: Callable
     ) -> SimpleNamespace:
         asked.append((train, test))
-        # The model to use has another law than the one that was found: the note names what it has.
-        found, laws = SimpleNamespace(effect="dahl", port="hub"), ((("dahl", "hub"), ("coulomb", "hub")),)
         return SimpleNamespace(
-            rounds=[found],
             verdict="unexplained",
-            final_fit=SimpleNamespace(laws=laws),
+            added=(("coulomb", "hub"),),
             model=model + rf.effects.Coulomb(at="hub", level=0.01),
         )
 
