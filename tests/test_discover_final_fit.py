@@ -21,7 +21,6 @@ from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_se
 from rotflex_jax.effects import Coulomb
 from rotflex_jax.experiment import until_decided
 from rotflex_jax.parameters import Estimate
-from rotflex_jax.recording.recording import digest_of_recordings
 
 MODULE = sys.modules[log_error_ratio.__module__]
 INERTIA, DRIVE, DAMPING = 0.0075, 48.4 * 0.0107 / 3.29, (48.4 * 0.0107) ** 2 / 3.29
@@ -97,14 +96,13 @@ def test_its_errors_are_those_of_its_model(found, runs):
     whole = rf.metrics.rmse(test, last.model.simulate(test))["theta"]
     assert last.test.whole["theta"] == pytest.approx(whole, rel=1e-6)
     # It is the fit that a user makes, tried first on data that have not seen what they validate.
-    structure, local = found.final.model.mechanism, []
-    if last.fit.local:
-        structure, local = structure + rf.effects.VoltageOffset("input"), [OFFSET]
-    how = {"first": "measured", "window_seconds": 2.0, "local": local}
-    assert level_of(rf.fit(structure, [train, validation], **how).model) == pytest.approx(
-        level_of(found.model), rel=0.02
-    )
-    alone = rf.fit(structure, train, **how).model
+    structure, local = found.final.model.mechanism, list(last.fit.local)
+    if OFFSET in local:
+        structure = structure + rf.effects.VoltageOffset("input")
+    how = {"first": "measured", "window_seconds": 2.0}
+    both = rf.fit(structure, [train, validation], local=local, **how).model
+    assert level_of(both) == pytest.approx(level_of(found.model), rel=0.02)
+    alone = rf.fit(structure, train, local=[n for n in local if n == OFFSET], **how).model
     assert last.trained.windows["theta"] == pytest.approx(short_runs_miss(alone, validation), rel=0.2)
 
 
@@ -174,32 +172,55 @@ def test_what_runs_have_in_common(values, common):
         assert found.ci95 == pytest.approx((common - half, common + half))
 
 
-def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, monkeypatch):
-    """Of what was found first the sizes are kept, then nothing; the user's model is then as given."""
-    begun, ends, fit = [], [], MODULE.fit
+def values_of(model: rf.Model) -> dict[str, float]:
+    return dict(zip(model.mechanism.parameter_names, model.mechanism.values.tolist(), strict=True))
 
-    def noted(model, *given, **how):
-        begun.append(dict(zip(model.mechanism.parameter_names, model.mechanism.values, strict=True)))
-        ends.append(fit(model, *given, **how))
-        return ends[-1]
+
+@pytest.fixture
+def fits(monkeypatch):
+    """What is fitted: model, recordings, local parameters, end of each; structures with the best ends."""
+    each, best, fit, fitted = [], [], MODULE.fit, MODULE._fitted
+
+    def noted(model, recordings, **how):
+        each.append((model, recordings, how["local"], fit(model, recordings, **how)))
+        return each[-1][-1]
+
+    def all_noted(asked):
+        ends = fitted(asked)
+        best.extend((*a, end) for a, end in zip(asked, ends, strict=True))
+        return ends
 
     monkeypatch.setattr(MODULE, "fit", noted)
-    monkeypatch.setattr(MODULE, "on_threads", lambda run, jobs: list(map(run, jobs)))  # in their order
+    monkeypatch.setattr(MODULE, "_fitted", all_noted)
+    return SimpleNamespace(each=each, best=best)
+
+
+def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, fits, monkeypatch):
+    """Of what was found first the sizes are kept, then nothing; the user's model is then as given."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
     train, validation, _ = runs
-    found = rf.discover(arm, train, validation, candidates=[(rf.effects.Stribeck, "hub")], rounds=1)
+    rf.discover(arm, train, validation, candidates=[(rf.effects.Stribeck, "hub")], rounds=1)
     sizes, inertia = ["hub.stribeck.level", "hub.stribeck.excess"], "hub.inertia.inertia"
-    given = dict(zip(arm.parameter_names, arm.values, strict=True))
-    for searched, usual, fresh in zip(begun[::3], begun[1::3], begun[2::3], strict=True):
+    alone = [end for structure, given, end in fits.best if len(given) == 1]
+    for structure, given, end in fits.best[: len(alone) + 1]:
+        searched, usual, fresh, *more = map(values_of, structure.starts)
         assert [usual[n] for n in (*sizes, inertia)] == [searched[n] for n in (*sizes, inertia)]
         assert usual["hub.stribeck.speed"] != searched["hub.stribeck.speed"]
         assert fresh["hub.stribeck.speed"] == usual["hub.stribeck.speed"]
         assert all(fresh[n] != searched[n] for n in sizes)
-        assert {n: fresh[n] for n in given} == pytest.approx(given)
-    assert found.final_fit.fit.cost == min(end.cost for end in ends[-3:])
+        assert {n: fresh[n] for n in values_of(rf.Model(arm))} == pytest.approx(values_of(rf.Model(arm)))
+        ends = [
+            e
+            for m, r, local, e in fits.each
+            if (len(r), local) == (len(given), structure.local) and any(m is s for s in structure.starts)
+        ]
+        assert len(ends) == len(structure.starts) and end.cost == min(e.cost for e in ends)
+        # The fit to all starts from that to training recordings besides.
+        assert more in ([],) if len(given) == 1 else more[0] in [values_of(e.model) for e in alone]
 
 
 LAWS = [(Coulomb, "hub"), (rf.effects.Stribeck, "hub")]
+LAWS_ON = tuple((law.name, port) for law, port in LAWS)
 
 
 @pytest.fixture
@@ -222,6 +243,7 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
     last = found.final_fit
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
     assert last.laws == ((("coulomb", "hub"), ("stribeck", "hub")),)
+    assert ("stribeck", "hub") in found.added and ("coulomb", "hub") not in found.added
     values = dict(zip(last.model.mechanism.parameter_names, last.model.mechanism.values, strict=True))
     assert LEVEL not in values and values["hub.stribeck.excess"] == pytest.approx(0.1, rel=0.2)
     assert last.test.windows["theta"] == pytest.approx(short_runs_miss(last.model, test), rel=1e-6)
@@ -250,31 +272,18 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
     assert level_of(rf.Model.of(coulomb.mechanism)) == level_of(found.final.model)
 
 
-def test_a_law_starts_from_the_fit_without_the_validation_data(arm, coulomb_found, monkeypatch):
+def test_a_law_starts_from_the_fit_without_the_validation_data(arm, coulomb_found, fits):
     """With the sizes that it shares with the law that was found, then with usual ones."""
-    fits, fit = [], MODULE.fit
-
-    def noted(model, recordings, **how):
-        fits.append((model, recordings, fit(model, recordings, **how)))
-        return fits[-1][2]
-
-    monkeypatch.setattr(MODULE, "fit", noted)
-    monkeypatch.setattr(MODULE, "on_threads", lambda run, jobs: list(map(run, jobs)))  # in their order
     train, validation, _ = map(falling, range(3))
     rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
-
-    def values(model):
-        return dict(zip(model.mechanism.parameter_names, model.mechanism.values, strict=True))
-
-    alone = [end for _, given, end in fits if len(given) == 1 and LEVEL in values(end.model)]
-    both = [end for _, given, end in fits if len(given) == 2 and LEVEL in values(end.model)]
-    law, usual = [values(m) for m, _, _ in fits if "hub.stribeck.level" in values(m)][:2]
-    shared = {"hub.stribeck.level": LEVEL} | dict.fromkeys(["hub.inertia.inertia"], "hub.inertia.inertia")
-    begun = {name: law[name] for name in shared}
-    assert any(begun == pytest.approx({n: end[of].value for n, of in shared.items()}) for end in alone)
-    assert not any(begun == pytest.approx({n: end[of].value for n, of in shared.items()}) for end in both)
-    assert usual["hub.inertia.inertia"] == values(rf.Model(arm))["hub.inertia.inertia"]
-    assert usual["hub.stribeck.level"] != begun["hub.stribeck.level"]
+    coulomb = [(len(given), end) for structure, given, end in fits.best if structure.on == LAWS_ON[:1]]
+    starts = next(structure.starts for structure, *_ in fits.best if structure.on == LAWS_ON[1:])
+    law, usual = map(values_of, starts)
+    begun = {LEVEL: law["hub.stribeck.level"], "hub.inertia.inertia": law["hub.inertia.inertia"]}
+    same = [count for count, end in coulomb if begun == pytest.approx({n: end[n].value for n in begun})]
+    assert same == [1] and {count for count, _ in coulomb} == {1, 2}
+    assert usual["hub.inertia.inertia"] == values_of(rf.Model(arm))["hub.inertia.inertia"]
+    assert usual["hub.stribeck.level"] != law["hub.stribeck.level"]
 
 
 def test_a_richer_law_needs_a_use(arm, coulomb_found):
@@ -288,8 +297,8 @@ def test_a_law_that_validation_data_speak_against_is_not_taken(arm, coulomb_foun
     """Fitted to training data alone, its runs of the validation data diverge."""
     errors_of = MODULE._on_validation
 
-    def diverging(structure, fits, evaluation):
-        errors = errors_of(structure, fits, evaluation)
+    def diverging(structure, trained, evaluation):
+        errors = errors_of(structure, trained, evaluation)
         lost = dict.fromkeys(errors.windows, np.inf)
         return RunErrors(lost, lost) if ("stribeck", "hub") in structure.on else errors
 
@@ -317,7 +326,8 @@ def test_free_runs_are_compared_by_the_likelihood_of_half_seconds(arm, runs):
     assert train.N == 2100
     expected = [part.sum() for part in np.split(each, range(250, 2000, 250))]
     last = comparing([train])
-    np.testing.assert_allclose(last.blocks(fit), expected)
+    (blocks,) = last.blocks(fit)
+    np.testing.assert_allclose(blocks, expected)
     assert not last.runs_prefer(fit, fit)
 
 
@@ -332,8 +342,49 @@ def test_free_runs_are_compared_by_the_likelihood_of_half_seconds(arm, runs):
 def test_a_law_is_preferred_where_free_runs_are_better_everywhere(falls, smaller, preferred, monkeypatch):
     last, before = comparing([]), np.array([1.0, 3.0, 2.0, 5.0])
     a, b = (SimpleNamespace(noise={"theta": x}) for x in (np.exp(-smaller), 1.0))
-    monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: before + falls if f is a else before)
+    two = [before[:2], before[2:]]
+    better = [x + f for x, f in zip(two, np.split(np.array(falls), 2), strict=True)]
+    monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: better if f is a else two)
     assert last.runs_prefer(a, b) == preferred
+
+
+@pytest.mark.parametrize(("second", "preferred"), [([4.0, 5.0], True), ([0.5, -0.4], False)])
+def test_what_every_run_has_to_prefer_helps_each(second, preferred, monkeypatch):
+    last, before = comparing([]), [np.arange(6.0)] * 2
+    a, b = (SimpleNamespace(noise={"theta": x}) for x in (0.5, 1.0))
+    after = [before[0] + np.tile([5.0, 6.0], 3), before[1] + np.tile(second, 3)]
+    monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: after if f is a else before)
+    assert last.runs_prefer(a, b)
+    assert last.runs_prefer(a, b, every=True) == preferred
+
+
+def test_friction_may_belong_to_each_run(arm):
+    """Four times as large in the run of the validation and of the test data; noise hides neither."""
+    train, (validation, rest) = run(0.03, 0.0, 0), run(0.12, 0.0, 1, N=6000).split(0.5)
+    other = run(0.07, 0.0, 2)
+    model = arm + Coulomb("hub", level=0.06)
+    found = rf.discover(model, train, validation, test=[rest, other], candidates=[], rounds=0)
+    last = found.final_fit
+    assert last.friction == (LEVEL,)
+    assert [e.value for e in last.fit.local[LEVEL]] == pytest.approx([0.03, 0.12], rel=0.05)
+    # What follows in a run has its friction, a run of which nothing is known their mean.
+    assert level_of(found.model_of(rest)) == pytest.approx(0.12, rel=0.05)
+    assert level_of(found.model_of(other)) == level_of(found.model) == pytest.approx(0.075, rel=0.05)
+    misses = [short_runs_miss(found.model_of(r), r) ** 2 for r in (rest, other)]
+    assert last.test.windows["theta"] == pytest.approx(np.sqrt(np.mean(misses)), rel=1e-3)
+    whole = [found.model_of(r).simulate(r)[r.n_init :] - r.y[r.n_init :] for r in (rest, other)]
+    assert last.test.whole["theta"] == pytest.approx(
+        float(np.sqrt(np.mean(np.concatenate(whole) ** 2))), rel=1e-3
+    )
+    assert last.to_dict()["friction_of_runs"] == {LEVEL: [e.value for e in last.fit.local[LEVEL]]}
+    assert re.search(r"hub\.coulomb\.level 0\.0[23]\d*, 0\.1[12]\d* N m", final_fit_sentence(found))
+
+
+def test_friction_that_runs_share_stays_the_machine_s(arm):
+    train, validation = run(0.06, 0.03, 0), run(0.06, -0.03, 1)
+    found = rf.discover(arm + Coulomb("hub", level=0.02), train, validation, candidates=[], rounds=0)
+    assert found.final_fit.friction == ()
+    assert level_of(found.model) == pytest.approx(0.06, rel=0.05)
 
 
 def test_data_may_speak_against_it(runs, arm, monkeypatch):
@@ -418,13 +469,18 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
         arm, train, validation, candidates=[], rounds=0, calibrate_seconds=0.0
     )
     theirs = search().final.held_out_rmse_windows["theta"]
-    alone, errors = digest_of_recordings([train]), MODULE._on_validation
+    tried, limit = MODULE._LastFit.tried, float(np.exp(share * MOST_WORSE) * theirs)
 
-    def on_validation(structure, fits, evaluation):
-        worse = np.exp(share * MOST_WORSE) if fits[0].data == alone else 0.9
-        return errors(structure, fits, evaluation)._replace(windows={"theta": float(worse * theirs)})
+    def on_validation(structure, trained, evaluation):
+        return RunErrors({"theta": 0.0}, {"theta": 0.9 * theirs})
+
+    def alone(last, structures):
+        return [
+            t._replace(errors=RunErrors({"theta": 0.0}, {"theta": limit})) for t in tried(last, structures)
+        ]
 
     monkeypatch.setattr(MODULE, "_on_validation", on_validation)
+    monkeypatch.setattr(MODULE._LastFit, "tried", alone)
     found = search()
     assert (found.final_fit is None) == (said is not None)
     assert [note.endswith(said or "") for note in refusals(found)] == [True] * (said is not None)
@@ -462,12 +518,13 @@ def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
 
 def test_of_many_runs_each_third_is_left_out(monkeypatch):
     """Each is validated by a fit without it."""
-    monkeypatch.setattr(MODULE, "_fitted", lambda asked: [tuple(part) for _, part in asked])
+    monkeypatch.setattr(MODULE, "_fitted", lambda asked: [(structure, *part) for structure, part in asked])
     monkeypatch.setattr(MODULE, "_on_validation", lambda structure, fits, evaluation: structure)
-    first, second = comparing(list(range(5))).tried(["first", "second"])
-    for tried, name in ((first, "first"), (second, "second")):
-        assert tried.fits == [(1, 2, 4), (0, 2, 3), (0, 1, 3, 4), (1, 2, 4), (0, 2, 3)]
-        assert tried.errors == name
+    structures = [SimpleNamespace(as_hypothesis=lambda fit: fit) for _ in range(2)]
+    for structure, tried in zip(structures, comparing(list(range(5))).tried(structures), strict=True):
+        parts = [(1, 2, 4), (0, 2, 3), (0, 1, 3, 4), (1, 2, 4), (0, 2, 3)]
+        assert tried.fits == [(structure, *part) for part in parts]
+        assert tried.errors is structure
 
 
 def test_the_ratio_of_errors_weighs_channels_alike():

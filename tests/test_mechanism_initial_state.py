@@ -8,7 +8,7 @@ import pytest
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.plant import Plant
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.joints import paper
+from rotflex_jax.joints import paper, rotary_arm
 from rotflex_jax.mechanism import Exponential, simulate, simulate_states
 from rotflex_jax.mechanism.initial_state import initial_states, rough_states
 from rotflex_jax.metrics import window_starts
@@ -114,6 +114,29 @@ def test_a_measured_speed_is_read_as_a_speed():
     y = np.column_stack([1.5 + 4 * t, 0.02 - 0.3 * t])
     state = rough_states(mechanism.structure, y[None], 0.01)[0]
     assert state[2] == pytest.approx(1.5) and state[1] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("samples", [1, 20])
+@pytest.mark.parametrize(
+    ("mechanism", "channel", "state"),
+    [
+        (dataclasses.replace(paper(), outputs={"alpha": "joint", "theta": "hub"}), 1, 0),
+        (rotary_arm(flexible=False), 0, 0),  # no spring
+        (dataclasses.replace(paper(), outputs={"omega": ("hub", "speed")}), 0, 2),  # no sensor of a position
+    ],
+)
+def test_each_segment_is_read_by_itself(mechanism, channel, state, samples):
+    """Straight lines through five segments: one channel says what a state is at the start of each."""
+    rng, t = np.random.default_rng(3), np.arange(samples)[:, None] * 0.01
+    start, slope = rng.normal(size=(2, 5, len(mechanism.channels)))
+    y = start[:, None] + slope[:, None] * t
+    found, n = rough_states(mechanism.structure, y, 0.01), len(mechanism.coordinates)
+    alone = [rough_states(mechanism.structure, segment[None], 0.01)[0] for segment in y]
+    np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found[:, state], start[:, channel], atol=1e-9)
+    if state < n:
+        speed = slope[:, channel] if samples > 1 else 0.0
+        np.testing.assert_allclose(found[:, n + state], speed, atol=1e-8)
 
 
 def scrambled(y: np.ndarray, kept: np.ndarray) -> np.ndarray:

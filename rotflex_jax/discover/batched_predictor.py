@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -301,10 +301,11 @@ def on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
     """Results of independent calls, on as many threads as there are cores.
 
     A scan keeps one core busy however many parameter sets it carries; compiled code runs outside of Python's
-    lock.
+    lock. Where one call fails, those that have begun end before its error is raised.
 
     Args:
-        run: What to call; no two threads may compile the same.
+        run: What to call; no two calls may run a program that spreads over devices. What several calls need
+            to be compiled is compiled once, by the first of them.
         jobs: Its arguments.
     """
     if len(jobs) == 1:
@@ -315,7 +316,11 @@ def on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
         with np.errstate(**settings):
             return run(job)
 
-    return list(_threads().map(on_thread, jobs))
+    begun = [_threads().submit(on_thread, job) for job in jobs]
+    try:
+        return [each.result() for each in begun]
+    finally:
+        wait([each for each in begun if not each.cancel()])
 
 
 @functools.cache

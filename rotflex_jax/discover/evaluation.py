@@ -99,33 +99,38 @@ def free_runs(validation: ValidationSet, models: Sequence[Model]) -> FreeRuns:
 
 
 def errors_with_own_calibration(
-    validation: ValidationSet, found: ValidatedHypothesis, locations: Sequence[EffectLocation], seconds: float
+    validation: ValidationSet,
+    trained: Sequence[Hypothesis],
+    locations: Sequence[EffectLocation],
+    seconds: float,
 ) -> RunErrors:
     """Errors over recordings where each has the offsets that its own first seconds give.
 
     Args:
         validation: Free runs over the recordings.
-        found: Trained, or trained without each of them.
+        trained: One for all recordings, or one for each: without it, or with what is known of its run.
         locations: What its model has.
         seconds: How much of each recording its offsets may be fitted to [s].
     """
-    s, every = validation.problem.supermodel, range(len(validation.problem.seen))
-    on = list(dict.fromkeys([*locations, *s.calibrations]))
-    parts = [(f.validation.problem, h) for f, h in zip(validation.folds, found.folds, strict=True)]
-    if not parts:
-        own = calibrate(validation.problem, found.hypothesis, seconds)
-        return free_runs(validation, [validation.model_of(own, on, i) for i in every]).errors
-    own = [calibrate(problem, h, seconds) for problem, h in parts]
+    problem = validation.problem
+    on = list(dict.fromkeys([*locations, *problem.supermodel.calibrations]))
+    if len(trained) == 1:
+        own = [calibrate(problem, trained[0], seconds)] * len(problem.seen)
+    else:
+        own = [calibrate(problem.of_recordings([k]), h, seconds) for k, h in enumerate(trained)]
     return free_runs(validation, [validation.model_of(h, on, i) for i, h in enumerate(own)]).errors
 
 
 def errors_as_trained(
-    validation: ValidationSet, h: Hypothesis, locations: Sequence[EffectLocation]
+    validation: ValidationSet, trained: Sequence[Hypothesis], locations: Sequence[EffectLocation]
 ) -> RunErrors:
     """Errors over recordings with the trained model as it is, less a disturbance; arguments as before."""
-    trained = _with_own_values(validation.problem.supermodel, h, h.local_z.mean(axis=0, keepdims=True))
-    model = validation.model_of(trained, locations, 0)
-    return free_runs(validation, [model] * len(validation.problem.dataset.recordings)).errors
+    s = validation.problem.supermodel
+    means = (_with_own_values(s, h, h.local_z.mean(axis=0, keepdims=True)) for h in trained)
+    models = [validation.model_of(h, locations, 0) for h in means]
+    if len(models) == 1:
+        models *= len(validation.problem.dataset.recordings)
+    return free_runs(validation, models).errors
 
 
 def _with_own_values(s: SuperModel, h: Hypothesis, local_z: Float[np.ndarray, "R L"]) -> Hypothesis:
@@ -141,7 +146,7 @@ def _with_own_values(s: SuperModel, h: Hypothesis, local_z: Float[np.ndarray, "R
 
 def errors_on_test(
     test: ValidationSet,
-    h: Hypothesis,
+    trained: Sequence[Hypothesis],
     own: Float[np.ndarray, "K L"],
     locations: Sequence[EffectLocation],
     runs: KnownRuns,
@@ -154,20 +159,24 @@ def errors_on_test(
 
     Args:
         test: The recordings.
-        h: Trained.
+        trained: One for all recordings, or one for each, with what else is known of its run.
         own: Unconstrained values of its local parameters in each of the fitted recordings.
         locations: What its model has.
         runs: The fitted recordings.
         of_runs: What the model has for recordings of the fitted runs besides.
     """
-    s, recordings = test.problem.supermodel, test.problem.dataset.recordings
-    known = [runs.index(r) for r in recordings]
-    any_run = h.local_z.mean(axis=0)
-    rows = np.array([any_run if k is None else own[k] for k in known]).reshape(len(known), -1)
-    trained = _with_own_values(s, h, rows)
-    machine = [p for p in locations if runs.compared or p not in s.calibrations]
-    on = [machine if k is None else [*locations, *of_runs] for k in known]
-    return free_runs(test, [test.model_of(trained, p, i) for i, p in enumerate(on)]).errors
+    s, recordings, models = test.problem.supermodel, test.problem.dataset.recordings, []
+    for i, r in enumerate(recordings):
+        h, k = trained[i % len(trained)], runs.index(r)
+        if k is None:
+            local, on = (
+                h.local_z.mean(axis=0),
+                [p for p in locations if runs.compared or p not in s.calibrations],
+            )
+        else:
+            local, on = own[k], [*locations, *of_runs]
+        models.append(test.model_of(_with_own_values(s, h, local[None]), on, 0))
+    return free_runs(test, models).errors
 
 
 def evaluate(
@@ -433,18 +442,16 @@ class Evaluation:
             validated: Its parameters.
             locations: What its model has.
         """
-        trained = dataclasses.replace(validated, folds=())
-        found: dict[str, Any] = {"calibrate_seconds": self.calibrate_seconds}
+        h, found = validated.hypothesis, dict[str, Any](calibrate_seconds=self.calibrate_seconds)
         if self.calibrate_seconds:
             found["calibrated"] = errors_with_own_calibration(
-                self.validation, validated, locations, self.calibrate_seconds
+                self.validation, validated.folds or [h], locations, self.calibrate_seconds
             )
         if self.test:
-            h = validated.hypothesis
-            found["test"] = errors_on_test(self.test, h, h.local_z, locations, self.runs)
+            found["test"] = errors_on_test(self.test, [h], h.local_z, locations, self.runs)
             if self.calibrate_seconds:
                 found["test_calibrated"] = errors_with_own_calibration(
-                    self.test, trained, locations, self.calibrate_seconds
+                    self.test, [h], locations, self.calibrate_seconds
                 )
         return dataclasses.replace(stage, **found)
 

@@ -13,7 +13,8 @@ gets what the fitted runs have in common of them.
 
 In a search each free run has a first state of its own, which hides much of what distinguishes one law of
 friction from another. From measured first states it shows: a law that the search cannot exclude, or that
-contains the one found, takes its place where these runs prefer it beyond doubt.
+contains the one found, takes its place where these runs prefer it beyond doubt. Where every run prefers
+beyond doubt a friction of its own size, each has it.
 """
 
 import dataclasses
@@ -31,7 +32,6 @@ from rotflex_jax.discover.evaluation import (
     errors_as_trained,
     errors_on_test,
     errors_with_own_calibration,
-    free_runs,
 )
 from rotflex_jax.discover.hypothesis import (
     Hypothesis,
@@ -46,6 +46,7 @@ from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, paired_gain
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.result import Fit
@@ -54,6 +55,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import joined
+from rotflex_jax.runtime.xla import mesh_of
 
 # Errors of a fit from measured first states over those of the search, both fitted to training recordings,
 # up to which the former is taken: logarithm of their ratio on validation data, mean over channels.
@@ -74,6 +76,7 @@ class _Structure:
         hypothesis: The same as the search has it.
         supermodel: What it is a hypothesis of.
         window_seconds: Length of free runs [s].
+        friction: Sizes of friction among `local`.
     """
 
     starts: tuple[Model, ...]
@@ -83,6 +86,7 @@ class _Structure:
     hypothesis: Hypothesis
     supermodel: SuperModel
     window_seconds: float
+    friction: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -92,10 +96,19 @@ class _Structure:
         h: Hypothesis,
         on: Sequence[EffectLocation],
         window_seconds: float,
-        *others: Float[np.ndarray, " P"],
+        *more_starts: Float[np.ndarray, " P"],
     ) -> "_Structure":
-        """That of a hypothesis; arguments as the attributes, then values of parameters to start from too."""
-        values = {tuple(v.tolist()): v for v in (h.mean_values(s), *others)}
+        """The structure of a hypothesis.
+
+        Args:
+            s: What it is a hypothesis of.
+            solver: Integration rule.
+            h: The hypothesis; fits start from its parameters.
+            on: What is on in the model that a user gets.
+            window_seconds: Length of free runs [s].
+            more_starts: Values of all parameters to start from besides.
+        """
+        values = {tuple(v.tolist()): v for v in (h.mean_values(s), *more_starts)}
         starts = tuple(Model(s.clean(v, h.locations), solver) for v in values.values())
         free = starts[0].mechanism.free_names
         local = [s.mechanism.parameter_names[i] for i in h.local]
@@ -106,11 +119,10 @@ class _Structure:
     def with_law(self, law: EffectLocation, found: Fit) -> "_Structure":
         """The structure with a law in the place of all others of the same thing at its port.
 
-        It starts from a fit with these, whose sizes it takes over, and from what a user would start with.
-
         Args:
-            law: It, a candidate at the port.
-            found: The structure as it is, fitted without the validation data.
+            law: It takes their place; a candidate at the port.
+            found: A fit of this structure to training recordings. Its values are the first start, and the law
+                keeps those of parameters of the same name; the second start is that of a user.
         """
         s = self.supermodel
         replaced = [p for p in self.on if p in other_laws(s, law)]
@@ -118,9 +130,26 @@ class _Structure:
         on = list(dict.fromkeys(law if p in replaced else p for p in self.on))
         return _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds, _as_given(s, h))
 
-    def as_hypothesis(self, found: Fit) -> Hypothesis:
-        """A fit in the terms of the search, what recordings have for themselves at its mean."""
+    def with_own_friction(self, found: Fit) -> "_Structure":
+        """The structure with dry friction of its own size in each recording; it starts from a fit without."""
+        m, sizes = found.model.mechanism, []
+        units = {n: spec.unit for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)}
+        for effect in [e for e in m.effects if e.law_of == DRY_FRICTION]:
+            names = [f"{effect.at}.{effect.name}.{amplitude}" for amplitude in effect.amplitudes]
+            sizes += [n for n in names if n in m.free_names and units[n] == units[names[0]]]
+        starts = (found.model, self.starts[-1])
+        return dataclasses.replace(self, starts=starts, local=(*self.local, *sizes), friction=tuple(sizes))
+
+    def as_hypothesis(self, found: Fit, run: int | None = None) -> Hypothesis:
+        """A fit in the terms of the search, what recordings have for themselves at its mean.
+
+        Args:
+            found: The fit.
+            run: Which of the fitted recordings the friction is of, where each has its own; None for the mean.
+        """
         s, m = self.supermodel, found.model.mechanism
+        if run is not None:
+            m = m.with_values({n: found.local[n][run].value for n in self.friction})
         rows = [s.mechanism.parameter_names.index(n) for n in m.parameter_names]
         z = self.hypothesis.z.copy()
         z[rows] = Transform.of(m.parameter_specifications).unconstrain(m.values)
@@ -133,10 +162,6 @@ class _Structure:
         transform = Transform.of(m.parameter_specifications)
         z = np.array([transform.unconstrain(found.model_of(k).mechanism.values) for k in range(count)])
         return z[:, [m.parameter_names.index(s.mechanism.parameter_names[i]) for i in self.hypothesis.local]]
-
-    def validated(self, h: Hypothesis, folds: Sequence[Hypothesis] = ()) -> ValidatedHypothesis:
-        """A hypothesis, or one for each recording, as errors are evaluated; nothing is adapted."""
-        return ValidatedHypothesis(h, np.zeros(0), h, np.zeros(0), folds=tuple(folds))
 
     def with_common_offsets(self, found: Fit) -> tuple["_Structure", Fit]:
         """The structure that carries over what runs have in common of their offsets, and the fit with that.
@@ -336,12 +361,15 @@ class _LastFit:
         if (ratio := log_error_ratio(best.errors, self.searched)) > MOST_WORSE:
             others = "the other recordings" if state.validation.folds else "the training recordings"
             return _refused(state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
-        (found,) = _fitted([(best.structure, self.recordings)])
-        as_found = _Candidate(best, found)
-        with_laws = self.with_better_laws(as_found)
-        made = self.accepted(with_laws)
-        if isinstance(made, Refused) and with_laws.laws:
-            return self.accepted(as_found)
+        # A law starts from the fit to training recordings too: neither has a start that the other lacks.
+        starts = (*best.structure.starts, best.fits[0].model)
+        (found,) = _fitted([(dataclasses.replace(best.structure, starts=starts), self.recordings)])
+        candidates = [_Candidate(best, found)]
+        for better in (self.with_better_laws, self.with_own_friction):
+            candidates.append(better(candidates[-1]))
+        made = self.accepted(candidates.pop())
+        while isinstance(made, Refused) and candidates:
+            made = self.accepted(candidates.pop())
         return made
 
     def tried(self, structures: Sequence[_Structure]) -> list[_Tried]:
@@ -354,50 +382,71 @@ class _LastFit:
             own = fits[k * len(parts) : (k + 1) * len(parts)]
             if self.state.validation.folds:  # for each recording the fit without it
                 own = [own[i % len(parts)] for i in range(len(train))]
-            tried.append(_Tried(structure, own, _on_validation(structure, own, self.evaluation)))
+            each = [structure.as_hypothesis(found) for found in own]
+            tried.append(_Tried(structure, own, _on_validation(structure, each, self.evaluation)))
         return tried
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
         """The same with laws that free runs of all recordings prefer in the places of those found."""
         for location in self.state.order:
-            if location in candidate.tried.structure.on:  # unless a law at its port has taken its place
+            if location in candidate.tried.structure.on:  # not where a law has taken its place already
                 candidate = self.with_best_law(candidate, location)
         return candidate
 
     def with_best_law(self, candidate: _Candidate, location: EffectLocation) -> _Candidate:
-        """The same with the best of such laws in the place of one effect; as it is without any."""
+        """The candidate with the best of `laws_in_question` in the place of an effect, if any passes."""
         state, structure = self.state, candidate.tried.structure
         laws = laws_in_question(state, location, structure.on)
         if laws:
             state.say(f"  in the place of {location}: {', '.join(map(str, laws))}")
         others = [structure.with_law(law, candidate.tried.fits[0]) for law in laws]
         fits = _fitted([(other, self.recordings) for other in others])
-        able = [
-            (found, other)
-            for law, other, found in zip(laws, others, fits, strict=True)
+        better = [
+            (found, other, law)
+            for found, other, law in zip(fits, others, laws, strict=True)
             if state.is_plausible(other.as_hypothesis(found), law)
             and self.runs_prefer(found, candidate.found)
         ]
-        for found, other in sorted(able, key=lambda each: each[0].cost):
+        for found, other, law in sorted(better, key=lambda each: each[0].cost):
             (tried,) = self.tried([other])
             # As little as validation data may speak against the fit, they may against the law.
-            known = (self.searched, candidate.tried.errors)
-            if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in known):
-                (law,) = (p for p in other.on if p not in structure.on)
+            before = (self.searched, candidate.tried.errors)
+            if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in before):
                 replaced = [(p, law) for p in structure.on if p not in other.on]
                 return _Candidate(tried, found, (*candidate.laws, *replaced))
         return candidate
 
-    def runs_prefer(self, a: Fit, b: Fit) -> bool:
-        """Whether free runs of fit `a` leave a tenth less than those of `b`, beyond doubt."""
+    def with_own_friction(self, candidate: _Candidate) -> _Candidate:
+        """The same with dry friction of its own size in each run, if every run prefers that."""
+        structure = candidate.tried.structure.with_own_friction(candidate.found)
+        if not (structure.friction and self.evaluation.runs.compared and len(self.recordings) > 1):
+            return candidate
+        self.state.say("  with friction of its own size in each run")
+        (found,) = _fitted([(structure, self.recordings)])
+        if not self.runs_prefer(found, candidate.found, every=True):
+            return candidate
+        return candidate._replace(tried=candidate.tried._replace(structure=structure), found=found)
+
+    def runs_prefer(self, a: Fit, b: Fit, every: bool = False) -> bool:
+        """Whether free runs of fit `a` leave a tenth less than those of `b`, beyond doubt.
+
+        Args:
+            a: The fit in question.
+            b: The fit that it is compared with.
+            every: Whether those of every recording have to prefer it beyond doubt.
+        """
         smaller = float(np.mean([np.log(a.noise[c] / b.noise[c]) for c in b.noise]))
-        return smaller < -FREE_RUN_BETTER and paired_gain(self.blocks(a), self.blocks(b))[1] > FREE_RUN_Z
+        gains = list(zip(self.blocks(a), self.blocks(b), strict=True))
+        if not every:
+            gains = [tuple(map(np.concatenate, zip(*gains, strict=True)))]
+        return smaller < -FREE_RUN_BETTER and all(paired_gain(*each)[1] > FREE_RUN_Z for each in gains)
 
-    def blocks(self, found: Fit) -> Float[np.ndarray, " B"]:
-        """Log-likelihood of free runs in each half second, as the fit maximises it, up to a constant [nat].
+    def blocks(self, found: Fit) -> list[Float[np.ndarray, " B"]]:
+        """Log-likelihood of free runs in each half second of each recording, up to a constant [nat].
 
-        Unlike in a search, where an effect has to help everywhere, large errors count by their square: they
-        are what a user of the model sees. If a few half seconds decide, their scatter is as large.
+        It is the one that the fit maximises. Unlike in a search, where an effect has to help everywhere,
+        large errors count by their square: they are what a user of the model sees. If a few half seconds
+        decide, their scatter is as large.
         """
         out, noise = [], np.array(list(found.noise.values()))
         for k, r in enumerate(self.recordings):
@@ -405,7 +454,16 @@ class _LastFit:
             e = model.simulate_windows(r, self.state.validation.window_seconds) - model.measured(r)
             each = -np.sum(0.5 * (e / noise) ** 2 + np.log(noise), axis=1)
             out.append(np.add.reduceat(each, block_edges(r.N, r.Ts)))
-        return np.concatenate(out)
+        return out
+
+    def hypotheses(
+        self, structure: _Structure, found: Fit, recordings: Sequence[Recording]
+    ) -> list[Hypothesis]:
+        """A fit to all, for some recordings: one for each where friction belongs to runs."""
+        if not structure.friction:
+            return [structure.as_hypothesis(found)]
+        runs = self.evaluation.runs._replace(recordings=self.recordings)
+        return [structure.as_hypothesis(found, runs.index(r)) for r in recordings]
 
     def accepted(self, candidate: _Candidate) -> FinalFit | Refused:
         """The result with a candidate, unless it fails on validation data, to which it was fitted."""
@@ -417,9 +475,11 @@ class _LastFit:
             options = [structure.with_common_offsets(found), (structure, found)]
         else:
             options = [(_with_offsets_that_help(structure, fits, self.evaluation), found)]
+        validation = self.evaluation.validation
         for structure, found in options:
-            each = [found] * len(fits)
-            carried = log_error_ratio(_as_carried(structure, each, self.evaluation), self.carried_over)
+            each = self.hypotheses(structure, found, validation.problem.dataset.recordings)
+            errors = errors_as_trained(validation, each, structure.on)
+            carried = log_error_ratio(errors, self.carried_over)
             if carried <= MOST_WORSE:
                 break
         own = log_error_ratio(_on_validation(structure, each, self.evaluation), self.searched)
@@ -434,6 +494,7 @@ class _LastFit:
             trained=trained,
             searched=self.searched,
             laws=laws,
+            friction=structure.friction,
         )
         return self.tested(made, structure) if self.evaluation.test else made
 
@@ -441,25 +502,23 @@ class _LastFit:
         """A final fit with its errors on recordings that had no say."""
         test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
         assert test
-        h = structure.as_hypothesis(made.fit)
+        each = self.hypotheses(structure, made.fit, test.problem.dataset.recordings)
         runs = self.evaluation.runs._replace(recordings=self.recordings)
         own = structure.own_values(made.fit, len(self.recordings))
         # Of one run alone, validation data have said already whether its own offsets do any good.
         of_runs = structure.own if runs.compared else ()
-        errors = errors_on_test(test, h, own, structure.on, runs, of_runs)
-        calibrated = None
-        if seconds:
-            validated = structure.validated(h)
-            calibrated = errors_with_own_calibration(test, validated, structure.on, seconds)
+        errors = errors_on_test(test, each, own, structure.on, runs, of_runs)
+        calibrated = errors_with_own_calibration(test, each, structure.on, seconds) if seconds else None
         return dataclasses.replace(made, test=errors, test_calibrated=calibrated)
 
 
 def _with_offsets_that_help(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> _Structure:
     """The structure that carries over the offsets with which runs of validation data are better."""
+    each = [structure.as_hypothesis(found) for found in fits]
     for location in structure.own:
         left = tuple(p for p in structure.own if p != location)
         more = dataclasses.replace(structure, own=left, on=(*structure.on, location))
-        errors = (_as_carried(each, fits, evaluation) for each in (more, structure))
+        errors = (errors_as_trained(evaluation.validation, each, s.on) for s in (more, structure))
         if log_error_ratio(*errors) < 0:
             structure = more
     return structure
@@ -486,14 +545,19 @@ def _fitted(asked: Sequence[tuple[_Structure, Sequence[Recording]]]) -> list[Fit
     damped bristles of a friction instead of soft ones. Those of the search's free runs may, too.
     """
 
-    def end(start: tuple[int, Model]) -> Fit:
-        structure, recordings = asked[start[0]]
+    def end(job: tuple[int, Model]) -> Fit:
+        k, start = job
+        structure, recordings = asked[k]
         how = {"first": "measured", "window_seconds": structure.window_seconds}
-        return fit(start[1], list(recordings), local=structure.local, **how)
+        return fit(start, list(recordings), local=structure.local, **how)
 
-    starts = [(k, model) for k, (structure, _) in enumerate(asked) for model in structure.starts]
+    # Those of one structure share a program, which one of them compiles: others first.
+    most = max((len(structure.starts) for structure, _ in asked), default=0)
+    jobs = [(k, x.starts[i]) for i in range(most) for k, (x, _) in enumerate(asked) if i < len(x.starts)]
+    # A fit spreads over several devices, if there are some.
+    fits = on_threads(end, jobs) if mesh_of() is None else [end(job) for job in jobs]
     ends: list[list[Fit]] = [[] for _ in asked]
-    for (k, _), found in zip(starts, on_threads(end, starts), strict=True):
+    for (k, _), found in zip(jobs, fits, strict=True):
         ends[k].append(found)
     return [min(each, key=lambda found: float(np.nan_to_num(found.cost, nan=np.inf))) for each in ends]
 
@@ -504,19 +568,9 @@ def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
     return [[train[k] for k in each if k % folds != fold] for fold in range(folds)]
 
 
-def _on_validation(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> RunErrors:
-    """Errors on the validation recordings of one fit, or of one for each, with own offsets if these count."""
+def _on_validation(structure: _Structure, trained: Sequence[Hypothesis], evaluation: Evaluation) -> RunErrors:
+    """Errors on validation recordings of one hypothesis or one for each, with own offsets if these count."""
     validation, seconds = evaluation.validation, evaluation.calibrate_seconds
     if not seconds:
-        return _as_carried(structure, fits, evaluation)
-    each = [structure.as_hypothesis(found) for found in fits]
-    found = structure.validated(each[0], each if validation.folds else ())
-    return errors_with_own_calibration(validation, found, structure.on, seconds)
-
-
-def _as_carried(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> RunErrors:
-    """The same with what the fits carry over, and nothing of the recordings' own."""
-    validation, each = evaluation.validation, [structure.as_hypothesis(found) for found in fits]
-    if not validation.folds:
-        return errors_as_trained(validation, each[0], structure.on)
-    return free_runs(validation, [validation.model_of(h, structure.on, 0) for h in each]).errors
+        return errors_as_trained(validation, trained, structure.on)
+    return errors_with_own_calibration(validation, trained, structure.on, seconds)

@@ -46,7 +46,8 @@ def laws_in_question(
 
     Args:
         state: A search that is done, with the rivals that remain.
-        location: An effect of a model. One that was there from the start, or is none of a law, has none.
+        location: An effect of the model; no law is in question for one of the model as it was given, nor for
+            one that is no law.
         on: All effects of the model.
     """
     if location not in state.scores:

@@ -208,6 +208,7 @@ class FinalFit:
         test: Errors on recordings that had no say, if there are any.
         test_calibrated: The same with each recording's own offsets.
         laws: Pairs of an effect that the search has found and the law that stands in its place in this model.
+        friction: Sizes of dry friction that each run has for itself, by full name; `model` has their mean.
     """
 
     fit: Fit
@@ -218,6 +219,7 @@ class FinalFit:
     test: RunErrors | None = None
     test_calibrated: RunErrors | None = None
     laws: tuple[tuple[tuple[str, str], tuple[str, str]], ...] = ()
+    friction: tuple[str, ...] = ()
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -232,6 +234,7 @@ class FinalFit:
             "status": self.fit.status,
             "parameters": _parameters(self.estimates),
             "laws": [{"found": list(found), "used": list(used)} for found, used in self.laws],
+            "friction_of_runs": {n: [e.value for e in self.fit.local[n]] for n in self.friction},
         }
         for name, suffix, errors in (
             ("held_out_rmse_of_training_fit", "", self.trained),

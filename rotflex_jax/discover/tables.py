@@ -166,6 +166,13 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         "found: such runs of all that was fitted prefer it by far."
         for replaced, used in found.laws
     )
+    sizes = "; ".join(
+        f"{name} {', '.join(plain_number(e.value) for e in each)} {unit_text(each[0].unit)}"
+        for name, each in found.fit.local.items()
+        if name in found.friction
+    )
+    if sizes:
+        laws += f" Each run has a friction of its own size, without which every run is worse by far: {sizes}."
     return (
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
         f"measured first states.{laws} Fitted in the same way without the validation data, its errors on "
