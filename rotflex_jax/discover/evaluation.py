@@ -126,11 +126,14 @@ def errors_as_trained(
 ) -> RunErrors:
     """Errors over recordings with the trained model as it is, less a disturbance; arguments as before."""
     s = validation.problem.supermodel
-    means = (_with_own_values(s, h, h.local_z.mean(axis=0, keepdims=True)) for h in trained)
-    models = [validation.model_of(h, locations, 0) for h in means]
-    if len(models) == 1:
-        models *= len(validation.problem.dataset.recordings)
-    return free_runs(validation, models).errors
+    means = [_with_own_values(s, h, h.local_z.mean(axis=0, keepdims=True)) for h in trained]
+    each = _for_each(means, len(validation.problem.dataset.recordings))
+    return free_runs(validation, [validation.model_of(h, locations, 0) for h in each]).errors
+
+
+def _for_each(trained: Sequence[Hypothesis], count: int) -> Sequence[Hypothesis]:
+    """A hypothesis for each of some recordings; of one for all, that."""
+    return [trained[0]] * count if len(trained) == 1 else trained
 
 
 def _with_own_values(s: SuperModel, h: Hypothesis, local_z: Float[np.ndarray, "R L"]) -> Hypothesis:
@@ -166,15 +169,10 @@ def errors_on_test(
         of_runs: What the model has for recordings of the fitted runs besides.
     """
     s, recordings, models = test.problem.supermodel, test.problem.dataset.recordings, []
-    for i, r in enumerate(recordings):
-        h, k = trained[i % len(trained)], runs.index(r)
-        if k is None:
-            local, on = (
-                h.local_z.mean(axis=0),
-                [p for p in locations if runs.compared or p not in s.calibrations],
-            )
-        else:
-            local, on = own[k], [*locations, *of_runs]
+    machine = [p for p in locations if runs.compared or p not in s.calibrations]
+    for h, r in zip(_for_each(trained, len(recordings)), recordings, strict=True):
+        k = runs.index(r)
+        local, on = (h.local_z.mean(axis=0), machine) if k is None else (own[k], [*locations, *of_runs])
         models.append(test.model_of(_with_own_values(s, h, local[None]), on, 0))
     return free_runs(test, models).errors
 

@@ -41,7 +41,7 @@ from rotflex_jax.discover.hypothesis import (
 )
 from rotflex_jax.discover.in_place import laws_in_question, other_laws
 from rotflex_jax.discover.likelihood import block_edges
-from rotflex_jax.discover.result import FinalFit, RunErrors, Stage
+from rotflex_jax.discover.result import FinalFit, KnownRuns, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, paired_gain
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
@@ -338,6 +338,11 @@ class _LastFit:
         return joined((*self.state.problem.dataset.recordings, *held_back))
 
     @property
+    def runs(self) -> KnownRuns:
+        """Those of the recordings."""
+        return self.evaluation.runs._replace(recordings=self.recordings)
+
+    @property
     def carried_over(self) -> RunErrors:
         """Errors of the search's own fit on the validation recordings, with nothing of these."""
         return RunErrors(self.stage.held_out_rmse, self.stage.held_out_rmse_windows)
@@ -365,8 +370,9 @@ class _LastFit:
         starts = (*best.structure.starts, best.fits[0].model)
         (found,) = _fitted([(dataclasses.replace(best.structure, starts=starts), self.recordings)])
         candidates = [_Candidate(best, found)]
-        for better in (self.with_better_laws, self.with_own_friction):
-            candidates.append(better(candidates[-1]))
+        for improved in (self.with_better_laws, self.with_own_friction):
+            if (better := improved(candidates[-1])) is not candidates[-1]:
+                candidates.append(better)
         made = self.accepted(candidates.pop())
         while isinstance(made, Refused) and candidates:
             made = self.accepted(candidates.pop())
@@ -462,8 +468,7 @@ class _LastFit:
         """A fit to all, for some recordings: one for each where friction belongs to runs."""
         if not structure.friction:
             return [structure.as_hypothesis(found)]
-        runs = self.evaluation.runs._replace(recordings=self.recordings)
-        return [structure.as_hypothesis(found, runs.index(r)) for r in recordings]
+        return [structure.as_hypothesis(found, self.runs.index(r)) for r in recordings]
 
     def accepted(self, candidate: _Candidate) -> FinalFit | Refused:
         """The result with a candidate, unless it fails on validation data, to which it was fitted."""
@@ -503,11 +508,10 @@ class _LastFit:
         test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
         assert test
         each = self.hypotheses(structure, made.fit, test.problem.dataset.recordings)
-        runs = self.evaluation.runs._replace(recordings=self.recordings)
         own = structure.own_values(made.fit, len(self.recordings))
         # Of one run alone, validation data have said already whether its own offsets do any good.
-        of_runs = structure.own if runs.compared else ()
-        errors = errors_on_test(test, each, own, structure.on, runs, of_runs)
+        of_runs = structure.own if self.runs.compared else ()
+        errors = errors_on_test(test, each, own, structure.on, self.runs, of_runs)
         calibrated = errors_with_own_calibration(test, each, structure.on, seconds) if seconds else None
         return dataclasses.replace(made, test=errors, test_calibrated=calibrated)
 

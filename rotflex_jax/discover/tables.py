@@ -171,12 +171,15 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         for name, each in found.fit.local.items()
         if name in found.friction
     )
-    if sizes:
-        laws += f" Each run has a friction of its own size, without which every run is worse by far: {sizes}."
+    friction = (
+        f" Each run has a friction of its own size, without which every run is worse by far: {sizes}."
+        if sizes
+        else ""
+    )
     return (
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
-        f"measured first states.{laws} Fitted in the same way without the validation data, its errors on "
-        f"these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
+        f"measured first states.{laws}{friction} Fitted in the same way without the validation data, its "
+        f"errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
     )
 
 
