@@ -378,6 +378,8 @@ def test_friction_may_belong_to_each_run(arm):
     )
     assert last.to_dict()["friction_of_runs"] == {LEVEL: [e.value for e in last.fit.local[LEVEL]]}
     assert re.search(r"hub\.coulomb\.level 0\.0[23]\d*, 0\.1[12]\d* N m", final_fit_sentence(found))
+    (row,) = [row for row in parameter_rows(found) if row.name == LEVEL]
+    assert re.fullmatch(r"mean of runs with 0\.0[23]\d*, 0\.1[12]\d*", row.note)
 
 
 def test_friction_that_runs_share_stays_the_machine_s(arm):

@@ -333,6 +333,25 @@ def test_errors_of_windows_leave_out_what_a_model_has_seen(sides):
         runs.append(run)
     assert all(isinstance(r, Recording) and r.N == 640 for r in validation.problem.dataset.recordings)
     np.testing.assert_allclose(validation.window_rmse(runs), [0.03, 0.04])
+    runs[1][400:, 1] = np.nan
+    np.testing.assert_array_equal(validation.window_rmse(runs)[1], np.inf)
+
+
+def test_runs_that_diverge_are_worse_than_all_others() -> None:
+    """However much their predictions gain, and whatever their first half seconds say."""
+    gained = {"held_out": 100.0, "train": 100.0}
+    diverged = dataclasses.replace(of_free_runs(windows=np.inf), parameter_count=9)
+    steady = at_both({"windows": 5.0}, {"windows": 5.0}, DAHL)
+    assert not admissible(diverged, FAR, DATA, NOISE)
+    assert not better_in_place(diverged, steady, DATA)
+    for prediction, free_run in ((np.inf, 5.0), (5.0, np.inf)):
+        half = at_both(gained | {"windows": prediction}, gained | {"windows": free_run}, COULOMB)
+        assert best_window_rmse(half) == pytest.approx(5.0 * NOISE)
+    both = at_both(gained | {"windows": np.inf}, gained | {"windows": np.inf}, COULOMB)
+    assert not admissible(both, FAR, DATA, NOISE)
+    assert not runs_clearly_better(both.window_rmse, both.window_rmse)
+    assert runs_clearly_better(steady.window_rmse, both.window_rmse)
+    assert "free runs diverge; fitted to free runs they diverge" in describe(both, FAR)
 
 
 def test_of_two_that_nothing_distinguishes_the_one_with_fewer_parameters_leads():

@@ -100,6 +100,19 @@ def test_state_under_a_given_motion(name):
     assert errors[1] < errors[0] / 10  # order two
 
 
+@pytest.mark.parametrize("beta", [0.1, 0.4, 0.9])
+def test_a_bouc_wen_state_beyond_its_limits_returns(beta):
+    """As the law stands, it would run away from them where `beta` is less than a half."""
+    effect, span = fx.BoucWen("hub", 0.02, 0.02, beta), (0.0, 3.0)
+    for start in (-9.0, 9.0):
+        with double_precision():
+            law = lambda t, z: np.asarray(effect.flow(z, 0.0, motion(t)[0], 0.0))  # noqa: E731
+            z = exactly(law, span, [start], max_step=0.01).y[0]
+            torques = [float(effect.force(jnp.asarray(state), 0.0, 1.0, 0.0)) for state in z]
+        assert np.abs(z).max() <= 9.0 and np.abs(z[-1]) < 1.0
+        assert np.abs(torques).max() == pytest.approx(0.02, rel=1e-3)
+
+
 def test_lugre_slides_at_its_level_and_bends_before():
     friction = fx.LuGre("hub", **LUGRE)
     with double_precision():

@@ -43,7 +43,7 @@ from rotflex_jax.discover.in_place import laws_in_question, other_laws
 from rotflex_jax.discover.likelihood import block_edges
 from rotflex_jax.discover.result import FinalFit, KnownRuns, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
-from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, paired_gain
+from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, mean_log_ratio, paired_gain
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects.base import DRY_FRICTION
@@ -529,17 +529,9 @@ def _with_offsets_that_help(structure: _Structure, fits: Sequence[Fit], evaluati
 
 
 def log_error_ratio(a: RunErrors, b: RunErrors) -> float:
-    """Logarithm of errors `a` over windows by errors `b`, mean over channels.
-
-    Infinite where runs of `a` diverge, minus infinity where those of `b` alone do.
-    """
+    """Logarithm of errors `a` over windows by errors `b`, mean over channels; see `mean_log_ratio`."""
     before, after = (np.array([x.windows[c] for c in b.windows]) for x in (b, a))
-    if not np.isfinite(after).all():
-        return np.inf
-    if not np.isfinite(before).all():
-        return -np.inf
-    least = np.finfo(float).tiny
-    return float(np.mean(np.log(np.maximum(after, least) / np.maximum(before, least))))
+    return mean_log_ratio(after, before)
 
 
 def _fitted(asked: Sequence[tuple[_Structure, Sequence[Recording]]]) -> list[Fit]:

@@ -224,8 +224,13 @@ class FinalFit:
     @property
     def estimates(self) -> tuple[Estimate, ...]:
         """Parameters of `model` with intervals; without offsets that belong to single runs."""
-        names = self.model.mechanism.parameter_names
-        return tuple(e for e in self.fit.parameters if e.name in names)
+        names, noted = self.model.mechanism.parameter_names, list[Estimate]()
+        for e in self.fit.parameters:
+            if e.name in self.friction:
+                values = ", ".join(f"{own.value:.3g}" for own in self.fit.local[e.name])
+                e = dataclasses.replace(e, note=f"mean of runs with {values}")
+            noted += [e] if e.name in names else []
+        return tuple(noted)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""

@@ -95,16 +95,17 @@ def describe(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> st
         return line
     z, train_z = paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1]
     ratio = float(np.exp(_log_error_ratio(runs, before)))
-    return f"{line}; fitted to free runs {ratio:.2g} times (z {z:.1f}, training {train_z:.1f})"
+    fitted = f"{ratio:.2g} times" if np.isfinite(ratio) else "they diverge"
+    return f"{line}; fitted to free runs {fitted} (z {z:.1f}, training {train_z:.1f})"
 
 
 def error_ratio(ratio: float) -> str:
     """How a free-run error compares with the one before.
 
-    >>> error_ratio(1.87), error_ratio(0.534)
-    ('free-run error 1.9 times as large', 'free-run error 0.53 times as large')
+    >>> error_ratio(1.87), error_ratio(0.534), error_ratio(float("inf"))
+    ('free-run error 1.9 times as large', 'free-run error 0.53 times as large', 'free runs diverge')
     """
-    return f"free-run error {ratio:.2g} times as large"
+    return f"free-run error {ratio:.2g} times as large" if np.isfinite(ratio) else "free runs diverge"
 
 
 def _training_gain(a: ValidatedHypothesis, b: ValidatedHypothesis) -> tuple[float, float]:
@@ -113,7 +114,20 @@ def _training_gain(a: ValidatedHypothesis, b: ValidatedHypothesis) -> tuple[floa
 
 def _log_error_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
     """Mean log ratio of the errors of short free runs; negative where `a` is better."""
-    return float(np.mean(np.log(a.window_rmse / b.window_rmse)))
+    return mean_log_ratio(a.window_rmse, b.window_rmse)
+
+
+def mean_log_ratio(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> float:
+    """Logarithm of errors `a` over errors `b`, mean over channels.
+
+    Infinite where runs of `a` diverge, minus infinity where those of `b` alone do.
+    """
+    if not np.isfinite(a).all():
+        return np.inf
+    if not np.isfinite(b).all():
+        return -np.inf
+    least = np.finfo(float).tiny
+    return float(np.mean(np.log(np.maximum(a, least) / np.maximum(b, least))))
 
 
 def admissible(
@@ -407,7 +421,7 @@ def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> 
 
 def log_best_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
     """Mean log ratio of the errors of short free runs, each with the parameters that suit them best."""
-    return float(np.mean(np.log(best_window_rmse(a) / best_window_rmse(b))))
+    return mean_log_ratio(best_window_rmse(a), best_window_rmse(b))
 
 
 def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
@@ -452,4 +466,4 @@ def _free_run_certainty(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float
 
 def runs_clearly_better(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> bool:
     """Whether errors `a` of short free runs are clearly smaller than errors `b`."""
-    return float(np.mean(np.log(a / b))) < -WINDOWS_BETTER
+    return mean_log_ratio(a, b) < -WINDOWS_BETTER

@@ -33,6 +33,7 @@ from rotflex_jax.discover.selection import (
     WINDOWS_BETTER,
     distinguished,
     log_best_ratio,
+    mean_log_ratio,
     paired_gain,
     runs_clearly_better,
 )
@@ -451,7 +452,7 @@ def merge_effects(
     validated = validate(validation, one)
     errors = validation.short_run_errors(validated.with_trained_calibrations(s), kept)
     several = validation.short_run_errors(final.with_trained_calibrations(s), order)
-    if float(np.mean(np.log(errors / several))) > WINDOWS_BETTER:
+    if mean_log_ratio(errors, several) > WINDOWS_BETTER:
         return None
     return MergedEffects(one, rich, simple, (simple, *calibrations), saved == 0, validated)
 
@@ -502,7 +503,7 @@ def _split_calibrations(
     for location in [p for p in order if p in s.calibrations]:
         with_it = validation.short_run_errors(trained, kept)
         less = validation.short_run_errors(trained, [p for p in kept if p != location])
-        if float(np.mean(np.log(with_it / less))) > -WINDOWS_BETTER:
+        if mean_log_ratio(with_it, less) > -WINDOWS_BETTER:
             kept.remove(location)
             own.append(location)
     return kept, own

@@ -238,11 +238,15 @@ class ValidationSet:
         return self.window_rmse([runs[i] for i in self.counted])
 
     def window_rmse(self, runs: Sequence[Float[np.ndarray, "_ C"]]) -> Float[np.ndarray, " C"]:
-        """Root mean square error of short free runs of the recordings that count, without first samples."""
+        """Root mean square error of short free runs of the recordings that count, without first samples.
+
+        Infinite where runs diverge.
+        """
         dataset = self.problem.dataset
         recordings = [dataset.recordings[i] for i in self.counted]
         measured = [np.asarray(dataset.data.y[i])[: dataset.recordings[i].N] for i in self.counted]
-        return windowed_rmse(recordings, measured, runs, self.window_seconds)
+        rmse = windowed_rmse(recordings, measured, runs, self.window_seconds)
+        return np.nan_to_num(rmse, nan=np.inf, posinf=np.inf)
 
 
 class Fold(NamedTuple):

@@ -165,6 +165,10 @@ class BoucWen(Memory):
     saturates without loss. A recording without small reversals cannot distinguish it from Dahl friction:
     the two differ only where the motion reverses before the state has saturated.
 
+    Where `beta` is less than a half, a state beyond its limits would run away from them. The law never takes
+    it there, but rounding and fitted first states do: |z| above 1 counts as 1 in the second part of the rate
+    and in the torque, so that the state returns.
+
     Args:
         at: Port.
         level: Torque at saturation [N m].
@@ -190,12 +194,12 @@ class BoucWen(Memory):
 
     def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Time derivative of the state [1/s]."""
-        turning, fixed = jnp.abs(speed) * z, speed * jnp.abs(z)
+        turning, fixed = jnp.abs(speed) * z, speed * jnp.minimum(jnp.abs(z), 1.0)
         return (speed - self.beta * turning - (1 - self.beta) * fixed) / self.width
 
     def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Torque [N m] on the port."""
-        return -self.level * z
+        return -self.level * jnp.clip(z, -1.0, 1.0)
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
