@@ -150,6 +150,48 @@ def test_what_most_runs_have_in_common_may_not_suit_a_run_of_validation_data(arm
     assert OFFSET not in last.to_dict()["parameters"]
 
 
+def test_of_two_calibrations_one_may_be_carried_over(monkeypatch):
+    """Offsets of 0.06 and 0.02 V have 0.03 V in common, biases of 4 and -4 mrad nothing."""
+    monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
+    joint, given = rf.joints.paper() + Coulomb("hub", level=0.02), []
+    truth = joint.with_values({LEVEL: 0.03}) + rf.effects.CubicSpring("joint", stiffness=20.0)
+    for seed, (offset, bias) in enumerate(((0.06, 0.004), (0.02, -0.004))):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.normal(0.0, 2.0, 60), 50)
+        own = truth + rf.effects.VoltageOffset("input", offset=offset)
+        y = rf.simulate(own + rf.effects.SensorBias("alpha", bias=bias), u, 0.002)
+        y = y + 2e-4 * rng.standard_normal(y.shape)
+        given.append(rf.Recording(u, y, 0.002, channels=("theta", "alpha"), n_init=50))
+    found = rf.discover(joint, *given, candidates=[], rounds=0)
+    value, local = values_of(found.model), found.final_fit.fit.local
+    # The spring that is missing bends both alike.
+    assert np.diff([e.value for e in local["alpha.sensor_bias.bias"]]) == pytest.approx(-0.008, abs=5e-4)
+    assert value[OFFSET] == pytest.approx(0.03, abs=0.003)
+    assert "alpha.sensor_bias.bias" not in value
+    assert "alpha.sensor_bias.bias" not in found.final_fit.to_dict()["parameters"]
+
+
+@pytest.mark.parametrize("needed", [True, False])
+def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypatch, needed):
+    """It makes validation data better, which are of the same run; other runs do not have it."""
+    if not needed:
+        monkeypatch.setattr(MODULE._LastFit, "runs_prefer", lambda *given, **how: False)
+        monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
+        monkeypatch.setattr(MODULE, "WINDOWS_APART", np.inf)
+    train, validation = run(0.06, 0.03, 0, N=4500).split(2 / 3)
+    other, model = run(0.06, 0.0, 1), arm + Coulomb("hub", level=0.02)
+    found = rf.discover(model, train, validation, test=other, candidates=[], rounds=0)
+    last, offset = found.final_fit, ("voltage_offset", "input")
+    assert found.offsets == ((offset,) if needed else ())
+    assert last.left_out == (() if needed else (offset,))
+    assert (OFFSET in last.fit.model.mechanism.parameter_names) == needed
+    assert ("It is without voltage offset, which" in final_fit_sentence(found)) != needed
+    listed = json.loads(json.dumps(found.to_dict()))["final_fit"]["left_out"]
+    assert listed == ([] if needed else [{"effect": "voltage_offset", "port": "input"}])
+    missed = short_runs_miss(found.model_of(other), other)
+    assert last.test.windows["theta"] == pytest.approx(missed, rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("values", "common"),
     [
@@ -270,6 +312,48 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
     models, _ = until_decided.models_of(found, lambda line: None)
     (coulomb,) = [m for name, m in models.items() if name == "coulomb@hub"]
     assert level_of(rf.Model.of(coulomb.mechanism)) == level_of(found.final.model)
+
+
+def test_a_law_where_runs_validate_each_other(arm, coulomb_found):
+    """Each run is missed by the law that the others teach no more than by the one found."""
+    given = [falling(seed) for seed in range(3)]
+    found = rf.discover(arm, given, candidates=LAWS, rounds=1)
+    last = found.final_fit
+    assert last.laws == ((("coulomb", "hub"), ("stribeck", "hub")),)
+    assert values_of(found.model)["hub.stribeck.excess"] == pytest.approx(0.1, rel=0.2)
+    seen = np.sqrt(np.mean([short_runs_miss(found.model_of(r), r) ** 2 for r in given]))
+    assert seen < 0.5 * last.searched.windows["theta"]
+    assert seen < last.trained.windows["theta"] < last.searched.windows["theta"]
+
+
+def test_a_law_may_pass_where_the_one_found_does_not(arm, coulomb_found, monkeypatch):
+    """Coulomb friction, fitted to the training data in this way, is far off on validation data."""
+    errors_of = MODULE._on_validation
+
+    def far_off(structure, trained, evaluation):
+        errors = errors_of(structure, trained, evaluation)
+        if ("coulomb", "hub") not in structure.on:
+            return errors
+        return RunErrors(errors.whole, {c: 9 * e for c, e in errors.windows.items()})
+
+    monkeypatch.setattr(MODULE, "_on_validation", far_off)
+    train, validation, _ = map(falling, range(3))
+    found = rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
+    assert found.final_fit.laws == ((("coulomb", "hub"), ("stribeck", "hub")),)
+    found = rf.discover(arm, train, validation, candidates=LAWS[:1], rounds=1)
+    assert found.final_fit is None and "to the training recordings alone" in refusals(found)[0]
+
+
+def test_a_law_keeps_the_offsets_that_runs_have_in_common(arm, coulomb_found):
+    train, validation, test = (run(0.025, 0.05, seed, excess=0.1) for seed in range(3))
+    found = rf.discover(arm, train, validation, test=test, candidates=LAWS, rounds=1)
+    value = values_of(found.model)
+    assert found.final_fit.laws == ((("coulomb", "hub"), ("stribeck", "hub")),)
+    assert value["hub.stribeck.excess"] == pytest.approx(0.1, rel=0.2)
+    assert value[OFFSET] == pytest.approx(0.05, abs=0.005)
+    missed = short_runs_miss(found.model, test)
+    assert found.final_fit.test.windows["theta"] == pytest.approx(missed, rel=1e-6)
+    assert missed < 0.5 * short_runs_miss(found.final.model, test)
 
 
 def test_a_law_starts_from_the_fit_without_the_validation_data(arm, coulomb_found, fits):
@@ -486,6 +570,26 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
     found = search()
     assert (found.final_fit is None) == (said is not None)
     assert [note.endswith(said or "") for note in refusals(found)] == [True] * (said is not None)
+
+
+@pytest.mark.parametrize(("share", "taken"), [(0.98, True), (1.02, False)])
+def test_errors_that_differ_by_less_than_a_tenth_are_not_distinguished(runs, arm, monkeypatch, share, taken):
+    train, validation, _ = runs
+    search = lambda: rf.discover(  # noqa: E731
+        arm, train, validation, candidates=[], rounds=0, calibrate_seconds=0.0
+    )
+    theirs, tried, alone = search().final.held_out_rmse_windows["theta"], MODULE._LastFit.tried, []
+
+    def without_validation_data(last, structures):
+        alone.extend(tried(last, structures))
+        return alone
+
+    def on_validation(structure, trained, evaluation):
+        return RunErrors({"theta": 0.0}, {"theta": float(np.exp(0.1 * share if alone else 0.0) * theirs)})
+
+    monkeypatch.setattr(MODULE, "_on_validation", on_validation)
+    monkeypatch.setattr(MODULE._LastFit, "tried", without_validation_data)
+    assert (search().final_fit is not None) == taken
 
 
 def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):

@@ -14,7 +14,8 @@ gets what the fitted runs have in common of them.
 In a search each free run has a first state of its own, which hides much of what distinguishes one law of
 friction from another. From measured first states it shows: a law that the search cannot exclude, or that
 contains the one found, takes its place where these runs prefer it beyond doubt. Where every run prefers
-beyond doubt a friction of its own size, each has it.
+beyond doubt a friction of its own size, each has it. An offset that a single run has shown is left out where
+that run hardly needs it.
 """
 
 import dataclasses
@@ -38,12 +39,19 @@ from rotflex_jax.discover.hypothesis import (
     replacing,
     usual_start,
     with_all_calibrations,
+    without,
 )
 from rotflex_jax.discover.in_place import laws_in_question, other_laws
 from rotflex_jax.discover.likelihood import block_edges
 from rotflex_jax.discover.result import FinalFit, KnownRuns, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
-from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, mean_log_ratio, paired_gain
+from rotflex_jax.discover.selection import (
+    FREE_RUN_BETTER,
+    FREE_RUN_Z,
+    WINDOWS_APART,
+    mean_log_ratio,
+    paired_gain,
+)
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects.base import DRY_FRICTION
@@ -129,6 +137,15 @@ class _Structure:
         h = replacing(s, self.as_hypothesis(found), replaced, usual_start(s, law), 1.0)
         on = list(dict.fromkeys(law if p in replaced else p for p in self.on))
         return _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds, _as_given(s, h))
+
+    def without(self, left_out: Sequence[EffectLocation], found: Fit) -> "_Structure":
+        """The structure without some effects; it starts from a fit with them."""
+        h = self.as_hypothesis(found)
+        for location in left_out:
+            h = without(self.supermodel, h, location)
+        on = [p for p in self.on if p not in left_out]
+        more = _as_given(self.supermodel, h)
+        return _Structure.of(self.supermodel, self.starts[0].solver, h, on, self.window_seconds, more)
 
     def with_own_friction(self, found: Fit) -> "_Structure":
         """The structure with dry friction of its own size in each recording; it starts from a fit without."""
@@ -303,17 +320,19 @@ class _Tried(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A structure that has passed without the validation data, fitted to all recordings.
+    """A structure fitted to all recordings.
 
     Attributes:
-        tried: The structure without the validation data.
+        tried: The structure without the validation data, which may speak against it.
         found: The fit to all.
         laws: Pairs of an effect that was found and the law that stands in its place.
+        left_out: Offsets that were found and that the structure does without.
     """
 
     tried: _Tried
     found: Fit
     laws: tuple[tuple[EffectLocation, EffectLocation], ...] = ()
+    left_out: tuple[EffectLocation, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -363,14 +382,11 @@ class _LastFit:
             for v in variants.values()
         ]
         best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
-        if (ratio := log_error_ratio(best.errors, self.searched)) > MOST_WORSE:
-            others = "the other recordings" if state.validation.folds else "the training recordings"
-            return _refused(state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
         # A law starts from the fit to training recordings too: neither has a start that the other lacks.
         starts = (*best.structure.starts, best.fits[0].model)
         (found,) = _fitted([(dataclasses.replace(best.structure, starts=starts), self.recordings)])
         candidates = [_Candidate(best, found)]
-        for improved in (self.with_better_laws, self.with_own_friction):
+        for improved in (self.without_needless_offsets, self.with_better_laws, self.with_own_friction):
             if (better := improved(candidates[-1])) is not candidates[-1]:
                 candidates.append(better)
         made = self.accepted(candidates.pop())
@@ -391,6 +407,24 @@ class _LastFit:
             each = [structure.as_hypothesis(found) for found in own]
             tried.append(_Tried(structure, own, _on_validation(structure, each, self.evaluation)))
         return tried
+
+    def without_needless_offsets(self, candidate: _Candidate) -> _Candidate:
+        """The same without offsets that other runs do not have, where the one run hardly needs them.
+
+        Other parameters make up for an offset that is not fitted, but not for one that is left out later.
+        """
+        structure, s = candidate.tried.structure, self.state.problem.supermodel
+        offsets = [p for p in structure.on if p in s.calibrations]
+        if self.evaluation.runs.compared or not offsets:
+            return candidate
+        self.state.say(f"  without {', '.join(map(str, offsets))}")
+        (tried,) = self.tried([structure.without(offsets, candidate.tried.fits[0])])
+        (found,) = _fitted([(tried.structure, self.recordings)])
+        if self.runs_prefer(candidate.found, found):
+            return candidate
+        if log_error_ratio(tried.errors, candidate.tried.errors) > MOST_WORSE:
+            return candidate
+        return _Candidate(tried, found, left_out=tuple(offsets))
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
         """The same with laws that free runs of all recordings prefer in the places of those found."""
@@ -419,7 +453,7 @@ class _LastFit:
             before = (self.searched, candidate.tried.errors)
             if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in before):
                 replaced = [(p, law) for p in structure.on if p not in other.on]
-                return _Candidate(tried, found, (*candidate.laws, *replaced))
+                return candidate._replace(tried=tried, found=found, laws=(*candidate.laws, *replaced))
         return candidate
 
     def with_own_friction(self, candidate: _Candidate) -> _Candidate:
@@ -471,10 +505,18 @@ class _LastFit:
         return [structure.as_hypothesis(found, self.runs.index(r)) for r in recordings]
 
     def accepted(self, candidate: _Candidate) -> FinalFit | Refused:
-        """The result with a candidate, unless it fails on validation data, to which it was fitted."""
-        (structure, fits, trained), found, laws = candidate
-        # A fit to recordings that does worse on them than one that has not seen them has failed; without
-        # their offsets it may be a little worse by chance.
+        """The result with a candidate; or why not.
+
+        It must not fail on validation data: neither the same fit without these, nor this one, which has seen
+        them.
+        """
+        (structure, fits, trained), found, laws, left_out = candidate
+        seconds = self.state.validation.window_seconds
+        if (ratio := log_error_ratio(trained, self.searched)) > MOST_WORSE:
+            others = "the other recordings" if self.state.validation.folds else "the training recordings"
+            return _refused(self.state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
+        # A fit to recordings that does clearly worse on them than one that has not seen them has failed.
+        # Without their offsets it may be worse by more.
         if self.evaluation.runs.compared and len(self.recordings) > 1:
             # What most runs have in common may be far from what a run of validation data has.
             options = [structure.with_common_offsets(found), (structure, found)]
@@ -488,8 +530,7 @@ class _LastFit:
             if carried <= MOST_WORSE:
                 break
         own = log_error_ratio(_on_validation(structure, each, self.evaluation), self.searched)
-        if carried > MOST_WORSE or own > 0:
-            seconds = self.state.validation.window_seconds
+        if carried > MOST_WORSE or own > WINDOWS_APART:
             worse = _worse(carried if carried > MOST_WORSE else own, seconds)
             return _refused(self.state, f"{worse}, although it was fitted to them")
         made = FinalFit(
@@ -500,6 +541,7 @@ class _LastFit:
             searched=self.searched,
             laws=laws,
             friction=structure.friction,
+            left_out=left_out,
         )
         return self.tested(made, structure) if self.evaluation.test else made
 

@@ -209,6 +209,7 @@ class FinalFit:
         test_calibrated: The same with each recording's own offsets.
         laws: Pairs of an effect that the search has found and the law that stands in its place in this model.
         friction: Sizes of dry friction that each run has for itself, by full name; `model` has their mean.
+        left_out: Offsets that the search has found in the one run that was fitted, and which it hardly needs.
     """
 
     fit: Fit
@@ -220,6 +221,7 @@ class FinalFit:
     test_calibrated: RunErrors | None = None
     laws: tuple[tuple[tuple[str, str], tuple[str, str]], ...] = ()
     friction: tuple[str, ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -240,6 +242,7 @@ class FinalFit:
             "parameters": _parameters(self.estimates),
             "laws": [{"found": list(found), "used": list(used)} for found, used in self.laws],
             "friction_of_runs": {n: [e.value for e in self.fit.local[n]] for n in self.friction},
+            "left_out": [{"effect": effect, "port": port} for effect, port in self.left_out],
         }
         for name, suffix, errors in (
             ("held_out_rmse_of_training_fit", "", self.trained),

@@ -176,10 +176,17 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         if sizes
         else ""
     )
+    offsets = " and ".join(effect_phrase(*p) for p in found.left_out)
+    left_out = (
+        f" It is without {offsets}, which the search has found: such runs are hardly worse, and other "
+        "recordings may not have it."
+        if offsets
+        else ""
+    )
     return (
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
-        f"measured first states.{laws}{friction} Fitted in the same way without the validation data, its "
-        f"errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
+        f"measured first states.{left_out}{laws}{friction} Fitted in the same way without the validation "
+        f"data, its errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
     )
 
 
