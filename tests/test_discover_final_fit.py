@@ -171,23 +171,36 @@ def test_of_two_calibrations_one_may_be_carried_over(monkeypatch):
     assert "alpha.sensor_bias.bias" not in found.final_fit.to_dict()["parameters"]
 
 
-@pytest.mark.parametrize("needed", [True, False])
-def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypatch, needed):
+@pytest.mark.parametrize("kept_for", ["its use", "validation data", ""])
+def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypatch, kept_for):
     """It makes validation data better, which are of the same run; other runs do not have it."""
-    if not needed:
-        monkeypatch.setattr(MODULE._LastFit, "runs_prefer", lambda *given, **how: False)
+    asked, errors_of = [], MODULE._on_validation
+
+    def prefer(last, a, b, every=False):
+        asked.append([OFFSET in fit.model.mechanism.parameter_names for fit in (a, b)])
+        return kept_for == "its use"
+
+    def far_off(structure, trained, evaluation):
+        errors = errors_of(structure, trained, evaluation)
+        worse = 9 if kept_for == "validation data" and not structure.on else 1
+        return RunErrors(errors.whole, {c: worse * e for c, e in errors.windows.items()})
+
+    monkeypatch.setattr(MODULE._LastFit, "runs_prefer", prefer)
+    monkeypatch.setattr(MODULE, "_on_validation", far_off)
+    if not kept_for:
         monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
         monkeypatch.setattr(MODULE, "WINDOWS_APART", np.inf)
     train, validation = run(0.06, 0.03, 0, N=4500).split(2 / 3)
     other, model = run(0.06, 0.0, 1), arm + Coulomb("hub", level=0.02)
     found = rf.discover(model, train, validation, test=other, candidates=[], rounds=0)
     last, offset = found.final_fit, ("voltage_offset", "input")
-    assert found.offsets == ((offset,) if needed else ())
-    assert last.left_out == (() if needed else (offset,))
-    assert (OFFSET in last.fit.model.mechanism.parameter_names) == needed
-    assert ("It is without voltage offset, which" in final_fit_sentence(found)) != needed
+    assert asked == [[True, False]]
+    assert found.offsets == ((offset,) if kept_for else ())
+    assert last.left_out == (() if kept_for else (offset,))
+    assert (OFFSET in last.fit.model.mechanism.parameter_names) == bool(kept_for)
+    assert ("It is without voltage offset, which" in final_fit_sentence(found)) != bool(kept_for)
     listed = json.loads(json.dumps(found.to_dict()))["final_fit"]["left_out"]
-    assert listed == ([] if needed else [{"effect": "voltage_offset", "port": "input"}])
+    assert listed == ([] if kept_for else [{"effect": "voltage_offset", "port": "input"}])
     missed = short_runs_miss(found.model_of(other), other)
     assert last.test.windows["theta"] == pytest.approx(missed, rel=1e-6)
 
@@ -430,6 +443,12 @@ def test_a_law_is_preferred_where_free_runs_are_better_everywhere(falls, smaller
     better = [x + f for x, f in zip(two, np.split(np.array(falls), 2), strict=True)]
     monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: better if f is a else two)
     assert last.runs_prefer(a, b) == preferred
+
+
+@pytest.mark.parametrize(("diverges", "preferred"), [("a", False), ("b", True), ("ab", False)])
+def test_a_fit_that_diverges_is_never_preferred(diverges, preferred):
+    fits = [SimpleNamespace(noise={"theta": np.nan if name in diverges else 1.0}) for name in "ab"]
+    assert comparing([]).runs_prefer(*fits) == preferred
 
 
 @pytest.mark.parametrize(("second", "preferred"), [([4.0, 5.0], True), ([0.5, -0.4], False)])

@@ -1,6 +1,7 @@
 """The rounds that a search has finished stay in a file until it has ended."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,8 @@ class RoundsSoFar:
             errors = getattr(line, "errors", None)
             if self.file is not None and errors is not None:
                 label = str(getattr(line, "label", ""))
-                stage = {"model": label, "held_out_rmse_windows": dict(errors)}
+                finite = {c: e if math.isfinite(e) else None for c, e in errors.items()}
+                stage = {"model": label, "held_out_rmse_windows": finite}
                 if found := getattr(line, "kept", None):
                     stage["search"] = found
                 self._stages.append(stage)

@@ -92,7 +92,7 @@ def free_runs(validation: ValidationSet, models: Sequence[Model]) -> FreeRuns:
     whole = tuple(m.simulate(r) for m, r in pairs)
     windows = tuple(m.simulate_windows(r, validation.window_seconds) for m, r in pairs)
     e = [(y_hat - m.measured(r))[r.n_init :] for y_hat, (m, r) in zip(whole, pairs, strict=True)]
-    total = np.sqrt(np.mean(np.concatenate(e) ** 2, axis=0))
+    total = np.nan_to_num(np.sqrt(np.mean(np.concatenate(e) ** 2, axis=0)), nan=np.inf, posinf=np.inf)
     short = validation.window_rmse(windows)
     by_channel = (dict(zip(channels, errors.tolist(), strict=True)) for errors in (total, short))
     return FreeRuns(whole, windows, RunErrors(*by_channel))

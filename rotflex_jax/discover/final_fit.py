@@ -382,10 +382,7 @@ class _LastFit:
             for v in variants.values()
         ]
         best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
-        # A law starts from the fit to training recordings too: neither has a start that the other lacks.
-        starts = (*best.structure.starts, best.fits[0].model)
-        (found,) = _fitted([(dataclasses.replace(best.structure, starts=starts), self.recordings)])
-        candidates = [_Candidate(best, found)]
+        candidates = [_Candidate(best, self.fitted_to_all(best))]
         for improved in (self.without_needless_offsets, self.with_better_laws, self.with_own_friction):
             if (better := improved(candidates[-1])) is not candidates[-1]:
                 candidates.append(better)
@@ -393,6 +390,14 @@ class _LastFit:
         while isinstance(made, Refused) and candidates:
             made = self.accepted(candidates.pop())
         return made
+
+    def fitted_to_all(self, tried: _Tried) -> Fit:
+        """The fit to all recordings of what was fitted without the validation data.
+
+        It starts from there too, as laws in question do: neither has a start that the other lacks.
+        """
+        starts = (*tried.structure.starts, tried.fits[0].model)
+        return _fitted([(dataclasses.replace(tried.structure, starts=starts), self.recordings)])[0]
 
     def tried(self, structures: Sequence[_Structure]) -> list[_Tried]:
         """Structures fitted to the training recordings, and validated."""
@@ -409,7 +414,7 @@ class _LastFit:
         return tried
 
     def without_needless_offsets(self, candidate: _Candidate) -> _Candidate:
-        """The same without offsets that other runs do not have, where the one run hardly needs them.
+        """The same without offsets that a single run has shown, if it is not clearly better with them.
 
         Other parameters make up for an offset that is not fitted, but not for one that is left out later.
         """
@@ -419,12 +424,11 @@ class _LastFit:
             return candidate
         self.state.say(f"  without {', '.join(map(str, offsets))}")
         (tried,) = self.tried([structure.without(offsets, candidate.tried.fits[0])])
-        (found,) = _fitted([(tried.structure, self.recordings)])
+        found = self.fitted_to_all(tried)
         if self.runs_prefer(candidate.found, found):
             return candidate
-        if log_error_ratio(tried.errors, candidate.tried.errors) > MOST_WORSE:
-            return candidate
-        return _Candidate(tried, found, left_out=tuple(offsets))
+        fewer = candidate._replace(tried=tried, found=found, left_out=tuple(offsets))
+        return candidate if isinstance(self.accepted(fewer), Refused) else fewer
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
         """The same with laws that free runs of all recordings prefer in the places of those found."""
@@ -459,6 +463,8 @@ class _LastFit:
     def with_own_friction(self, candidate: _Candidate) -> _Candidate:
         """The same with dry friction of its own size in each run, if every run prefers that."""
         structure = candidate.tried.structure.with_own_friction(candidate.found)
+        if log_error_ratio(candidate.tried.errors, self.searched) > MOST_WORSE:
+            return candidate  # it would be refused for that
         if not (structure.friction and self.evaluation.runs.compared and len(self.recordings) > 1):
             return candidate
         self.state.say("  with friction of its own size in each run")
@@ -475,7 +481,9 @@ class _LastFit:
             b: The fit that it is compared with.
             every: Whether those of every recording have to prefer it beyond doubt.
         """
-        smaller = float(np.mean([np.log(a.noise[c] / b.noise[c]) for c in b.noise]))
+        smaller = mean_log_ratio(*(np.array([x.noise[c] for c in b.noise]) for x in (a, b)))
+        if np.isinf(smaller):  # one of them diverges, and its half seconds are not numbers
+            return smaller < 0
         gains = list(zip(self.blocks(a), self.blocks(b), strict=True))
         if not every:
             gains = [tuple(map(np.concatenate, zip(*gains, strict=True)))]
@@ -505,10 +513,9 @@ class _LastFit:
         return [structure.as_hypothesis(found, self.runs.index(r)) for r in recordings]
 
     def accepted(self, candidate: _Candidate) -> FinalFit | Refused:
-        """The result with a candidate; or why not.
+        """The result with a candidate, or why it is refused by its errors on validation data.
 
-        It must not fail on validation data: neither the same fit without these, nor this one, which has seen
-        them.
+        The same fit without these data must not be clearly worse than that of the search, nor this fit.
         """
         (structure, fits, trained), found, laws, left_out = candidate
         seconds = self.state.validation.window_seconds

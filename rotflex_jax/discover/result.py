@@ -209,7 +209,7 @@ class FinalFit:
         test_calibrated: The same with each recording's own offsets.
         laws: Pairs of an effect that the search has found and the law that stands in its place in this model.
         friction: Sizes of dry friction that each run has for itself, by full name; `model` has their mean.
-        left_out: Offsets that the search has found in the one run that was fitted, and which it hardly needs.
+        left_out: Offsets that the search has found in the only run, which is not clearly worse without.
     """
 
     fit: Fit
@@ -226,13 +226,15 @@ class FinalFit:
     @property
     def estimates(self) -> tuple[Estimate, ...]:
         """Parameters of `model` with intervals; without offsets that belong to single runs."""
-        names, noted = self.model.mechanism.parameter_names, list[Estimate]()
-        for e in self.fit.parameters:
-            if e.name in self.friction:
-                values = ", ".join(f"{own.value:.3g}" for own in self.fit.local[e.name])
-                e = dataclasses.replace(e, note=f"mean of runs with {values}")
-            noted += [e] if e.name in names else []
-        return tuple(noted)
+        names = self.model.mechanism.parameter_names
+        return tuple(self._noted(e) for e in self.fit.parameters if e.name in names)
+
+    def _noted(self, e: Estimate) -> Estimate:
+        """An estimate that says of a friction that belongs to runs what it is in each."""
+        if e.name not in self.friction:
+            return e
+        of_runs = "mean of runs with " + ", ".join(f"{own.value:.3g}" for own in self.fit.local[e.name])
+        return dataclasses.replace(e, note="; ".join(filter(None, (e.note, of_runs))))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""
@@ -507,7 +509,8 @@ class SearchResult:
         without those that a single run has shown.
 
         Args:
-            recording: Any of this machine; a part of a recording knows its run.
+            recording: Any of this machine; a part of a recording knows its run. An offset that the final fit
+                leaves out is in no model.
         """
         runs, m = KnownRuns.of(self.train, self.validation), self.model.mechanism
         fit = self.final_fit.fit if self.final_fit else None

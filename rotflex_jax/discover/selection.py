@@ -120,7 +120,7 @@ def _log_error_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
 def mean_log_ratio(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> float:
     """Logarithm of errors `a` over errors `b`, mean over channels.
 
-    Infinite where runs of `a` diverge, minus infinity where those of `b` alone do.
+    Infinite where runs of `a` diverge, whatever those of `b` do; minus infinity where those of `b` alone do.
     """
     if not np.isfinite(a).all():
         return np.inf

@@ -293,7 +293,7 @@ def _need(
     if z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER:
         return True
     # A fit without it may suit the training recordings with parameters that suit no others.
-    return log_best_ratio(horizons.validated(less, less_runs, as_it_is()), as_it_is()) > FREE_RUN_BETTER
+    return log_best_ratio(as_it_is(), horizons.validated(less, less_runs, as_it_is())) < -FREE_RUN_BETTER
 
 
 class RemainingRivals(NamedTuple):

@@ -178,8 +178,8 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     )
     offsets = " and ".join(effect_phrase(*p) for p in found.left_out)
     left_out = (
-        f" It is without {offsets}, which the search has found: such runs are hardly worse, and other "
-        "recordings may not have it."
+        f" It is without {offsets}, which the search has found: such runs are not clearly worse, and "
+        "other recordings may not have it."
         if offsets
         else ""
     )

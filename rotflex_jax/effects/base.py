@@ -377,6 +377,8 @@ class Memory(Effect):
     driven_by: ClassVar[Drive] = "voltage"
     # The quantity of its port that its state is the reading of; empty where no output shows it.
     shows: ClassVar[str] = ""
+    # What the law keeps the state within; a step that would take it beyond ends there.
+    limits: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
 
     @property
     def order(self) -> int:

@@ -165,9 +165,8 @@ class BoucWen(Memory):
     saturates without loss. A recording without small reversals cannot distinguish it from Dahl friction:
     the two differ only where the motion reverses before the state has saturated.
 
-    Where `beta` is less than a half, a state beyond its limits would run away from them. The law never takes
-    it there, but rounding and fitted first states do: |z| above 1 counts as 1 in the second part of the rate
-    and in the torque, so that the state returns.
+    With a `beta` of less than a half the state moves ever faster after a reversal, until it changes its sign.
+    A step that takes the law as linear would throw it far beyond 1, so it is held within its limits.
 
     Args:
         at: Port.
@@ -187,6 +186,7 @@ class BoucWen(Memory):
     amplitudes: ClassVar[tuple[str, ...]] = ("level",)
     contains: ClassVar[tuple[str, ...]] = ("coulomb", "dahl")
     searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
+    limits: ClassVar[tuple[float, float]] = (-1.0, 1.0)
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="torque at saturation")
     width: float = parameter(0.02, unit="rad", lower=1e-6, meaning="deflection over which it builds up")
@@ -194,12 +194,12 @@ class BoucWen(Memory):
 
     def flow(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Time derivative of the state [1/s]."""
-        turning, fixed = jnp.abs(speed) * z, speed * jnp.minimum(jnp.abs(z), 1.0)
+        turning, fixed = jnp.abs(speed) * z, speed * jnp.abs(z)
         return (speed - self.beta * turning - (1 - self.beta) * fixed) / self.width
 
     def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:
         """Torque [N m] on the port."""
-        return -self.level * jnp.clip(z, -1.0, 1.0)
+        return -self.level * z
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:

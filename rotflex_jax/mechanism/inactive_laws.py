@@ -52,7 +52,7 @@ from rotflex_jax.mechanism.simulate import (
     sensor_readings,
     true_outputs,
 )
-from rotflex_jax.mechanism.step import Exponential, exponential_euler
+from rotflex_jax.mechanism.step import Exponential, exponential_euler, within
 
 
 class _Evaluations:
@@ -447,9 +447,8 @@ def _memories(
             law = lambda values, e=e: _with(e, jnp.unstack(values))  # noqa: E731
             flow = lambda values, s, law=law, p=p: law(values).flow(s, motion[p, 0], motion[p, 1], v)  # noqa: E731
             each = jax.vmap(flow)
-            later.append(
-                exponential_euler(lambda s, each=each, values=values: each(values, s), own, samples.Ts)
-            )
+            after = exponential_euler(lambda s, each=each, values=values: each(values, s), own, samples.Ts)
+            later.append(within(after, *e.limits))
         return [jnp.where(ends > 0, r, s) for r, s in zip(rest, later, strict=True)], (z, later)
 
     before, after = jax.lax.scan(advance, rest, (middle, v, ends))[1]

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from rotflex_jax.checks import one_of, real, shown, whole
 from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar
@@ -40,6 +41,9 @@ from rotflex_jax.mechanism.small_matrices import (
     sparse_matvec,
     with_rows,
 )
+
+# A memory that grows by itself does so by no more than so many e-folds in a step: its state stays finite.
+MOST_GROWTH = 30.0
 
 
 def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "p *S"], Float[Array, "p *S"]]:
@@ -368,7 +372,18 @@ def advance_memories(
     if not z.shape[0]:
         return z
     # What drives a flow is held, other states of memories too.
-    return exponential_euler(lambda s: memory_rates(mechanism, x, s, v, gates, z), z, h)
+    after = exponential_euler(lambda s: memory_rates(mechanism, x, s, v, gates, z), z, h)
+    limits = np.array([e.limits for _, e in effects_of(mechanism, Memory)])
+    if not np.isfinite(limits).any():
+        return after
+    return within(after, *(expand_axes(jnp.asarray(each, z.dtype), z) for each in limits.T))
+
+
+def within(
+    z: Float[Array, "*S"], low: Float[ArrayLike, "*S"], high: Float[ArrayLike, "*S"]
+) -> Float[Array, "*S"]:
+    """States held within limits; beyond them derivatives are zero, however large those of the states."""
+    return jnp.where(z < low, low, jnp.where(z > high, high, z))
 
 
 def exponential_euler(
@@ -376,11 +391,14 @@ def exponential_euler(
     z: Float[Array, "z *S"],
     h: Float[Array, "*D"],
 ) -> Float[Array, "z *S"]:
-    """States after `h` [s], each with a flow that depends on no other one."""
+    """States after `h` [s], each with a flow that depends on no other one.
+
+    A state that grows by itself does so by no more than `MOST_GROWTH` e-folds in a step.
+    """
     # So one direction gives all derivatives.
     rate, slope = jax.jvp(flow, (z,), (jnp.ones_like(z),))
     h = expand_axes(h[None], z)
-    a = slope * h
+    a = jnp.minimum(slope * h, MOST_GROWTH)
     small = jnp.abs(a) < 1e-6
     phi = jnp.where(small, 1 + a / 2, jnp.expm1(a) / jnp.where(small, 1.0, a))
     return z + h * phi * rate

@@ -104,8 +104,8 @@ def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
         before, read = readable(first[channel], unit)
         after, _ = readable(last[channel], unit)
         times = ratio(last[channel], discovery.noise_floor.get(channel))
-        text = f"{multiple(times)} × the sensor noise" if times == times else f"error on {data} data"
-        if discovery.rounds and first[channel] > 0:
+        text = f"{multiple(times)} × the sensor noise" if math.isfinite(times) else f"error on {data} data"
+        if discovery.rounds and 0 < first[channel] < math.inf:
             share = 100 * (1 - (last[channel] / first[channel]) ** 2)
             text += f" · {percent(share)} of the squared error explained"
         tiles.append(
