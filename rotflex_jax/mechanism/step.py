@@ -380,7 +380,7 @@ def advance_memories(
 
 
 def within(
-    z: Float[Array, "*S"], low: Float[ArrayLike, "*S"], high: Float[ArrayLike, "*S"]
+    z: Float[Array, "*S"], low: Float[ArrayLike, "*#S"], high: Float[ArrayLike, "*#S"]
 ) -> Float[Array, "*S"]:
     """States held within limits; beyond them derivatives are zero, however large those of the states."""
     return jnp.where(z < low, low, jnp.where(z > high, high, z))
