@@ -199,7 +199,9 @@ KNOWN = {
             "errors over 2 s of these fits",
         ),
         **dict.fromkeys(["41.9", "0.1", "40.7"], "friction at a speed in both, by hand"),
-        **dict.fromkeys(["4.97", "3.87", "1.33", "0.41", "4.54", "3.18", "2.04"], "errors before"),
+        **dict.fromkeys(
+            ["4.97", "3.87", "1.33", "0.41", "4.54", "3.18", "2.04", "11.58", "3.39"], "errors before"
+        ),
         **dict.fromkeys(
             ["0.70", "0.21", "0.18", "5.72", "2.92", "2.95", "0.48"], "errors before, by final fits"
         ),
