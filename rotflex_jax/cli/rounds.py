@@ -1,7 +1,6 @@
 """The rounds that a search has finished stay in a file until it has ended."""
 
 import json
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,8 +32,9 @@ class RoundsSoFar:
             errors = getattr(line, "errors", None)
             if self.file is not None and errors is not None:
                 label = str(getattr(line, "label", ""))
-                finite = {c: e if math.isfinite(e) else None for c, e in errors.items()}
-                stage = {"model": label, "held_out_rmse_windows": finite}
+                from rotflex_jax.discover.result import plain  # loaded by the search that sends the line
+
+                stage = {"model": label, "held_out_rmse_windows": plain(errors)}
                 if found := getattr(line, "kept", None):
                     stage["search"] = found
                 self._stages.append(stage)

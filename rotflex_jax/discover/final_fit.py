@@ -389,7 +389,7 @@ class _LastFit:
         made = self.accepted(candidates.pop())
         while isinstance(made, Refused) and candidates:
             made = self.accepted(candidates.pop())
-        return made
+        return made if isinstance(made, Refused) else self.tested(*made)
 
     def fitted_to_all(self, tried: _Tried) -> Fit:
         """The fit to all recordings of what was fitted without the validation data.
@@ -462,9 +462,9 @@ class _LastFit:
 
     def with_own_friction(self, candidate: _Candidate) -> _Candidate:
         """The same with dry friction of its own size in each run, if every run prefers that."""
-        structure = candidate.tried.structure.with_own_friction(candidate.found)
         if log_error_ratio(candidate.tried.errors, self.searched) > MOST_WORSE:
             return candidate  # it would be refused for that
+        structure = candidate.tried.structure.with_own_friction(candidate.found)
         if not (structure.friction and self.evaluation.runs.compared and len(self.recordings) > 1):
             return candidate
         self.state.say("  with friction of its own size in each run")
@@ -512,8 +512,8 @@ class _LastFit:
             return [structure.as_hypothesis(found)]
         return [structure.as_hypothesis(found, self.runs.index(r)) for r in recordings]
 
-    def accepted(self, candidate: _Candidate) -> FinalFit | Refused:
-        """The result with a candidate, or why it is refused by its errors on validation data.
+    def accepted(self, candidate: _Candidate) -> tuple[FinalFit, _Structure] | Refused:
+        """The result with a candidate and its structure, or why its errors on validation data refuse it.
 
         The same fit without these data must not be clearly worse than that of the search, nor this fit.
         """
@@ -550,12 +550,13 @@ class _LastFit:
             friction=structure.friction,
             left_out=left_out,
         )
-        return self.tested(made, structure) if self.evaluation.test else made
+        return made, structure
 
     def tested(self, made: FinalFit, structure: _Structure) -> FinalFit:
-        """A final fit with its errors on recordings that had no say."""
+        """A final fit with its errors on recordings that had no say, if there are any."""
         test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
-        assert test
+        if not test:
+            return made
         each = self.hypotheses(structure, made.fit, test.problem.dataset.recordings)
         own = structure.own_values(made.fit, len(self.recordings))
         # Of one run alone, validation data have said already whether its own offsets do any good.
