@@ -15,6 +15,7 @@ import scipy.stats
 import rotflex_jax as rf
 from rotflex_jax.discover import conclusion
 from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
+from rotflex_jax.discover.final_structure import Structure
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.selection import choose
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
@@ -23,6 +24,7 @@ from rotflex_jax.experiment import until_decided
 from rotflex_jax.parameters import Estimate
 
 MODULE = sys.modules[log_error_ratio.__module__]
+STRUCTURE = sys.modules[Structure.__module__]
 INERTIA, DRIVE, DAMPING = 0.0075, 48.4 * 0.0107 / 3.29, (48.4 * 0.0107) ** 2 / 3.29
 LEVEL, OFFSET, CANDIDATES = "hub.coulomb.level", "input.voltage_offset.offset", [(Coulomb, "hub")]
 
@@ -219,7 +221,7 @@ def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypa
 def test_what_runs_have_in_common(values, common):
     """By hand: mean m, variance s^2, m max(0, 1 - s^2 / (K m^2))."""
     each = [Estimate(OFFSET, v, 1e-4, (v - 2e-4, v + 2e-4), "V") for v in values]
-    found = MODULE._common(each)
+    found = STRUCTURE._common(each)
     assert found.value == pytest.approx(common)
     assert found.std == pytest.approx(np.std(values, ddof=1) / np.sqrt(len(values)))
     if len(values) == 2:  # one degree of freedom: the quantile of a Cauchy distribution
@@ -234,7 +236,7 @@ def values_of(model: rf.Model) -> dict[str, float]:
 @pytest.fixture
 def fits(monkeypatch):
     """What is fitted: model, recordings, local parameters, end of each; structures with the best ends."""
-    each, best, fit, fitted = [], [], MODULE.fit, MODULE._fitted
+    each, best, fit, fitted = [], [], STRUCTURE.fit, MODULE.fitted
 
     def noted(model, recordings, **how):
         each.append((model, recordings, how["local"], fit(model, recordings, **how)))
@@ -245,8 +247,8 @@ def fits(monkeypatch):
         best.extend((*a, end) for a, end in zip(asked, ends, strict=True))
         return ends
 
-    monkeypatch.setattr(MODULE, "fit", noted)
-    monkeypatch.setattr(MODULE, "_fitted", all_noted)
+    monkeypatch.setattr(STRUCTURE, "fit", noted)
+    monkeypatch.setattr(MODULE, "fitted", all_noted)
     return SimpleNamespace(each=each, best=best)
 
 
@@ -613,7 +615,7 @@ def test_errors_that_differ_by_less_than_a_tenth_are_not_distinguished(runs, arm
 
 def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
     train, validation, _ = runs
-    fit = MODULE.fit
+    fit = STRUCTURE.fit
 
     def lost(model, recordings, **how):
         found = fit(model, recordings, **how)
@@ -622,7 +624,7 @@ def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
         m = found.model.mechanism.with_values({"hub.inertia.inertia": 1.0})
         return dataclasses.replace(found, model=rf.Model(m, found.model.solver))
 
-    monkeypatch.setattr(MODULE, "fit", lost)
+    monkeypatch.setattr(STRUCTURE, "fit", lost)
     found = rf.discover(arm, train, validation, candidates=[], rounds=0)
     assert found.verdict == "unexplained" and found.final_fit is None
     (note,) = refusals(found)
@@ -633,7 +635,7 @@ def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
     def refuse(model, recordings, **how):
         raise rf.InputError("One channel does not move.")
 
-    monkeypatch.setattr(MODULE, "fit", refuse)
+    monkeypatch.setattr(STRUCTURE, "fit", refuse)
     train, validation, _ = runs
     found = rf.discover(arm, train, validation, candidates=[], rounds=0)
     assert found.verdict == "unexplained" and found.final_fit is None
@@ -643,7 +645,7 @@ def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
 
 def test_of_many_runs_each_third_is_left_out(monkeypatch):
     """Each is validated by a fit without it."""
-    monkeypatch.setattr(MODULE, "_fitted", lambda asked: [(structure, *part) for structure, part in asked])
+    monkeypatch.setattr(MODULE, "fitted", lambda asked: [(structure, *part) for structure, part in asked])
     monkeypatch.setattr(MODULE, "_on_validation", lambda structure, fits, evaluation: structure)
     structures = [SimpleNamespace(as_hypothesis=lambda fit: fit) for _ in range(2)]
     for structure, tried in zip(structures, comparing(list(range(5))).tried(structures), strict=True):

@@ -60,6 +60,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty cache folder, and source files that are older than the process."""
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    monkeypatch.delenv(persistent_jit.FOLDER_VARIABLE, raising=False)
     monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
     traced.clear()
     yield tmp_path
@@ -313,6 +314,7 @@ def test_two_machines_with_other_units_have_other_programs() -> None:
 
 
 def test_folders_of_somebody_else_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(persistent_jit.FOLDER_VARIABLE, raising=False)
     monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
     others = [tmp_path / name for name in ("thesis", "photos", "data", "more", "a", "b", "c")]
     for other in others:
@@ -377,6 +379,7 @@ def test_nothing_is_stored_where_none_is_to_be_kept(folder: Path, monkeypatch: p
 def test_a_folder_may_be_chosen_and_the_usual_one_is_the_users(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delenv(persistent_jit.FOLDER_VARIABLE, raising=False)
     monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)

@@ -52,19 +52,20 @@ def row(
     if not all_of_it:
         return found
     told = result.to_dict()
+    last = told["final_fit"] or {}
     say("simulating the test recordings")
     return found | {
         "verdict": told["verdict"],
         "sentence": told["sentence"],
         "notes": told["notes"],
-        "laws": told["final_fit"]["laws"] if told["final_fit"] else [],
+        **{part: last.get(part, []) for part in ("laws", "left_out", "friction_of_runs")},
         "estimates": estimates(result.final),
         # What the search itself reports, all keys that it has, and the same again by the public interface.
         "reported": {
             "baseline": reported(told["baseline"]),
             "final": reported((told["rounds"] or [told["baseline"]])[-1]),
             # The last one fitted to all that had a say, where the search has done that.
-            "fitted to all": reported(told["final_fit"]) if told["final_fit"] else None,
+            "fitted to all": reported(last) if last else None,
         },
         "simulated": {
             "baseline": errors(result.baseline.model, way.test),

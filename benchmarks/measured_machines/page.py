@@ -21,7 +21,8 @@ Written by `python benchmarks/B9_measured.py`. Learnt from some recordings, deci
 evaluated on others that had no say. Root mean square errors of free runs over the whole test and over windows
 of 2 s, of all channels; calibrated: with the voltage offset that the first 2 s of each test recording ask
 for. Provisional rounds are in brackets, look-alikes after an equals sign. "fitted to all, A for B": that fit
-has law A in the place of the law B that was found.
+has law A in the place of the law B that was found; "without C": it does without an offset that was found;
+"D of each run": each run has this parameter for itself.
 
 """
 
@@ -73,10 +74,13 @@ def said(row: Row) -> str:
     return ", ".join(parts) or "nothing"
 
 
-def laws(row: Row) -> str:
-    """Laws that the fit to all has in the places of those that were found."""
+def changed(row: Row) -> str:
+    """In what the fit to all differs from what was found."""
     pairs = (("@".join(x["used"]), "@".join(x["found"])) for x in row.get("laws", []))
-    return "".join(f", {used} for {found}" for used, found in pairs)
+    without = (f"{x['effect']}@{x['port']}" for x in row.get("left_out", []))
+    parts = [f"{used} for {found}" for used, found in pairs] + [f"without {x}" for x in without]
+    parts += [f"{name} of each run" for name in row.get("friction_of_runs", [])]
+    return "".join(f", {part}" for part in parts)
 
 
 def best(row: Row) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:
@@ -113,7 +117,7 @@ def page(results: dict[str, Any]) -> str:
             head = [row["machine"], row["direction"], machine.unit] if stage == "baseline" else ["", "", ""]
             cells = [told(errors[kind], machine.factor) for kind in KINDS]
             cells.append(told(held_out(row, stage)["windows"], machine.factor) if stage not in last else "")
-            label = stage + laws(row) if stage in last else stage
+            label = stage + changed(row) if stage in last else stage
             lines.append("| " + " | ".join([*head, label, *cells, source]) + " |")
         name, whole, windows = best(row)
         cells = [told(whole, machine.factor), told(windows, machine.factor), "", "", "", "`compare`"]

@@ -9,6 +9,7 @@ from typing import Any
 from rotflex_jax.arena.simulator.hidden import ABSORBED, EQUIVALENT, OUTSIDE, UNSEEN
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.arena.simulator.plant import Plant
+from rotflex_jax.text.numbers import json_number
 
 # Arena's parameter -> the parameters of the same effect in the package.
 _RENAMED: dict[str, dict[str, tuple[str, ...]]] = {
@@ -143,7 +144,7 @@ def parameter_errors(
             table[full] = {
                 "true": true,
                 "estimate": e.value,
-                "std": e.std if math.isfinite(e.std) else None,
+                "std": json_number(e.std),
                 "error_percent": 100 * (e.value - true) / abs(true) if true else math.nan,
                 "covered": bool(e.ci95[0] <= true <= e.ci95[1]),
             }

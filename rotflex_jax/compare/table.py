@@ -13,7 +13,7 @@ from rotflex_jax.compare.method import Horizon, Simulator
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import bullets, card, folded, table
-from rotflex_jax.text.numbers import digits, readable
+from rotflex_jax.text.numbers import digits, json_number, json_numbers, readable
 
 
 def cells(comparison: "Comparison") -> list[list[str]]:
@@ -126,18 +126,18 @@ class Row:
             "status": self.status,
             "reason": self.reason,
             "note": self.note,
-            "held_out_rmse": _plain(self.rmse),
-            "held_out_rmse_windows": {"seconds": window_seconds, **_plain(self.rmse_windows)},
-            "held_out_nrmse": _plain(self.nrmse),
-            "held_out_fit_percent": _plain(self.fit_percent),
-            "held_out_worst": _plain(self.worst),
-            "held_out_rmse_one_step": _plain(self.rmse_one_step),
+            "held_out_rmse": json_numbers(self.rmse),
+            "held_out_rmse_windows": {"seconds": window_seconds, **json_numbers(self.rmse_windows)},
+            "held_out_nrmse": json_numbers(self.nrmse),
+            "held_out_fit_percent": json_numbers(self.fit_percent),
+            "held_out_worst": json_numbers(self.worst),
+            "held_out_rmse_one_step": json_numbers(self.rmse_one_step),
             "horizon": None
             if self.horizon is None
             else {
                 "seconds": list(self.horizon.seconds),
                 "runs": self.horizon.runs,
-                **{c: [v if math.isfinite(v) else None for v in e] for c, e in self.horizon.rmse.items()},
+                **{c: [json_number(v) for v in e] for c, e in self.horizon.rmse.items()},
             },
             "parameters": self.parameters,
             "fit_seconds": self.fit_seconds,
@@ -186,7 +186,7 @@ class Comparison:
             "schema": 1,
             "best": self.best.method if self.best else None,
             "rows": [row.to_dict(self.window_seconds) for row in self.rows],
-            "noise_floor": _plain(self.noise_floor),
+            "noise_floor": json_numbers(self.noise_floor),
             "train": [_described(r) for r in self.train],
             "test": [_described(r) for r in self.test],
             "elapsed_s": self.elapsed_s,
@@ -286,7 +286,3 @@ def _described(recording: Recording) -> dict[str, Any]:
         "samples": recording.N,
         "n_init": recording.n_init,
     }
-
-
-def _plain(values: ChannelErrors) -> dict[str, float | None]:
-    return {k: float(v) if math.isfinite(v) else None for k, v in values.items()}

@@ -48,7 +48,7 @@ PROBES_PER_BATCH = 4
 MOST_LINES = 2
 
 
-@persistent_jit(static=3, runs_rarely=True)
+@persistent_jit(static=3, optimisation_level=0)
 def _run_responses(
     structure: Mechanism,
     solver: Solver,
@@ -64,7 +64,7 @@ def _run_responses(
     return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
 
 
-@persistent_jit(static=3, runs_rarely=True)
+@persistent_jit(static=3, optimisation_level=0)
 def _friction_responses(
     structure: Mechanism,
     solver: Solver,

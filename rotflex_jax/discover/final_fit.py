@@ -24,24 +24,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.special
 from jaxtyping import Float
 
-from rotflex_jax.discover.batched_predictor import on_threads
 from rotflex_jax.discover.evaluation import (
     Evaluation,
     errors_as_trained,
     errors_on_test,
     errors_with_own_calibration,
 )
-from rotflex_jax.discover.hypothesis import (
-    Hypothesis,
-    replacing,
-    usual_start,
-    with_all_calibrations,
-    without,
-)
-from rotflex_jax.discover.in_place import laws_in_question, other_laws
+from rotflex_jax.discover.final_structure import Structure, as_given, fitted, with_usual_shapes
+from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
+from rotflex_jax.discover.in_place import laws_in_question
 from rotflex_jax.discover.likelihood import block_edges
 from rotflex_jax.discover.result import FinalFit, KnownRuns, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
@@ -52,210 +45,18 @@ from rotflex_jax.discover.selection import (
     mean_log_ratio,
     paired_gain,
 )
-from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
+from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
-from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.result import Fit
-from rotflex_jax.mechanism import Solver
-from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import joined
-from rotflex_jax.runtime.xla import mesh_of
 
 # Errors of a fit from measured first states over those of the search, both fitted to training recordings,
 # up to which the former is taken: logarithm of their ratio on validation data, mean over channels.
 MOST_WORSE = 0.2
 # Where runs validate each other, at most so many fits, each without a share of them, say how well a way does.
 MOST_FOLDS = 3
-
-
-@dataclasses.dataclass(frozen=True)
-class _Structure:
-    """What is fitted.
-
-    Attributes:
-        starts: Models from which fits start, with the calibrations of the recordings.
-        local: Parameters that each recording has for itself.
-        own: Calibrations that are not carried over to other recordings.
-        on: What is on in the model that a user gets.
-        hypothesis: The same as the search has it.
-        supermodel: What it is a hypothesis of.
-        window_seconds: Length of free runs [s].
-        friction: Sizes of friction among `local`.
-    """
-
-    starts: tuple[Model, ...]
-    local: tuple[str, ...]
-    own: tuple[EffectLocation, ...]
-    on: tuple[EffectLocation, ...]
-    hypothesis: Hypothesis
-    supermodel: SuperModel
-    window_seconds: float
-    friction: tuple[str, ...] = ()
-
-    @classmethod
-    def of(
-        cls,
-        s: SuperModel,
-        solver: Solver,
-        h: Hypothesis,
-        on: Sequence[EffectLocation],
-        window_seconds: float,
-        *more_starts: Float[np.ndarray, " P"],
-    ) -> "_Structure":
-        """The structure of a hypothesis.
-
-        Args:
-            s: What it is a hypothesis of.
-            solver: Integration rule.
-            h: The hypothesis; fits start from its parameters.
-            on: What is on in the model that a user gets.
-            window_seconds: Length of free runs [s].
-            more_starts: Values of all parameters to start from besides.
-        """
-        values = {tuple(v.tolist()): v for v in (h.mean_values(s), *more_starts)}
-        starts = tuple(Model(s.clean(v, h.locations), solver) for v in values.values())
-        free = starts[0].mechanism.free_names
-        local = [s.mechanism.parameter_names[i] for i in h.local]
-        own = tuple(p for p in h.locations if p in s.calibrations and p not in on)
-        local = tuple(n for n in local if n in free)
-        return cls(starts, local, own, tuple(on), h, s, window_seconds)
-
-    def with_law(self, law: EffectLocation, found: Fit) -> "_Structure":
-        """The structure with a law in the place of all others of the same thing at its port.
-
-        Args:
-            law: It takes their place; a candidate at the port.
-            found: A fit of this structure to training recordings. Its values are the first start, and the law
-                keeps those of parameters of the same name; the second start is that of a user.
-        """
-        s = self.supermodel
-        replaced = [p for p in self.on if p in other_laws(s, law)]
-        h = replacing(s, self.as_hypothesis(found), replaced, usual_start(s, law), 1.0)
-        on = list(dict.fromkeys(law if p in replaced else p for p in self.on))
-        return _Structure.of(s, self.starts[0].solver, h, on, self.window_seconds, _as_given(s, h))
-
-    def without(self, left_out: Sequence[EffectLocation], found: Fit) -> "_Structure":
-        """The structure without some effects; it starts from a fit with them."""
-        h = self.as_hypothesis(found)
-        for location in left_out:
-            h = without(self.supermodel, h, location)
-        on = [p for p in self.on if p not in left_out]
-        more = _as_given(self.supermodel, h)
-        return _Structure.of(self.supermodel, self.starts[0].solver, h, on, self.window_seconds, more)
-
-    def with_own_friction(self, found: Fit) -> "_Structure":
-        """The structure with dry friction of its own size in each recording; it starts from a fit without."""
-        m, sizes = found.model.mechanism, []
-        units = {n: spec.unit for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)}
-        for effect in [e for e in m.effects if e.law_of == DRY_FRICTION]:
-            names = [f"{effect.at}.{effect.name}.{amplitude}" for amplitude in effect.amplitudes]
-            sizes += [n for n in names if n in m.free_names and units[n] == units[names[0]]]
-        starts = (found.model, self.starts[-1])
-        return dataclasses.replace(self, starts=starts, local=(*self.local, *sizes), friction=tuple(sizes))
-
-    def as_hypothesis(self, found: Fit, run: int | None = None) -> Hypothesis:
-        """A fit in the terms of the search, what recordings have for themselves at its mean.
-
-        Args:
-            found: The fit.
-            run: Which of the fitted recordings the friction is of, where each has its own; None for the mean.
-        """
-        s, m = self.supermodel, found.model.mechanism
-        if run is not None:
-            m = m.with_values({n: found.local[n][run].value for n in self.friction})
-        rows = [s.mechanism.parameter_names.index(n) for n in m.parameter_names]
-        z = self.hypothesis.z.copy()
-        z[rows] = Transform.of(m.parameter_specifications).unconstrain(m.values)
-        local_z = np.tile(z[list(self.hypothesis.local)], (len(self.hypothesis.x0), 1))
-        return dataclasses.replace(self.hypothesis, z=z, local_z=local_z)
-
-    def own_values(self, found: Fit, count: int) -> Float[np.ndarray, "K L"]:
-        """Unconstrained values of the local parameters of the search in each of the fitted recordings."""
-        s, m = self.supermodel, found.model.mechanism
-        transform = Transform.of(m.parameter_specifications)
-        z = np.array([transform.unconstrain(found.model_of(k).mechanism.values) for k in range(count)])
-        return z[:, [m.parameter_names.index(s.mechanism.parameter_names[i]) for i in self.hypothesis.local]]
-
-    def with_common_offsets(self, found: Fit) -> tuple["_Structure", Fit]:
-        """The structure that carries over what runs have in common of their offsets, and the fit with that.
-
-        The offset of a run is that of the machine plus a deviation of the run. By the values of K runs, with
-        mean m and variance s^2 (of K - 1 degrees of freedom), that of the machine is estimated as
-
-            m max(0, 1 - s^2 / (K m^2)):
-
-        their mean where they agree, zero where it is no larger than its standard deviation.
-
-        This is an empirical Bayes estimate with a prior of mean zero; it is better than the mean where what
-        runs have in common is small against their scatter.
-
-        Source: after B. Efron and C. Morris, "Stein's estimation rule and its competitors - an empirical
-        Bayes approach", Journal of the American Statistical Association 68 (1973) 117-130.
-        """
-        s, common, carried = self.supermodel, dict[str, Estimate](), list[EffectLocation]()
-        for location in self.own:
-            names = [s.mechanism.parameter_names[i] for i in s.parameter_indices(location)]
-            shared = {n: _common(found.local[n]) for n in names if n in found.local}
-            if any(e.value for e in shared.values()):
-                common |= shared
-                carried.append(location)
-        left = tuple(p for p in self.own if p not in carried)
-        mechanism = found.model.mechanism.with_values({n: e.value for n, e in common.items()})
-        found = dataclasses.replace(
-            found,
-            model=dataclasses.replace(found.model, mechanism=mechanism),
-            parameters=tuple(common.get(e.name, e) for e in found.parameters),
-        )
-        return dataclasses.replace(self, own=left, on=(*self.on, *carried)), found
-
-    def carried(self, found: Fit) -> Model:
-        """The model of a fit without what belongs to the recordings that were fitted."""
-        m = found.model.mechanism
-        for location in self.own:
-            m = m.without(*location)
-        return dataclasses.replace(found.model, mechanism=m)
-
-
-def _common(of_runs: Sequence[Estimate]) -> Estimate:
-    """What runs have in common by the estimates of each; see `_Structure.with_common_offsets`.
-
-    Its interval has the width of that of their mean, by how they differ.
-    """
-    values = [e.value for e in of_runs]
-    count, mean = len(values), float(np.mean(values))
-    std = float(np.std(values, ddof=1)) / np.sqrt(count)
-    value = mean * max(0.0, 1.0 - (std / mean) ** 2) if mean else 0.0
-    half = float(scipy.special.stdtrit(count - 1, 0.975)) * std
-    note = "common to runs with " + ", ".join(f"{v:.3g}" for v in values)
-    return dataclasses.replace(of_runs[0], value=value, std=std, ci95=(value - half, value + half), note=note)
-
-
-def _with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
-    """Parameter values with amplitudes in the unit of an effect's first parameter as fitted, others as usual.
-
-    An effect without such an amplitude is left as it is.
-    """
-    values, specs = h.mean_values(s), s.mechanism.parameter_specifications
-    for location in s.without_calibrations(h.locations):
-        candidate, indices = s.candidates[location], s.parameter_indices(location)
-        sizes = np.array([specs[i].unit for i in indices]) == specs[indices[0]].unit
-        kept = np.asarray(candidate.amplitudes) & sizes
-        if kept.any():
-            values[indices] = np.where(kept, values[indices], np.array(candidate.probes[0][0]))
-    return values
-
-
-def _as_given(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
-    """Values of the user's model as given and usual ones of what was found; calibrations as fitted."""
-    values, given = h.mean_values(s), list(s.baseline_free)
-    values[given] = s.mechanism.values[given]
-    for location in s.without_calibrations(h.locations):
-        values[s.parameter_indices(location)] = np.array(s.candidates[location].probes[0][0])
-    return values
 
 
 class Refused(NamedTuple):
@@ -314,7 +115,7 @@ class _Tried(NamedTuple):
         errors: On the validation recordings, with their own offsets if these count.
     """
 
-    structure: _Structure
+    structure: Structure
     fits: Sequence[Fit]
     errors: RunErrors
 
@@ -376,8 +177,8 @@ class _LastFit:
         state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
         variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
         structures = [
-            _Structure.of(
-                s, state.model.solver, v, state.order, seconds, _with_usual_shapes(s, v), _as_given(s, v)
+            Structure.of(
+                s, state.model.solver, v, state.order, seconds, with_usual_shapes(s, v), as_given(s, v)
             )
             for v in variants.values()
         ]
@@ -397,13 +198,13 @@ class _LastFit:
         It starts from there too, as laws in question do: neither has a start that the other lacks.
         """
         starts = (*tried.structure.starts, tried.fits[0].model)
-        return _fitted([(dataclasses.replace(tried.structure, starts=starts), self.recordings)])[0]
+        return fitted([(dataclasses.replace(tried.structure, starts=starts), self.recordings)])[0]
 
-    def tried(self, structures: Sequence[_Structure]) -> list[_Tried]:
+    def tried(self, structures: Sequence[Structure]) -> list[_Tried]:
         """Structures fitted to the training recordings, and validated."""
         train = self.state.problem.dataset.recordings
         parts = _without_each(train) if self.state.validation.folds else [joined(train)]
-        fits = _fitted([(structure, part) for structure in structures for part in parts])
+        fits = fitted([(structure, part) for structure in structures for part in parts])
         tried = []
         for k, structure in enumerate(structures):
             own = fits[k * len(parts) : (k + 1) * len(parts)]
@@ -444,7 +245,7 @@ class _LastFit:
         if laws:
             state.say(f"  in the place of {location}: {', '.join(map(str, laws))}")
         others = [structure.with_law(law, candidate.tried.fits[0]) for law in laws]
-        fits = _fitted([(other, self.recordings) for other in others])
+        fits = fitted([(other, self.recordings) for other in others])
         better = [
             (found, other, law)
             for found, other, law in zip(fits, others, laws, strict=True)
@@ -468,7 +269,7 @@ class _LastFit:
         if not (structure.friction and self.evaluation.runs.compared and len(self.recordings) > 1):
             return candidate
         self.state.say("  with friction of its own size in each run")
-        (found,) = _fitted([(structure, self.recordings)])
+        (found,) = fitted([(structure, self.recordings)])
         if not self.runs_prefer(found, candidate.found, every=True):
             return candidate
         return candidate._replace(tried=candidate.tried._replace(structure=structure), found=found)
@@ -505,14 +306,14 @@ class _LastFit:
         return out
 
     def hypotheses(
-        self, structure: _Structure, found: Fit, recordings: Sequence[Recording]
+        self, structure: Structure, found: Fit, recordings: Sequence[Recording]
     ) -> list[Hypothesis]:
         """A fit to all, for some recordings: one for each where friction belongs to runs."""
         if not structure.friction:
             return [structure.as_hypothesis(found)]
         return [structure.as_hypothesis(found, self.runs.index(r)) for r in recordings]
 
-    def accepted(self, candidate: _Candidate) -> tuple[FinalFit, _Structure] | Refused:
+    def accepted(self, candidate: _Candidate) -> tuple[FinalFit, Structure] | Refused:
         """The result with a candidate and its structure, or why its errors on validation data refuse it.
 
         The same fit without these data must not be clearly worse than that of the search, nor this fit.
@@ -552,7 +353,7 @@ class _LastFit:
         )
         return made, structure
 
-    def tested(self, made: FinalFit, structure: _Structure) -> FinalFit:
+    def tested(self, made: FinalFit, structure: Structure) -> FinalFit:
         """A final fit with its errors on recordings that had no say, if there are any."""
         test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
         if not test:
@@ -566,7 +367,7 @@ class _LastFit:
         return dataclasses.replace(made, test=errors, test_calibrated=calibrated)
 
 
-def _with_offsets_that_help(structure: _Structure, fits: Sequence[Fit], evaluation: Evaluation) -> _Structure:
+def _with_offsets_that_help(structure: Structure, fits: Sequence[Fit], evaluation: Evaluation) -> Structure:
     """The structure that carries over the offsets with which runs of validation data are better."""
     each = [structure.as_hypothesis(found) for found in fits]
     for location in structure.own:
@@ -584,37 +385,13 @@ def log_error_ratio(a: RunErrors, b: RunErrors) -> float:
     return mean_log_ratio(after, before)
 
 
-def _fitted(asked: Sequence[tuple[_Structure, Sequence[Recording]]]) -> list[Fit]:
-    """Structures fitted to free runs of recordings, each the likelier of the ends from its starts.
-
-    Parameters of predictions may lead to another local minimum of free runs than usual ones: to stiff,
-    damped bristles of a friction instead of soft ones. Those of the search's free runs may, too.
-    """
-
-    def end(job: tuple[int, Model]) -> Fit:
-        k, start = job
-        structure, recordings = asked[k]
-        how = {"first": "measured", "window_seconds": structure.window_seconds}
-        return fit(start, list(recordings), local=structure.local, **how)
-
-    # Those of one structure share a program, which one of them compiles: others first.
-    most = max((len(structure.starts) for structure, _ in asked), default=0)
-    jobs = [(k, x.starts[i]) for i in range(most) for k, (x, _) in enumerate(asked) if i < len(x.starts)]
-    # A fit spreads over several devices, if there are some.
-    fits = on_threads(end, jobs) if mesh_of() is None else [end(job) for job in jobs]
-    ends: list[list[Fit]] = [[] for _ in asked]
-    for (k, _), found in zip(jobs, fits, strict=True):
-        ends[k].append(found)
-    return [min(each, key=lambda found: float(np.nan_to_num(found.cost, nan=np.inf))) for each in ends]
-
-
 def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
     """Training recordings without each in turn; of many, without every third one at a time."""
     folds, each = min(len(train), MOST_FOLDS), range(len(train))
     return [[train[k] for k in each if k % folds != fold] for fold in range(folds)]
 
 
-def _on_validation(structure: _Structure, trained: Sequence[Hypothesis], evaluation: Evaluation) -> RunErrors:
+def _on_validation(structure: Structure, trained: Sequence[Hypothesis], evaluation: Evaluation) -> RunErrors:
     """Errors on validation recordings of one hypothesis or one for each, with own offsets if these count."""
     validation, seconds = evaluation.validation, evaluation.calibrate_seconds
     if not seconds:

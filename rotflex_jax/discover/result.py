@@ -1,7 +1,6 @@
 """What a search found, as data: stages, rounds, ranking, places of failure, a verdict."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import of_one_run
+from rotflex_jax.text.numbers import json_number, json_numbers
 
 
 class ConditionalInterval(NamedTuple):
@@ -157,8 +157,8 @@ class Stage:
         for name, (errors, suffix) in named.items():
             if errors is not None:
                 windows = name.removesuffix(suffix) + "_windows" + suffix
-                out[name] = plain(errors.whole)
-                out[windows] = {"seconds": self.window_seconds, **plain(errors.windows)}
+                out[name] = json_numbers(errors.whole)
+                out[windows] = {"seconds": self.window_seconds, **json_numbers(errors.windows)}
         return out
 
 
@@ -253,9 +253,9 @@ class FinalFit:
             ("test_rmse", "_calibrated", self.test_calibrated),
         ):
             if errors is not None:
-                out[name + suffix] = plain(errors.whole)
+                out[name + suffix] = json_numbers(errors.whole)
                 seconds = {"seconds": self.fit.options.window_seconds}
-                out[f"{name}_windows{suffix}"] = seconds | plain(errors.windows)
+                out[f"{name}_windows{suffix}"] = seconds | json_numbers(errors.windows)
         return out
 
 
@@ -348,10 +348,10 @@ class Round:
             "parameters": {n: e.to_dict() for n, e in self.parameters.items()},
             **self.stage.errors(),
             "evidence": {
-                "score": _number(self.score),
-                "held_out_gain_nats": _number(self.held_out_gain_nats),
+                "score": json_number(self.score),
+                "held_out_gain_nats": json_number(self.held_out_gain_nats),
                 **{
-                    name: {key: _number(value) for key, value in g._asdict().items()}
+                    name: {key: json_number(value) for key, value in g._asdict().items()}
                     for name, g in (("prediction", self.prediction), ("free_run", self.free_run))
                     if g is not None
                 },
@@ -392,10 +392,10 @@ class Ranked:
         return {
             "effect": self.effect,
             "port": self.port,
-            "score": _number(self.score),
-            "score_free_run": None if self.score_free_run is None else _number(self.score_free_run),
+            "score": json_number(self.score),
+            "score_free_run": None if self.score_free_run is None else json_number(self.score_free_run),
             "excited": self.excited,
-            "unconfounded": _number(self.unconfounded),
+            "unconfounded": json_number(self.unconfounded),
         }
 
 
@@ -429,21 +429,11 @@ class Where:
         """Plain JSON types."""
         return {
             "statement": self.statement,
-            "share": _number(self.share),
-            "p_value": _number(self.p_value),
+            "share": json_number(self.share),
+            "p_value": json_number(self.p_value),
             "kind": self.kind,
             "channel": self.channel,
         }
-
-
-def _number(value: float) -> float | None:
-    """A float that JSON can carry."""
-    return float(value) if math.isfinite(value) else None
-
-
-def plain(values: dict[str, float]) -> dict[str, float | None]:
-    """Floats that JSON can carry."""
-    return {k: _number(v) for k, v in values.items()}
 
 
 # Name of the file beside a report that holds the input to play next.
@@ -574,7 +564,7 @@ class SearchResult:
             "assessment": self.assessment.to_dict(),
             "units": dict(zip(first.channels, first.units, strict=True)),
             "baseline": self.baseline.errors(),
-            "noise_floor": plain(self.noise_floor),
+            "noise_floor": json_numbers(self.noise_floor),
             "rounds": [r.to_dict() for r in self.rounds],
             "parameters": _parameters(self.final.estimates),
             "ranking": [r.to_dict() for r in self.ranking],

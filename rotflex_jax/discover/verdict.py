@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MUTED
-from rotflex_jax.text.numbers import multiple, ratio
+from rotflex_jax.text.numbers import json_number, json_numbers, multiple, ratio
 
 # An error of at most this times the sensor noise counts as having reached it.
 NEAR_FLOOR = 1.5
@@ -117,14 +117,10 @@ class Assessment:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""
-
-        def finite(values: Mapping[str, float]) -> dict[str, float | None]:
-            return {c: v if math.isfinite(v) else None for c, v in values.items()}
-
         return {
-            "explained_percent": finite(self.explained),
-            "remaining_over_noise": finite(self.remaining),
-            "random_torque_nats_per_value": self.torque_nats if math.isfinite(self.torque_nats) else None,
+            "explained_percent": json_numbers(self.explained),
+            "remaining_over_noise": json_numbers(self.remaining),
+            "random_torque_nats_per_value": json_number(self.torque_nats),
             "grade": self.grade,
             "criterion": self.criterion,
         }
@@ -149,8 +145,11 @@ def assess(
     >>> end = assess({"theta": 0.1}, {"theta": 0.002}, {"theta": 0.001}, 5.0, 1000)
     >>> round(end.explained["theta"], 2), end.remaining, end.is_explained, end.grade
     (99.96, {'theta': 2.0}, False, <Grade.NEAR: 'near'>)
+    >>> assess({"theta": math.inf}, {"theta": 0.002}, {"theta": 0.001}, 5.0, 1000).explained_text
+    ''
     """
-    shares = {c: 100 * (1 - (after[c] / e) ** 2) if e > 0 else math.nan for c, e in before.items()}
+    # Of a baseline whose runs diverge there is no share.
+    shares = {c: 100 * (1 - (after[c] / e) ** 2) if 0 < e < math.inf else math.nan for c, e in before.items()}
     values = samples * max(1, len(floor))
     remaining = {c: ratio(after[c], floor.get(c)) for c in after}
     return Assessment(shares, remaining, nats / values if values else math.nan)

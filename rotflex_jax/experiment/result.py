@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.markup import bullets, card, paragraph, table
-from rotflex_jax.text.numbers import one_line
+from rotflex_jax.text.numbers import json_numbers, one_line
 
 
 def voltage_file(
@@ -47,7 +46,7 @@ def voltage_file(
 
 def plain_limits(limits: Limits) -> dict[str, float | None]:
     """Limits as plain JSON, None where there is none."""
-    return {k: v if math.isfinite(v) else None for k, v in dataclasses.asdict(limits).items()}
+    return json_numbers(dataclasses.asdict(limits))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -43,6 +43,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, single
 from rotflex_jax.runtime.xla import double_precision
 from rotflex_jax.text.markup import bullets, card, paragraph
+from rotflex_jax.text.numbers import json_numbers
 
 # Singular values of normalised sensitivities below this are zeros but for rounding.
 ZERO = 1e-7
@@ -151,7 +152,7 @@ class Identifiability:
             "trust_here": self.trust_here,
             "sensors_here": self.sensors_here,
             "inputs_here": self.inputs_here,
-            "std": {n: v if np.isfinite(v) else None for n, v in self.std.items()},
+            "std": json_numbers(self.std),
             "sentences": list(self.sentences),
         }
 

@@ -13,7 +13,7 @@ from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.text.markup import card, paragraph, table
-from rotflex_jax.text.numbers import as_read, digits, plain_number, readable, unit_text
+from rotflex_jax.text.numbers import as_read, digits, json_number, plain_number, readable, unit_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -162,7 +162,7 @@ class Profile:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types; an end that is infinite or unknown is None."""
-        finite = lambda pair: [v if math.isfinite(v) else None for v in pair]  # noqa: E731
+        finite = lambda pair: [json_number(v) for v in pair]  # noqa: E731
         return {
             "name": self.name,
             "unit": self.unit,

@@ -18,6 +18,7 @@ from rotflex_jax.mechanism.initial_state import initial_states
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import double_precision
+from rotflex_jax.text.numbers import json_number
 
 
 class AveragingRun(NamedTuple):
@@ -302,7 +303,7 @@ class EffectKernels:
                 "parameters": {k: float(v) for k, v in s.effect.values.items()},
                 "linear": s.linear,
                 "quadratic": s.quadratic,
-                "standard_errors": [z if np.isfinite(z) else None for z in s.z],
+                "standard_errors": [json_number(z) for z in s.z],
                 "statement": str(s),
             }
             for s in self.shares

@@ -14,8 +14,8 @@ from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, mi
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
-# Segments of one call at least; short as they are, more of them cost next to nothing.
-LEAST_SEGMENTS_PER_CALL = 8
+# Segments that arrays of one call have place for at least; those that are not there take no time.
+LEAST_SEGMENTS_PER_CALL = 64
 # Increment of a state for a difference quotient.
 DIFFERENCE = 1e-6
 # Evaluations of one segment at most.
@@ -63,7 +63,7 @@ def _lexicographic_fit(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> Flo
     return X
 
 
-@persistent_jit(static=2, runs_rarely=True)
+@persistent_jit(static=2, optimisation_level=1)
 def _fitted_states(
     structure: Mechanism,
     solver: Solver,
@@ -74,31 +74,33 @@ def _fitted_states(
     u: Array,
     y: Array,
     Ts: Array,
+    count: Array,
 ) -> Array:
-    """Positions and speeds (W, m) with the least squared error, each segment by itself.
+    """Positions and speeds (W, m) with the least squared error, each of the first `count` segments by itself.
 
-    Slopes are difference quotients: segments are short, and the derivative of the simulation would take
-    longer to compile than all the runs take.
+    Segments follow on each other: each ends where it has converged, and a step takes a quick way where its
+    own few runs allow that. Slopes are difference quotients: segments are short, and the derivative of the
+    simulation would take longer to compile than all the runs take.
     """
     m = guess.shape[1]
     increments = jnp.concatenate([jnp.zeros((1, m)), DIFFERENCE * jnp.eye(m)])
     # Formed once, outside of the minimisation, whose loop would have to be traced with them.
     mechanism, constants = structure.with_values(values), solver.prepare(structure, values, gates, Ts)
 
-    def fitted(guess: Array, hidden: Array, u: Array, y: Array) -> Array:
-        v = motor_inputs(solver, mechanism, gates, u, Ts)
+    def with_fitted(k: Array, found: Array) -> Array:
+        v = motor_inputs(solver, mechanism, gates, u[k], Ts)
 
         def run(x0: Array) -> Array:
             return read_outputs(mechanism, gates, states(FreeStep(structure, solver), x0, v, constants).T).T
 
         def linearise(x: Array) -> NormalEquations:
-            starts = jnp.concatenate([x[None] + increments, jnp.tile(hidden[None], (m + 1, 1))], axis=1)
-            e = (jax.vmap(run)(starts) - y[None]).reshape(m + 1, -1)
+            starts = jnp.concatenate([x[None] + increments, jnp.tile(hidden[k][None], (m + 1, 1))], axis=1)
+            e = (jax.vmap(run)(starts) - y[k][None]).reshape(m + 1, -1)
             return NormalEquations.of((e[1:] - e[:1]).T / DIFFERENCE, e[0])
 
-        return minimise_compiled(linearise, guess, RULES, max_steps=MAX_EVALUATIONS)[0]
+        return found.at[k].set(minimise_compiled(linearise, guess[k], RULES, max_steps=MAX_EVALUATIONS)[0])
 
-    return jax.vmap(fitted)(guess, hidden, u, y)
+    return jax.lax.fori_loop(0, count, with_fitted, guess)
 
 
 def initial_states(
@@ -134,5 +136,5 @@ def initial_states(
     with double_precision():
         segments = map(jnp.asarray, (guess[rows], hidden[rows], u[rows], y[rows], np.float64(Ts)))
         parameters = map(jnp.asarray, (mechanism.values, gates))
-        found = np.asarray(_fitted_states(structure, solver, *parameters, *segments))
+        found = np.asarray(_fitted_states(structure, solver, *parameters, *segments, jnp.asarray(len(u))))
     return np.concatenate([found[: len(u)], hidden], axis=1)

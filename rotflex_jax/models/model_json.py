@@ -22,6 +22,7 @@ from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, HeldConstant, specifications
 from rotflex_jax.text.files import path_of, write_file
+from rotflex_jax.text.numbers import json_number
 
 SCHEMA = 1
 KIND = "rotflex_jax model"
@@ -181,7 +182,7 @@ def _json(value: Any) -> Any:
     if isinstance(value, (np.ndarray, tuple, list)):
         return [_json(v) for v in value]
     if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
+        return json_number(float(value))
     return value
 
 

@@ -20,7 +20,7 @@ from rotflex_jax.models.run_figure import run_figure, run_view
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.residuals import residual_figure, response_figure
 from rotflex_jax.text.markup import as_json, fill_template, write_files
-from rotflex_jax.text.numbers import plain_number, readable, unit_text, value_and_interval
+from rotflex_jax.text.numbers import json_numbers, plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.plotting import Picture, styled
 
 # The model's name in figures.
@@ -104,10 +104,7 @@ def _plain(simulation: Simulation) -> dict[str, Any]:
     return {
         "schema": 1,
         "source": simulation.recording.source,
-        "errors": {
-            channel: {name: value if np.isfinite(value) else None for name, value in row.items()}
-            for channel, row in simulation.errors().items()
-        },
+        "errors": {channel: json_numbers(row) for channel, row in simulation.errors().items()},
         "parameters": {e.name: e.to_dict() for e in fit.parameters} if fit else {},
     }
 

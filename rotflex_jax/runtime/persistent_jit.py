@@ -58,8 +58,7 @@ FOLDER_VARIABLE = "ROTFLEX_PROGRAMS"
 # With these settings JAX does more at each call than run a program.
 _WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
 _FOR_COMPILER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
-# For programs that run a few times: a third to half of the time to compile, a run up to three times as long.
-_QUICK_TO_COMPILE = {"xla_backend_optimization_level": 0}
+_FULL_LEVEL = 3
 _programs: list["PersistentJit"] = []
 # Programs held in memory, that used last at the end: each takes some 14 MB, and loading it again 0.1 s. Where
 # there are more than the first number, those not used for longest are released down to the second.
@@ -136,13 +135,16 @@ class PersistentJit:
     Args:
         function: Pure; a function of a module of this package that returns arrays, in tuples or named tuples.
         static: How many of the first arguments are static.
-        runs_rarely: Whether a program runs a few times only, so that a quick compilation counts for more than
-            a quick run.
+        optimisation_level: That of LLVM. For loops over samples level 1 is as good as 3 and compiles in four
+            fifths of the time, slopes apart, which want 3. Level 0 is for large programs that run a few
+            times: half of the time to compile, runs of simple loops that are five to ten times as long.
     """
 
-    def __init__(self, function: Callable[..., Any], static: int, runs_rarely: bool = False) -> None:
+    def __init__(
+        self, function: Callable[..., Any], static: int, optimisation_level: int = _FULL_LEVEL
+    ) -> None:
         self.jitted = jax.jit(function, static_argnums=tuple(range(static)))
-        self._runs_rarely = runs_rarely
+        self._level = optimisation_level
         self._static = static
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._held: dict[Any, _Held] = {}
@@ -219,7 +221,9 @@ class PersistentJit:
         def flat(*leaves: Any) -> Any:
             return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
 
-        options = _options() | (_QUICK_TO_COMPILE if self._runs_rarely else {})
+        options = _options() | (
+            {} if self._level == _FULL_LEVEL else {"xla_backend_optimization_level": self._level}
+        )
         program = jax.jit(flat, compiler_options=options)
         began = time.perf_counter()
         stored = None if file is None else _read(file, leaves)
@@ -238,9 +242,11 @@ class PersistentJit:
         return compiled, compiled(*leaves)
 
 
-def persistent_jit(static: int, runs_rarely: bool = False) -> Callable[[Callable[..., Any]], PersistentJit]:
+def persistent_jit(
+    static: int, optimisation_level: int = _FULL_LEVEL
+) -> Callable[[Callable[..., Any]], PersistentJit]:
     """Decorator: the function as a `PersistentJit`; arguments as there."""
-    return lambda function: PersistentJit(function, static, runs_rarely)
+    return lambda function: PersistentJit(function, static, optimisation_level)
 
 
 def make_ahead(function: Callable[..., Any], *arguments: Any) -> None:

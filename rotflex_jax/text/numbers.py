@@ -3,6 +3,7 @@
 import math
 import re
 import unicodedata
+from collections.abc import Mapping
 
 from rotflex_jax.parameters import Estimate
 
@@ -92,6 +93,20 @@ def plain_number(value: float | None, digits: int = 3) -> str:
     if abs(value) >= 1000:
         return f"{value:,.0f}".replace(",", "\u202f").replace("-", "−")
     return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+
+
+def json_number(value: float) -> float | None:
+    """A number that JSON can carry; None where it is infinite or none.
+
+    >>> json_number(0.5), json_number(float("inf"))
+    (0.5, None)
+    """
+    return float(value) if math.isfinite(value) else None
+
+
+def json_numbers(values: Mapping[str, float]) -> dict[str, float | None]:
+    """Several by their names, as `json_number`."""
+    return {name: json_number(value) for name, value in values.items()}
 
 
 def digits(value: float | None, count: int = 3, missing: str = "-") -> str:
