@@ -169,7 +169,7 @@ def geared_step(
     def in_contact() -> Array:
         return with_rows(advance(x, c, None), {k + 1: jnp.zeros_like(r)})
 
-    def any_case() -> Array:
+    def meeting() -> Array:
         impact = _impact(r, s, in_flight[k], in_flight[k + 1], stop, impacts, c)
         moments = jnp.where(impacts[None], impact.moments, 0.0)
         moments = jnp.where(separation.separates[None], separation.moments, moments)
@@ -181,13 +181,12 @@ def geared_step(
         error = jnp.stack([end[k] - stop, end[k + 1]])
         end = end + matvec(a.line, jnp.where(rests[None], matvec(a.correction, error), 0.0))
         angle = jnp.where(rests, stop, jnp.where(end[k] > gap, gap, jnp.where(end[k] < -gap, -gap, end[k])))
-        end = with_rows(end, {k: angle, k + 1: jnp.where(rests, 0.0, end[k + 1])})
-        return jnp.where(stays[None], in_contact(), end)
+        return with_rows(end, {k: angle, k + 1: jnp.where(rests, 0.0, end[k + 1])})
 
-    # Most steps are all in contact or all in flight.
-    flies = ~stays & ~impacts & ~separation.separates
-    elsewhere = lambda: shortcut(lambda: (flies, lambda: in_flight), any_case)  # noqa: E731
-    return shortcut(lambda: (stays, in_contact), elsewhere)
+    # Most steps are all in contact or all in flight. Each way through a step is compiled once: they are long.
+    meets = ~stays & (impacts | separation.separates)
+    elsewhere = shortcut(lambda: (~meets, lambda: in_flight), meeting)
+    return jnp.where(stays[None], shortcut(lambda: (~stays, lambda: elsewhere), in_contact), elsewhere)
 
 
 class Separation(NamedTuple):
