@@ -10,7 +10,7 @@ from rotflex_jax.arena.simulator.plant import Plant
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.joints import paper, rotary_arm
 from rotflex_jax.mechanism import Exponential, simulate, simulate_states
-from rotflex_jax.mechanism.initial_state import initial_states, rough_states
+from rotflex_jax.mechanism.initial_state import _fitted_states, initial_states, rough_states
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -81,6 +81,23 @@ def test_a_stretch_is_read_by_itself(truth):
     np.testing.assert_allclose(again[same], found[same], rtol=0, atol=1e-9)
     # The angle of a servo has no zero of its own.
     np.testing.assert_allclose(again[0] - found[0], [600, 0, 0, 0], atol=1e-5)
+
+
+def test_other_numbers_of_stretches_compile_nothing_and_change_none(truth):
+    """Arrays have place for many; those beyond them are filled up to the next power of two."""
+    r, mechanism = truth
+    gates, starts = np.ones(len(mechanism.effects)), np.linspace(50, 740, 70).astype(int)
+    u, y = stretches(r, "y", starts, 40)
+    found = initial_states(mechanism, Exponential(), gates, u, y, r["Ts"])
+    assert found.shape == (70, 4)
+    few = initial_states(mechanism, Exponential(), gates, u[:3], y[:3], r["Ts"])
+    held = len(_fitted_states)
+    for chosen in ([69], range(20, 70)):
+        pick = list(chosen)
+        alone = initial_states(mechanism, Exponential(), gates, u[pick], y[pick], r["Ts"])
+        np.testing.assert_allclose(alone, found[pick], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(few, found[:3], rtol=0, atol=1e-7)
+    assert len(_fitted_states) == held
 
 
 def test_encoder_noise_is_averaged(truth):
