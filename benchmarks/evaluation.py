@@ -15,6 +15,7 @@ import numpy as np
 
 import rotflex_jax as rf
 from rotflex_jax.effects import VoltageOffset
+from rotflex_jax.text.numbers import json_numbers
 
 ESTABLISHED, PROVISIONAL = "established", "provisional"
 WINDOW = 2.0
@@ -133,4 +134,4 @@ def _windows(pairs: Sequence[tuple[rf.Model, rf.Recording]]) -> Errors:
 
 def _plain(model: rf.Model, rms: Any) -> Errors:
     values = np.asarray(rms, float).tolist()
-    return {c: v if math.isfinite(v) else None for c, v in zip(model.mechanism.channels, values, strict=True)}
+    return json_numbers(dict(zip(model.mechanism.channels, values, strict=True)))

@@ -131,5 +131,8 @@ def test_page_takes_what_the_search_reports_and_says_so():
     assert "- so101: left out, no model" in text
     used = [{"found": ["dahl", "hub"], "used": ["lugre", "hub"]}]
     row |= {"laws": used, "reported": row["reported"] | {"fitted to all": row["reported"]["final"]}}
+    row |= {"left_out": [{"effect": "voltage_offset", "port": "input"}]}
+    row |= {"friction_of_runs": {"hub.lugre.level": [0.01, 0.02]}}
     text = page({"rows": {"rotflex: A to B": row}})
-    assert f"|  |  |  | fitted to all, lugre@hub for dahl@hub | {three} | {three} | {three} |" in text
+    changes = "lugre@hub for dahl@hub, without voltage_offset@input, hub.lugre.level separate for each run"
+    assert f"|  |  |  | fitted to all, {changes} | {three} | {three} | {three} |" in text

@@ -414,6 +414,13 @@ def test_shares_and_nats_of_nothing_are_no_numbers() -> None:
     assert assess({}, {}, {}, 5.0, 0).to_dict()["random_torque_nats_per_value"] is None
 
 
+@pytest.mark.parametrize("after", [0.1, math.inf])
+def test_a_baseline_that_diverges_has_no_share_that_is_explained(after) -> None:
+    end = assess({"theta": math.inf, "alpha": 2.0}, {"theta": after, "alpha": 1.0}, {}, 5.0, 10)
+    assert end.explained_text == "alpha 75.0 % of the baseline's squared error is explained"
+    assert end.to_dict()["explained_percent"] == {"theta": None, "alpha": 75.0}
+
+
 def test_candidates_that_could_not_have_shown_are_a_step() -> None:
     said = "2 of 9 candidates could not have shown here"
     for verdict in Verdict:

@@ -15,7 +15,7 @@ import scipy.stats
 import rotflex_jax as rf
 from rotflex_jax.discover import conclusion
 from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
-from rotflex_jax.discover.final_structure import Structure
+from rotflex_jax.discover.final_structure import FinalStructure
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.selection import choose
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
@@ -24,7 +24,7 @@ from rotflex_jax.experiment import until_decided
 from rotflex_jax.parameters import Estimate
 
 MODULE = sys.modules[log_error_ratio.__module__]
-STRUCTURE = sys.modules[Structure.__module__]
+STRUCTURE = sys.modules[FinalStructure.__module__]
 INERTIA, DRIVE, DAMPING = 0.0075, 48.4 * 0.0107 / 3.29, (48.4 * 0.0107) ** 2 / 3.29
 LEVEL, OFFSET, CANDIDATES = "hub.coulomb.level", "input.voltage_offset.offset", [(Coulomb, "hub")]
 
@@ -236,19 +236,19 @@ def values_of(model: rf.Model) -> dict[str, float]:
 @pytest.fixture
 def fits(monkeypatch):
     """What is fitted: model, recordings, local parameters, end of each; structures with the best ends."""
-    each, best, fit, fitted = [], [], STRUCTURE.fit, MODULE.fitted
+    each, best, fit, fit_structures = [], [], STRUCTURE.fit, MODULE.fit_structures
 
     def noted(model, recordings, **how):
         each.append((model, recordings, how["local"], fit(model, recordings, **how)))
         return each[-1][-1]
 
     def all_noted(asked):
-        ends = fitted(asked)
-        best.extend((*a, end) for a, end in zip(asked, ends, strict=True))
+        ends = fit_structures(asked)
+        best.extend((*a, end.fit) for a, end in zip(asked, ends, strict=True))
         return ends
 
     monkeypatch.setattr(STRUCTURE, "fit", noted)
-    monkeypatch.setattr(MODULE, "fitted", all_noted)
+    monkeypatch.setattr(MODULE, "fit_structures", all_noted)
     return SimpleNamespace(each=each, best=best)
 
 
@@ -645,12 +645,18 @@ def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
 
 def test_of_many_runs_each_third_is_left_out(monkeypatch):
     """Each is validated by a fit without it."""
-    monkeypatch.setattr(MODULE, "fitted", lambda asked: [(structure, *part) for structure, part in asked])
+
+    def fit_structures(asked):
+        return [
+            SimpleNamespace(of=(structure, *part), as_hypothesis=lambda: None) for structure, part in asked
+        ]
+
+    monkeypatch.setattr(MODULE, "fit_structures", fit_structures)
     monkeypatch.setattr(MODULE, "_on_validation", lambda structure, fits, evaluation: structure)
-    structures = [SimpleNamespace(as_hypothesis=lambda fit: fit) for _ in range(2)]
+    structures: list[Any] = ["one", "another"]
     for structure, tried in zip(structures, comparing(list(range(5))).tried(structures), strict=True):
         parts = [(1, 2, 4), (0, 2, 3), (0, 1, 3, 4), (1, 2, 4), (0, 2, 3)]
-        assert tried.fits == [(structure, *part) for part in parts]
+        assert [fitted.of for fitted in tried.fits] == [(structure, *part) for part in parts]
         assert tried.errors is structure
 
 

@@ -1,6 +1,7 @@
 """Other laws in the places of what was found, where the model leaves much: which of them remain."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,7 @@ import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import Discovery, in_place
 from rotflex_jax.discover.search_state import SearchState
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.tables import status_sentence
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.parameters import specifications
@@ -26,19 +27,18 @@ EVERY = (COULOMB, STRIBECK, DAHL, LUGRE, ARM, DEAD_ZONE, SHAKING, DELAY, LAG)
 
 def supermodel() -> Any:
     one = SimpleNamespace(probes=(((1.0, 0.0), (0.0, 2.0)), ((3.0, 0.0), (0.0, 4.0))))
-    return SimpleNamespace(
-        candidates=dict.fromkeys(EVERY, one),
-        without_calibrations=frozenset,
-    )
+    s = SimpleNamespace(candidates=dict.fromkeys(EVERY, one), without_calibrations=frozenset)
+    s.other_laws = functools.partial(SuperModel.other_laws, s)
+    return s
 
 
 def test_laws_of_one_thing_at_one_port():
     s = supermodel()
-    assert in_place.other_laws(s, STRIBECK) == [COULOMB, DAHL, LUGRE]
-    assert in_place.other_laws(s, ARM) == []
-    assert in_place.other_laws(s, LAG) == [DELAY]
+    assert s.other_laws(STRIBECK) == [COULOMB, DAHL, LUGRE]
+    assert s.other_laws(ARM) == []
+    assert s.other_laws(LAG) == [DELAY]
     # Two of nothing that is a law of the same thing have nothing in common.
-    assert in_place.other_laws(s, DEAD_ZONE) == in_place.other_laws(s, SHAKING) == []
+    assert s.other_laws(DEAD_ZONE) == s.other_laws(SHAKING) == []
 
 
 def model(*locations: EffectLocation) -> ValidatedHypothesis:

@@ -1,6 +1,7 @@
 """Play in the gear: closed forms, an event-driven solver, the arena's gear, and the score of a search."""
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,18 @@ def lone(**numbers: float) -> Mechanism:
 
 def joint(gap: float = GAP, share: float = SHARE, **parts: float) -> Mechanism:
     return paper(hub_damping=0.004, joint_damping=0.003, **parts) + fx.Backlash("hub", gap=gap, share=share)
+
+
+def test_each_way_through_a_step_is_in_the_program_once(monkeypatch):
+    """In flight, in contact, and where that changes: programs with play take long to compile."""
+    step, ways = sys.modules[Exponential.__module__], []
+    smooth = step._advance_smooth
+    monkeypatch.setattr(step, "_advance_smooth", lambda *given: ways.append(1) or smooth(*given))
+    m, solver = joint(), Exponential()
+    gates, x = np.ones(len(m.effects)), np.zeros(6)
+    constants = solver.prepare(m.structure, jnp.asarray(m.values), jnp.asarray(gates), jnp.asarray(Ts))
+    jax.make_jaxpr(lambda x: solver.advance(m.structure, x, jnp.asarray(0.0), constants))(x)
+    assert len(ways) == 3
 
 
 def noise(N: int, hold: int = 5, seed: int = 0) -> np.ndarray:

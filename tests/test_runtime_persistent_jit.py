@@ -71,6 +71,20 @@ def files(folder: Path) -> list[Path]:
     return [f for f in folder.glob("programs/*/*") if f.is_file()]
 
 
+@pytest.mark.parametrize(("given", "expected"), [({}, None), ({"optimisation_level": 1}, 1)])
+def test_the_compiler_gets_the_level(folder: Path, monkeypatch, given, expected) -> None:
+    levels, jit = [], jax.jit
+
+    def noted(function, **options):
+        if function.__name__ == "flat":
+            levels.append(options["compiler_options"].get("xla_backend_optimization_level"))
+        return jit(function, **options)
+
+    monkeypatch.setattr(jax, "jit", noted)
+    PersistentJit(lambda slope, x: slope * x, static=1, **given)(2.0, jnp.ones(2))
+    assert levels == [expected]
+
+
 def test_a_second_process_does_not_trace(folder: Path) -> None:
     x = np.arange(3.0)
     with double_precision():

@@ -6,7 +6,6 @@ Imports JAX, so workers import it.
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 import traceback
 from typing import Any
@@ -23,6 +22,7 @@ from rotflex_jax.discover.probabilities import FittedSet, probabilities
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.models.model import Model
+from rotflex_jax.text.numbers import json_number
 
 FS = 500.0
 SUBSTEPS = 3
@@ -161,4 +161,4 @@ def trial(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(pair: tuple[float, float]) -> list[float | None]:
-    return [v if math.isfinite(v) else None for v in np.asarray(pair, float).tolist()]
+    return [json_number(v) for v in np.asarray(pair, float).tolist()]

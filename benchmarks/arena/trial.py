@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -18,6 +17,7 @@ from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
+from rotflex_jax.text.numbers import json_number
 
 SPLIT, WINDOW, FS = 0.7, 2.0, 500.0
 BOTH = ["theta", "alpha"]
@@ -126,7 +126,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
                 for r in result.rounds
             ],
             notes=list(result.notes),
-            ranking=[[s.effect, s.port, _finite(s.score), s.excited] for s in result.ranking[:8]],
+            ranking=[[s.effect, s.port, json_number(s.score), s.excited] for s in result.ranking[:8]],
             parameters=parameter_errors(
                 hidden, {e.name: e for e in result.final.estimates}, truth["plant"]["K"]
             ),
@@ -141,7 +141,3 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
         row["traceback"] = traceback.format_exc()
     row["lines"] = lines
     return row
-
-
-def _finite(x: float) -> float | None:
-    return float(x) if math.isfinite(x) else None

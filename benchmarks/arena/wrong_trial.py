@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
@@ -14,6 +13,7 @@ from evaluation import ESTABLISHED, PROVISIONAL, errors, named, searched
 from rotflex_jax.arena.marking import alike
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.arena.wrong_worlds import World, world
+from rotflex_jax.text.numbers import json_number
 
 
 def marks(
@@ -101,9 +101,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
             verdict=result.verdict.value,
             sentence=result.sentence,
             notes=list(result.notes),
-            ranking=[
-                [s.effect, s.port, s.score if math.isfinite(s.score) else None] for s in result.ranking[:8]
-            ],
+            ranking=[[s.effect, s.port, json_number(s.score)] for s in result.ranking[:8]],
             noise_floor=dict(result.noise_floor),
             **probabilities_told(result, job.get("keep_evidence", False)),
             errors={

@@ -58,7 +58,9 @@ def row(
         "verdict": told["verdict"],
         "sentence": told["sentence"],
         "notes": told["notes"],
-        **{part: last.get(part, []) for part in ("laws", "left_out", "friction_of_runs")},
+        "laws": last.get("laws", []),
+        "left_out": last.get("left_out", []),
+        "friction_of_runs": last.get("friction_of_runs", {}),
         "estimates": estimates(result.final),
         # What the search itself reports, all keys that it has, and the same again by the public interface.
         "reported": {

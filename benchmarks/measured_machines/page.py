@@ -22,7 +22,7 @@ evaluated on others that had no say. Root mean square errors of free runs over t
 of 2 s, of all channels; calibrated: with the voltage offset that the first 2 s of each test recording ask
 for. Provisional rounds are in brackets, look-alikes after an equals sign. "fitted to all, A for B": that fit
 has law A in the place of the law B that was found; "without C": it does without an offset that was found;
-"D of each run": each run has this parameter for itself.
+"D separate for each run": each run has a value of its own of this parameter.
 
 """
 
@@ -74,12 +74,12 @@ def said(row: Row) -> str:
     return ", ".join(parts) or "nothing"
 
 
-def changed(row: Row) -> str:
+def differences_from_found(row: Row) -> str:
     """In what the fit to all differs from what was found."""
     pairs = (("@".join(x["used"]), "@".join(x["found"])) for x in row.get("laws", []))
     without = (f"{x['effect']}@{x['port']}" for x in row.get("left_out", []))
     parts = [f"{used} for {found}" for used, found in pairs] + [f"without {x}" for x in without]
-    parts += [f"{name} of each run" for name in row.get("friction_of_runs", [])]
+    parts += [f"{name} separate for each run" for name in row.get("friction_of_runs", [])]
     return "".join(f", {part}" for part in parts)
 
 
@@ -117,7 +117,7 @@ def page(results: dict[str, Any]) -> str:
             head = [row["machine"], row["direction"], machine.unit] if stage == "baseline" else ["", "", ""]
             cells = [told(errors[kind], machine.factor) for kind in KINDS]
             cells.append(told(held_out(row, stage)["windows"], machine.factor) if stage not in last else "")
-            label = stage + changed(row) if stage in last else stage
+            label = stage + differences_from_found(row) if stage in last else stage
             lines.append("| " + " | ".join([*head, label, *cells, source]) + " |")
         name, whole, windows = best(row)
         cells = [told(whole, machine.factor), told(windows, machine.factor), "", "", "", "`compare`"]

@@ -8,6 +8,7 @@ from typing import Any
 from rotflex_jax.cli.stopping import STOP
 from rotflex_jax.errors import InputError
 from rotflex_jax.text.files import write_file
+from rotflex_jax.text.numbers import json_numbers
 
 
 class RoundsSoFar:
@@ -32,9 +33,7 @@ class RoundsSoFar:
             errors = getattr(line, "errors", None)
             if self.file is not None and errors is not None:
                 label = str(getattr(line, "label", ""))
-                from rotflex_jax.discover.result import plain  # loaded by the search that sends the line
-
-                stage = {"model": label, "held_out_rmse_windows": plain(errors)}
+                stage = {"model": label, "held_out_rmse_windows": json_numbers(errors)}
                 if found := getattr(line, "kept", None):
                     stage["search"] = found
                 self._stages.append(stage)

@@ -32,7 +32,7 @@ from rotflex_jax.discover.evaluation import (
     errors_on_test,
     errors_with_own_calibration,
 )
-from rotflex_jax.discover.final_structure import Structure, as_given, fitted, with_usual_shapes
+from rotflex_jax.discover.final_structure import FinalStructure, FittedStructure, fit_structures
 from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
 from rotflex_jax.discover.in_place import laws_in_question
 from rotflex_jax.discover.likelihood import block_edges
@@ -110,28 +110,31 @@ class _Tried(NamedTuple):
     """A structure fitted without the validation data.
 
     Attributes:
-        structure: What is fitted.
         fits: To the training recordings; where runs validate each other, one without each of them.
         errors: On the validation recordings, with their own offsets if these count.
     """
 
-    structure: Structure
-    fits: Sequence[Fit]
+    fits: Sequence[FittedStructure]
     errors: RunErrors
+
+    @property
+    def structure(self) -> FinalStructure:
+        """What is fitted."""
+        return self.fits[0].structure
 
 
 class _Candidate(NamedTuple):
     """A structure fitted to all recordings.
 
     Attributes:
-        tried: The structure without the validation data, which may speak against it.
-        found: The fit to all.
+        tried: The structure fitted without the validation data, which may speak against it.
+        fitted: It is fitted to all; its friction may belong to runs, unlike in `tried`.
         laws: Pairs of an effect that was found and the law that stands in its place.
         left_out: Offsets that were found and that the structure does without.
     """
 
     tried: _Tried
-    found: Fit
+    fitted: FittedStructure
     laws: tuple[tuple[EffectLocation, EffectLocation], ...] = ()
     left_out: tuple[EffectLocation, ...] = ()
 
@@ -177,10 +180,7 @@ class _LastFit:
         state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
         variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
         structures = [
-            Structure.of(
-                s, state.model.solver, v, state.order, seconds, with_usual_shapes(s, v), as_given(s, v)
-            )
-            for v in variants.values()
+            FinalStructure.of(s, state.model.solver, v, state.order, seconds) for v in variants.values()
         ]
         best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
         candidates = [_Candidate(best, self.fitted_to_all(best))]
@@ -192,26 +192,27 @@ class _LastFit:
             made = self.accepted(candidates.pop())
         return made if isinstance(made, Refused) else self.tested(*made)
 
-    def fitted_to_all(self, tried: _Tried) -> Fit:
+    def fitted_to_all(self, tried: _Tried) -> FittedStructure:
         """The fit to all recordings of what was fitted without the validation data.
 
         It starts from there too, as laws in question do: neither has a start that the other lacks.
         """
-        starts = (*tried.structure.starts, tried.fits[0].model)
-        return fitted([(dataclasses.replace(tried.structure, starts=starts), self.recordings)])[0]
+        structure = tried.structure.also_from(tried.fits[0].fit.model)
+        (fitted,) = fit_structures([(structure, self.recordings)])
+        return FittedStructure(tried.structure, fitted.fit)
 
-    def tried(self, structures: Sequence[Structure]) -> list[_Tried]:
+    def tried(self, structures: Sequence[FinalStructure]) -> list[_Tried]:
         """Structures fitted to the training recordings, and validated."""
         train = self.state.problem.dataset.recordings
         parts = _without_each(train) if self.state.validation.folds else [joined(train)]
-        fits = fitted([(structure, part) for structure in structures for part in parts])
+        fits = fit_structures([(structure, part) for structure in structures for part in parts])
         tried = []
         for k, structure in enumerate(structures):
             own = fits[k * len(parts) : (k + 1) * len(parts)]
             if self.state.validation.folds:  # for each recording the fit without it
                 own = [own[i % len(parts)] for i in range(len(train))]
-            each = [structure.as_hypothesis(found) for found in own]
-            tried.append(_Tried(structure, own, _on_validation(structure, each, self.evaluation)))
+            each = [one.as_hypothesis() for one in own]
+            tried.append(_Tried(own, _on_validation(structure, each, self.evaluation)))
         return tried
 
     def without_needless_offsets(self, candidate: _Candidate) -> _Candidate:
@@ -224,11 +225,11 @@ class _LastFit:
         if self.evaluation.runs.compared or not offsets:
             return candidate
         self.state.say(f"  without {', '.join(map(str, offsets))}")
-        (tried,) = self.tried([structure.without(offsets, candidate.tried.fits[0])])
-        found = self.fitted_to_all(tried)
-        if self.runs_prefer(candidate.found, found):
+        (tried,) = self.tried([candidate.tried.fits[0].without(offsets)])
+        fitted = self.fitted_to_all(tried)
+        if self.runs_prefer(candidate.fitted.fit, fitted.fit):
             return candidate
-        fewer = candidate._replace(tried=tried, found=found, left_out=tuple(offsets))
+        fewer = candidate._replace(tried=tried, fitted=fitted, left_out=tuple(offsets))
         return candidate if isinstance(self.accepted(fewer), Refused) else fewer
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
@@ -244,35 +245,34 @@ class _LastFit:
         laws = laws_in_question(state, location, structure.on)
         if laws:
             state.say(f"  in the place of {location}: {', '.join(map(str, laws))}")
-        others = [structure.with_law(law, candidate.tried.fits[0]) for law in laws]
-        fits = fitted([(other, self.recordings) for other in others])
+        fits = fit_structures([(candidate.tried.fits[0].with_law(law), self.recordings) for law in laws])
         better = [
-            (found, other, law)
-            for found, other, law in zip(fits, others, laws, strict=True)
-            if state.is_plausible(other.as_hypothesis(found), law)
-            and self.runs_prefer(found, candidate.found)
+            (other, law)
+            for other, law in zip(fits, laws, strict=True)
+            if state.is_plausible(other.as_hypothesis(), law)
+            and self.runs_prefer(other.fit, candidate.fitted.fit)
         ]
-        for found, other, law in sorted(better, key=lambda each: each[0].cost):
-            (tried,) = self.tried([other])
+        for other, law in sorted(better, key=lambda each: each[0].fit.cost):
+            (tried,) = self.tried([other.structure])
             # As little as validation data may speak against the fit, they may against the law.
             before = (self.searched, candidate.tried.errors)
             if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in before):
-                replaced = [(p, law) for p in structure.on if p not in other.on]
-                return candidate._replace(tried=tried, found=found, laws=(*candidate.laws, *replaced))
+                replaced = [(p, law) for p in structure.on if p not in other.structure.on]
+                return candidate._replace(tried=tried, fitted=other, laws=(*candidate.laws, *replaced))
         return candidate
 
     def with_own_friction(self, candidate: _Candidate) -> _Candidate:
         """The same with dry friction of its own size in each run, if every run prefers that."""
         if log_error_ratio(candidate.tried.errors, self.searched) > MOST_WORSE:
             return candidate  # it would be refused for that
-        structure = candidate.tried.structure.with_own_friction(candidate.found)
+        structure = candidate.fitted.with_own_friction()
         if not (structure.friction and self.evaluation.runs.compared and len(self.recordings) > 1):
             return candidate
         self.state.say("  with friction of its own size in each run")
-        (found,) = fitted([(structure, self.recordings)])
-        if not self.runs_prefer(found, candidate.found, every=True):
+        (fitted,) = fit_structures([(structure, self.recordings)])
+        if not self.runs_prefer(fitted.fit, candidate.fitted.fit, every=True):
             return candidate
-        return candidate._replace(tried=candidate.tried._replace(structure=structure), found=found)
+        return candidate._replace(fitted=fitted)
 
     def runs_prefer(self, a: Fit, b: Fit, every: bool = False) -> bool:
         """Whether free runs of fit `a` leave a tenth less than those of `b`, beyond doubt.
@@ -305,21 +305,17 @@ class _LastFit:
             out.append(np.add.reduceat(each, block_edges(r.N, r.Ts)))
         return out
 
-    def hypotheses(
-        self, structure: Structure, found: Fit, recordings: Sequence[Recording]
-    ) -> list[Hypothesis]:
+    def hypotheses(self, fitted: FittedStructure, recordings: Sequence[Recording]) -> list[Hypothesis]:
         """A fit to all, for some recordings: one for each where friction belongs to runs."""
-        if not structure.friction:
-            return [structure.as_hypothesis(found)]
-        return [structure.as_hypothesis(found, self.runs.index(r)) for r in recordings]
+        return fitted.as_hypotheses([self.runs.index(r) for r in recordings])
 
-    def accepted(self, candidate: _Candidate) -> tuple[FinalFit, Structure] | Refused:
-        """The result with a candidate and its structure, or why its errors on validation data refuse it.
+    def accepted(self, candidate: _Candidate) -> tuple[FinalFit, FittedStructure] | Refused:
+        """The result with a candidate and its fit, or why its errors on validation data refuse it.
 
         The same fit without these data must not be clearly worse than that of the search, nor this fit.
         """
-        (structure, fits, trained), found, laws, left_out = candidate
-        seconds = self.state.validation.window_seconds
+        tried, fitted, laws, left_out = candidate
+        trained, seconds = tried.errors, self.state.validation.window_seconds
         if (ratio := log_error_ratio(trained, self.searched)) > MOST_WORSE:
             others = "the other recordings" if self.state.validation.folds else "the training recordings"
             return _refused(self.state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
@@ -327,39 +323,39 @@ class _LastFit:
         # Without their offsets it may be worse by more.
         if self.evaluation.runs.compared and len(self.recordings) > 1:
             # What most runs have in common may be far from what a run of validation data has.
-            options = [structure.with_common_offsets(found), (structure, found)]
+            options = [fitted.with_common_offsets(), fitted]
         else:
-            options = [(_with_offsets_that_help(structure, fits, self.evaluation), found)]
+            options = [FittedStructure(_with_offsets_that_help(tried, self.evaluation), fitted.fit)]
         validation = self.evaluation.validation
-        for structure, found in options:
-            each = self.hypotheses(structure, found, validation.problem.dataset.recordings)
-            errors = errors_as_trained(validation, each, structure.on)
+        for fitted in options:
+            each = self.hypotheses(fitted, validation.problem.dataset.recordings)
+            errors = errors_as_trained(validation, each, fitted.structure.on)
             carried = log_error_ratio(errors, self.carried_over)
             if carried <= MOST_WORSE:
                 break
-        own = log_error_ratio(_on_validation(structure, each, self.evaluation), self.searched)
+        own = log_error_ratio(_on_validation(fitted.structure, each, self.evaluation), self.searched)
         if carried > MOST_WORSE or own > WINDOWS_APART:
             worse = _worse(carried if carried > MOST_WORSE else own, seconds)
             return _refused(self.state, f"{worse}, although it was fitted to them")
         made = FinalFit(
-            fit=found,
+            fit=fitted.fit,
             recordings=self.recordings,
-            model=structure.carried(found),
+            model=fitted.model,
             trained=trained,
             searched=self.searched,
             laws=laws,
-            friction=structure.friction,
+            friction=fitted.structure.friction,
             left_out=left_out,
         )
-        return made, structure
+        return made, fitted
 
-    def tested(self, made: FinalFit, structure: Structure) -> FinalFit:
+    def tested(self, made: FinalFit, fitted: FittedStructure) -> FinalFit:
         """A final fit with its errors on recordings that had no say, if there are any."""
         test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
         if not test:
             return made
-        each = self.hypotheses(structure, made.fit, test.problem.dataset.recordings)
-        own = structure.own_values(made.fit, len(self.recordings))
+        structure, own = fitted.structure, fitted.own_values(len(self.recordings))
+        each = self.hypotheses(fitted, test.problem.dataset.recordings)
         # Of one run alone, validation data have said already whether its own offsets do any good.
         of_runs = structure.own if self.runs.compared else ()
         errors = errors_on_test(test, each, own, structure.on, self.runs, of_runs)
@@ -367,12 +363,11 @@ class _LastFit:
         return dataclasses.replace(made, test=errors, test_calibrated=calibrated)
 
 
-def _with_offsets_that_help(structure: Structure, fits: Sequence[Fit], evaluation: Evaluation) -> Structure:
+def _with_offsets_that_help(tried: _Tried, evaluation: Evaluation) -> FinalStructure:
     """The structure that carries over the offsets with which runs of validation data are better."""
-    each = [structure.as_hypothesis(found) for found in fits]
+    each, structure = [fitted.as_hypothesis() for fitted in tried.fits], tried.structure
     for location in structure.own:
-        left = tuple(p for p in structure.own if p != location)
-        more = dataclasses.replace(structure, own=left, on=(*structure.on, location))
+        more = structure.carrying(location)
         errors = (errors_as_trained(evaluation.validation, each, s.on) for s in (more, structure))
         if log_error_ratio(*errors) < 0:
             structure = more
@@ -391,7 +386,9 @@ def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
     return [[train[k] for k in each if k % folds != fold] for fold in range(folds)]
 
 
-def _on_validation(structure: Structure, trained: Sequence[Hypothesis], evaluation: Evaluation) -> RunErrors:
+def _on_validation(
+    structure: FinalStructure, trained: Sequence[Hypothesis], evaluation: Evaluation
+) -> RunErrors:
     """Errors on validation recordings of one hypothesis or one for each, with own offsets if these count."""
     validation, seconds = evaluation.validation, evaluation.calibrate_seconds
     if not seconds:

@@ -1,6 +1,6 @@
-"""What a last fit fits: effects, parameters of recordings of their own, the starts, and the fits themselves.
+"""What the final fit fits: effects, the parameters that each recording has for itself, where fits start.
 
-Fits are to free runs over windows that start from what their first samples show.
+The fits are to free runs over windows that start from what their first samples show.
 """
 
 import dataclasses
@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from rotflex_jax.discover.batched_predictor import on_threads
 from rotflex_jax.discover.hypothesis import Hypothesis, replacing, usual_start, without
-from rotflex_jax.discover.in_place import other_laws
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.fit.greybox import fit
@@ -25,11 +24,12 @@ from rotflex_jax.runtime.xla import mesh_of
 
 
 @dataclasses.dataclass(frozen=True)
-class Structure:
+class FinalStructure:
     """What is fitted.
 
     Attributes:
-        starts: Models from which fits start, with the calibrations of the recordings.
+        starts: Models from which fits start, with the calibrations of the recordings; the last one has usual
+            values.
         local: Parameters that each recording has for itself.
         own: Calibrations that are not carried over to other recordings.
         on: What is on in the model that a user gets.
@@ -56,19 +56,24 @@ class Structure:
         h: Hypothesis,
         on: Sequence[EffectLocation],
         window_seconds: float,
-        *more_starts: Float[np.ndarray, " P"],
-    ) -> "Structure":
+        usual_shapes: bool = True,
+    ) -> "FinalStructure":
         """The structure of a hypothesis.
+
+        Fits start from its parameters and from usual ones.
 
         Args:
             s: What it is a hypothesis of.
             solver: Integration rule.
-            h: The hypothesis; fits start from its parameters.
+            h: The hypothesis.
             on: What is on in the model that a user gets.
             window_seconds: Length of free runs [s].
-            more_starts: Values of all parameters to start from besides.
+            usual_shapes: Whether fits start besides from its amplitudes with usual shapes.
         """
-        values = {tuple(v.tolist()): v for v in (h.mean_values(s), *more_starts)}
+        given = [h.mean_values(s), _values_as_given(s, h)]
+        if usual_shapes:
+            given.insert(1, _values_with_usual_shapes(s, h))
+        values = {tuple(v.tolist()): v for v in given}
         starts = tuple(Model(s.clean(v, h.locations), solver) for v in values.values())
         free = starts[0].mechanism.free_names
         local = [s.mechanism.parameter_names[i] for i in h.local]
@@ -76,64 +81,95 @@ class Structure:
         local = tuple(n for n in local if n in free)
         return cls(starts, local, own, tuple(on), h, s, window_seconds)
 
-    def with_law(self, law: EffectLocation, found: Fit) -> "Structure":
+    @property
+    def solver(self) -> Solver:
+        """Integration rule."""
+        return self.starts[0].solver
+
+    def also_from(self, start: Model) -> "FinalStructure":
+        """The same with a further start."""
+        return dataclasses.replace(self, starts=(*self.starts, start))
+
+    def carrying(self, *locations: EffectLocation) -> "FinalStructure":
+        """The same where the model that a user gets has these calibrations of the recordings."""
+        own = tuple(p for p in self.own if p not in locations)
+        return dataclasses.replace(self, own=own, on=(*self.on, *locations))
+
+
+@dataclasses.dataclass(frozen=True)
+class FittedStructure:
+    """A structure, and a fit of it to recordings."""
+
+    structure: FinalStructure
+    fit: Fit
+
+    def with_law(self, law: EffectLocation) -> FinalStructure:
         """The structure with a law in the place of all others of the same thing at its port.
+
+        The first start has the values of the fit, and the law keeps those of parameters of the same name; the
+        second start is that of a user.
 
         Args:
             law: It takes their place; a candidate at the port.
-            found: A fit of this structure to training recordings. Its values are the first start, and the law
-                keeps those of parameters of the same name; the second start is that of a user.
         """
-        s = self.supermodel
-        replaced = [p for p in self.on if p in other_laws(s, law)]
-        h = replacing(s, self.as_hypothesis(found), replaced, usual_start(s, law), 1.0)
-        on = list(dict.fromkeys(law if p in replaced else p for p in self.on))
-        return Structure.of(s, self.starts[0].solver, h, on, self.window_seconds, as_given(s, h))
+        this, s = self.structure, self.structure.supermodel
+        replaced = [p for p in this.on if p in s.other_laws(law)]
+        h = replacing(s, self.as_hypothesis(), replaced, usual_start(s, law), 1.0)
+        on = list(dict.fromkeys(law if p in replaced else p for p in this.on))
+        return FinalStructure.of(s, this.solver, h, on, this.window_seconds, usual_shapes=False)
 
-    def without(self, left_out: Sequence[EffectLocation], found: Fit) -> "Structure":
-        """The structure without some effects; it starts from a fit with them."""
-        h = self.as_hypothesis(found)
+    def without(self, left_out: Sequence[EffectLocation]) -> FinalStructure:
+        """The structure without some effects; starts are this fit, which has them, and usual values."""
+        this, h = self.structure, self.as_hypothesis()
         for location in left_out:
-            h = without(self.supermodel, h, location)
-        on = [p for p in self.on if p not in left_out]
-        more = as_given(self.supermodel, h)
-        return Structure.of(self.supermodel, self.starts[0].solver, h, on, self.window_seconds, more)
+            h = without(this.supermodel, h, location)
+        on = [p for p in this.on if p not in left_out]
+        return FinalStructure.of(this.supermodel, this.solver, h, on, this.window_seconds, usual_shapes=False)
 
-    def with_own_friction(self, found: Fit) -> "Structure":
-        """The structure with dry friction of its own size in each recording; it starts from a fit without."""
-        m, sizes = found.model.mechanism, []
+    def with_own_friction(self) -> FinalStructure:
+        """The structure with dry friction of its own size in each recording; it starts from this fit."""
+        m, sizes, this = self.fit.model.mechanism, list[str](), self.structure
         units = {n: spec.unit for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)}
         for effect in [e for e in m.effects if e.law_of == DRY_FRICTION]:
             names = [f"{effect.at}.{effect.name}.{amplitude}" for amplitude in effect.amplitudes]
             sizes += [n for n in names if n in m.free_names and units[n] == units[names[0]]]
-        starts = (found.model, self.starts[-1])
-        return dataclasses.replace(self, starts=starts, local=(*self.local, *sizes), friction=tuple(sizes))
+        starts = (self.fit.model, this.starts[-1])
+        return dataclasses.replace(this, starts=starts, local=(*this.local, *sizes), friction=tuple(sizes))
 
-    def as_hypothesis(self, found: Fit, run: int | None = None) -> Hypothesis:
-        """A fit in the terms of the search, what recordings have for themselves at its mean.
+    def as_hypothesis(self, run: int | None = None) -> Hypothesis:
+        """The fit in the terms of the search, what recordings have for themselves at its mean.
 
         Args:
-            found: The fit.
             run: Which of the fitted recordings the friction is of, where each has its own; None for the mean.
         """
-        s, m = self.supermodel, found.model.mechanism
+        s, h, m = self.structure.supermodel, self.structure.hypothesis, self.fit.model.mechanism
         if run is not None:
-            m = m.with_values({n: found.local[n][run].value for n in self.friction})
+            m = m.with_values({n: self.fit.local[n][run].value for n in self.structure.friction})
         rows = [s.mechanism.parameter_names.index(n) for n in m.parameter_names]
-        z = self.hypothesis.z.copy()
+        z = h.z.copy()
         z[rows] = Transform.of(m.parameter_specifications).unconstrain(m.values)
-        local_z = np.tile(z[list(self.hypothesis.local)], (len(self.hypothesis.x0), 1))
-        return dataclasses.replace(self.hypothesis, z=z, local_z=local_z)
+        return dataclasses.replace(h, z=z, local_z=np.tile(z[list(h.local)], (len(h.x0), 1)))
 
-    def own_values(self, found: Fit, count: int) -> Float[np.ndarray, "K L"]:
+    def as_hypotheses(self, runs: Sequence[int | None]) -> list[Hypothesis]:
+        """The same for some recordings: one for each where friction belongs to runs, else one for all.
+
+        Args:
+            runs: Which of the fitted recordings each is a run of; None where it is of none.
+        """
+        if not self.structure.friction:
+            return [self.as_hypothesis()]
+        return [self.as_hypothesis(run) for run in runs]
+
+    def own_values(self, count: int) -> Float[np.ndarray, "K L"]:
         """Unconstrained values of the local parameters of the search in each of the fitted recordings."""
-        s, m = self.supermodel, found.model.mechanism
+        s, m = self.structure.supermodel, self.fit.model.mechanism
         transform = Transform.of(m.parameter_specifications)
-        z = np.array([transform.unconstrain(found.model_of(k).mechanism.values) for k in range(count)])
-        return z[:, [m.parameter_names.index(s.mechanism.parameter_names[i]) for i in self.hypothesis.local]]
+        z = np.array([transform.unconstrain(self.fit.model_of(k).mechanism.values) for k in range(count)])
+        names = (s.mechanism.parameter_names[i] for i in self.structure.hypothesis.local)
+        return z[:, [m.parameter_names.index(n) for n in names]]
 
-    def with_common_offsets(self, found: Fit) -> tuple["Structure", Fit]:
-        """The structure that carries over what runs have in common of their offsets, and the fit with that.
+    def with_common_offsets(self) -> "FittedStructure":
+        """The same, carrying over what runs have in common of their offsets.
 
         The offset of a run is that of the machine plus a deviation of the run. By the values of K runs, with
         mean m and variance s^2 (of K - 1 degrees of freedom), that of the machine is estimated as
@@ -148,69 +184,34 @@ class Structure:
         Source: after B. Efron and C. Morris, "Stein's estimation rule and its competitors - an empirical
         Bayes approach", Journal of the American Statistical Association 68 (1973) 117-130.
         """
-        s, common, carried = self.supermodel, dict[str, Estimate](), list[EffectLocation]()
-        for location in self.own:
+        s, common, carried = self.structure.supermodel, dict[str, Estimate](), list[EffectLocation]()
+        for location in self.structure.own:
             names = [s.mechanism.parameter_names[i] for i in s.parameter_indices(location)]
-            shared = {n: _common(found.local[n]) for n in names if n in found.local}
+            shared = {n: _common(self.fit.local[n]) for n in names if n in self.fit.local}
             if any(e.value for e in shared.values()):
                 common |= shared
                 carried.append(location)
-        left = tuple(p for p in self.own if p not in carried)
-        mechanism = found.model.mechanism.with_values({n: e.value for n, e in common.items()})
+        model = self.fit.model
+        mechanism = model.mechanism.with_values({n: e.value for n, e in common.items()})
         found = dataclasses.replace(
-            found,
-            model=dataclasses.replace(found.model, mechanism=mechanism),
-            parameters=tuple(common.get(e.name, e) for e in found.parameters),
+            self.fit,
+            model=dataclasses.replace(model, mechanism=mechanism),
+            parameters=tuple(common.get(e.name, e) for e in self.fit.parameters),
         )
-        return dataclasses.replace(self, own=left, on=(*self.on, *carried)), found
+        return FittedStructure(self.structure.carrying(*carried), found)
 
-    def carried(self, found: Fit) -> Model:
-        """The model of a fit without what belongs to the recordings that were fitted."""
-        m = found.model.mechanism
-        for location in self.own:
+    @property
+    def model(self) -> Model:
+        """The model of the fit without what belongs to the recordings that were fitted."""
+        m = self.fit.model.mechanism
+        for location in self.structure.own:
             m = m.without(*location)
-        return dataclasses.replace(found.model, mechanism=m)
+        return dataclasses.replace(self.fit.model, mechanism=m)
 
 
-def _common(of_runs: Sequence[Estimate]) -> Estimate:
-    """What runs have in common by the estimates of each; see `Structure.with_common_offsets`.
-
-    Its interval has the width of that of their mean, by how they differ.
-    """
-    values = [e.value for e in of_runs]
-    count, mean = len(values), float(np.mean(values))
-    std = float(np.std(values, ddof=1)) / np.sqrt(count)
-    value = mean * max(0.0, 1.0 - (std / mean) ** 2) if mean else 0.0
-    half = float(scipy.special.stdtrit(count - 1, 0.975)) * std
-    note = "common to runs with " + ", ".join(f"{v:.3g}" for v in values)
-    return dataclasses.replace(of_runs[0], value=value, std=std, ci95=(value - half, value + half), note=note)
-
-
-def with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
-    """Parameter values with amplitudes in the unit of an effect's first parameter as fitted, others as usual.
-
-    An effect without such an amplitude is left as it is.
-    """
-    values, specs = h.mean_values(s), s.mechanism.parameter_specifications
-    for location in s.without_calibrations(h.locations):
-        candidate, indices = s.candidates[location], s.parameter_indices(location)
-        sizes = np.array([specs[i].unit for i in indices]) == specs[indices[0]].unit
-        kept = np.asarray(candidate.amplitudes) & sizes
-        if kept.any():
-            values[indices] = np.where(kept, values[indices], np.array(candidate.probes[0][0]))
-    return values
-
-
-def as_given(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
-    """Values of the user's model as given and usual ones of what was found; calibrations as fitted."""
-    values, given = h.mean_values(s), list(s.baseline_free)
-    values[given] = s.mechanism.values[given]
-    for location in s.without_calibrations(h.locations):
-        values[s.parameter_indices(location)] = np.array(s.candidates[location].probes[0][0])
-    return values
-
-
-def fitted(asked: Sequence[tuple[Structure, Sequence[Recording]]]) -> list[Fit]:
+def fit_structures(
+    asked: Sequence[tuple[FinalStructure, Sequence[Recording]]],
+) -> list[FittedStructure]:
     """Structures fitted to free runs of recordings, each the likelier of the ends from its starts.
 
     Parameters of predictions may lead to another local minimum of free runs than usual ones: to stiff,
@@ -231,4 +232,43 @@ def fitted(asked: Sequence[tuple[Structure, Sequence[Recording]]]) -> list[Fit]:
     ends: list[list[Fit]] = [[] for _ in asked]
     for (k, _), found in zip(jobs, fits, strict=True):
         ends[k].append(found)
-    return [min(each, key=lambda found: float(np.nan_to_num(found.cost, nan=np.inf))) for each in ends]
+    best = [min(each, key=lambda found: float(np.nan_to_num(found.cost, nan=np.inf))) for each in ends]
+    return [FittedStructure(structure, found) for (structure, _), found in zip(asked, best, strict=True)]
+
+
+def _common(of_runs: Sequence[Estimate]) -> Estimate:
+    """What runs have in common by the estimates of each; see `Structure.with_common_offsets`.
+
+    Its interval has the width of that of their mean, by how they differ.
+    """
+    values = [e.value for e in of_runs]
+    count, mean = len(values), float(np.mean(values))
+    std = float(np.std(values, ddof=1)) / np.sqrt(count)
+    value = mean * max(0.0, 1.0 - (std / mean) ** 2) if mean else 0.0
+    half = float(scipy.special.stdtrit(count - 1, 0.975)) * std
+    note = "common to runs with " + ", ".join(f"{v:.3g}" for v in values)
+    return dataclasses.replace(of_runs[0], value=value, std=std, ci95=(value - half, value + half), note=note)
+
+
+def _values_with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
+    """Parameter values with amplitudes in the unit of an effect's first parameter as fitted, others as usual.
+
+    An effect without such an amplitude is left as it is.
+    """
+    values, specs = h.mean_values(s), s.mechanism.parameter_specifications
+    for location in s.without_calibrations(h.locations):
+        candidate, indices = s.candidates[location], s.parameter_indices(location)
+        sizes = np.array([specs[i].unit for i in indices]) == specs[indices[0]].unit
+        kept = np.asarray(candidate.amplitudes) & sizes
+        if kept.any():
+            values[indices] = np.where(kept, values[indices], np.array(candidate.probes[0][0]))
+    return values
+
+
+def _values_as_given(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
+    """Values of the user's model as given and usual ones of what was found; calibrations as fitted."""
+    values, given = h.mean_values(s), list(s.baseline_free)
+    values[given] = s.mechanism.values[given]
+    for location in s.without_calibrations(h.locations):
+        values[s.parameter_indices(location)] = np.array(s.candidates[location].probes[0][0])
+    return values

@@ -26,15 +26,7 @@ from rotflex_jax.discover.stepwise import titled
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.labels import law_of
 from rotflex_jax.parameters import bound_reached
-
-
-def other_laws(s: SuperModel, location: EffectLocation) -> list[EffectLocation]:
-    """Candidates at the port of an effect that are laws of the same thing."""
-    law = law_of(location.effect)
-    at_port = (p for p in s.candidates if p.port == location.port and p != location)
-    return [p for p in at_port if law and law_of(p.effect) == law]
 
 
 def laws_in_question(
@@ -53,7 +45,7 @@ def laws_in_question(
     if location not in state.scores:
         return []
     contains = CATALOG[location.effect].contains
-    laws = [p for p in other_laws(state.problem.supermodel, location) if p not in on]
+    laws = [p for p in state.problem.supermodel.other_laws(location) if p not in on]
     remaining = [p for p in state.rivals.get(location, []) if p.effect not in contains]
     return [p for p in laws if p in remaining or location.effect in CATALOG[p.effect].contains]
 
@@ -71,7 +63,7 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
     for location in list(state.scores):
         if location not in state.current.hypothesis.locations:  # from the start, or by a law that contains it
             continue
-        laws = [p for p in other_laws(s, location) if p not in state.current.hypothesis.locations]
+        laws = [p for p in s.other_laws(location) if p not in state.current.hypothesis.locations]
         known = _as_found(state, location)
         fitted = _in_place(state, location, laws)
         better = [v for v in fitted if better_in_place(v, known, state.problem.dataset.data)]
@@ -125,7 +117,7 @@ def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLoca
     left = nats_left(state.horizons.prediction, final)
     remaining = {}
     for location in [p for p in found if p in final.hypothesis.locations]:
-        wanted = dict.fromkeys([*other_laws(s, location), *state.rivals[location]])
+        wanted = dict.fromkeys([*s.other_laws(location), *state.rivals[location]])
         rivals = [p for p in wanted if p not in final.hypothesis.locations]
         known = _as_found(state, location)
         fitted = _in_place(state, location, [p for p in rivals if not CATALOG[p.effect].line])

@@ -16,6 +16,7 @@ from jaxtyping import Float, Shaped
 from rotflex_jax.checks import entries, shown
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import Effect, Scale
+from rotflex_jax.effects.labels import law_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.plausibility import motion
 from rotflex_jax.mechanism import Mechanism
@@ -270,6 +271,12 @@ class SuperModel:
     def without_calibrations(self, locations: Iterable[EffectLocation]) -> frozenset[EffectLocation]:
         """The effects among some that a search may find."""
         return frozenset(locations) - set(self.calibrations)
+
+    def other_laws(self, location: EffectLocation) -> list[EffectLocation]:
+        """Candidates at the port of an effect that are laws of the same thing."""
+        law = law_of(location.effect)
+        at_port = (p for p in self.candidates if p.port == location.port and p != location)
+        return [p for p in at_port if law and law_of(p.effect) == law]
 
     def gates(self, switched_on: Iterable[EffectLocation]) -> Float[np.ndarray, " E"]:
         """One where an effect is on: those of the baseline and those named; not to be written to."""

@@ -48,7 +48,8 @@ class Assessment:
     """What the verdict rests on.
 
     Attributes:
-        explained: Channel -> share of the baseline's squared error that the final model explains [%].
+        explained: Channel -> share of the baseline's squared error that the final model explains [%]; not a
+            number where runs of the baseline diverge or have no error.
         remaining: Channel -> error of short runs that is left, in multiples of the sensor noise.
         torque_nats: What random torques still gain per measured value [nat]; 0 where the model is right.
     """
@@ -145,10 +146,8 @@ def assess(
     >>> end = assess({"theta": 0.1}, {"theta": 0.002}, {"theta": 0.001}, 5.0, 1000)
     >>> round(end.explained["theta"], 2), end.remaining, end.is_explained, end.grade
     (99.96, {'theta': 2.0}, False, <Grade.NEAR: 'near'>)
-    >>> assess({"theta": math.inf}, {"theta": 0.002}, {"theta": 0.001}, 5.0, 1000).explained_text
-    ''
     """
-    # Of a baseline whose runs diverge there is no share.
+    # There is no share where runs of the baseline diverge or have no error.
     shares = {c: 100 * (1 - (after[c] / e) ** 2) if 0 < e < math.inf else math.nan for c, e in before.items()}
     values = samples * max(1, len(floor))
     remaining = {c: ratio(after[c], floor.get(c)) for c in after}

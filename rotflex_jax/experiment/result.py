@@ -44,7 +44,7 @@ def voltage_file(
     return write_file(path, text.getvalue())
 
 
-def plain_limits(limits: Limits) -> dict[str, float | None]:
+def json_limits(limits: Limits) -> dict[str, float | None]:
     """Limits as plain JSON, None where there is none."""
     return json_numbers(dataclasses.asdict(limits))
 
@@ -162,7 +162,7 @@ class Experiment:
             "expected": self.chosen.to_dict(),
             "table": [r.to_dict() for r in self.table],
             "effects": self.numbers,
-            "limits": plain_limits(self.limits),
+            "limits": json_limits(self.limits),
             "noise": self.noise,
             "notes": list(self.notes),
         }
@@ -254,7 +254,7 @@ class Segment:
             "peaks": dict(self.peaks),
             "table": [{"input": k, "setting": s, "nats": n} for k, s, n in self.table],
             "tried": self.tried,
-            "limits": plain_limits(self.limits),
+            "limits": json_limits(self.limits),
         }
 
     def __str__(self) -> str:
@@ -368,7 +368,7 @@ class SequentialResult:
             "seconds": self.seconds,
             "max_seconds": self.max_seconds,
             "history": [s.to_dict() for s in self.history],
-            "limits": plain_limits(self.limits),
+            "limits": json_limits(self.limits),
             "notes": list(self.notes),
         }
 

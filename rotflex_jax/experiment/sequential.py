@@ -19,7 +19,7 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE, rival_set
-from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, plain_limits
+from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, json_limits
 from rotflex_jax.experiment.rig import checked_limits
 from rotflex_jax.experiment.rival_set import RivalPosterior, RivalSet, RunData
 from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
@@ -182,7 +182,7 @@ class SequentialExperiment:
             "Ts": r.Ts,
             "noise": dict(zip(r.structure.channels, r.noise.tolist(), strict=True)),
             "process_noise": dict(r.process_noise),
-            "settings": dataclasses.asdict(self.settings) | {"limits": plain_limits(self.settings.limits)},
+            "settings": dataclasses.asdict(self.settings) | {"limits": json_limits(self.settings.limits)},
             "prior": self.prior.tolist(),
             "runs": [{"u": x.u.tolist(), "y": x.y.tolist()} for x in self.runs],
             "unknowns": [x.tolist() for x in self.unknowns],

@@ -169,7 +169,7 @@ def geared_step(
     def in_contact() -> Array:
         return with_rows(advance(x, c, None), {k + 1: jnp.zeros_like(r)})
 
-    def meeting() -> Array:
+    def with_change_of_contact() -> Array:
         impact = _impact(r, s, in_flight[k], in_flight[k + 1], stop, impacts, c)
         moments = jnp.where(impacts[None], impact.moments, 0.0)
         moments = jnp.where(separation.separates[None], separation.moments, moments)
@@ -183,10 +183,11 @@ def geared_step(
         angle = jnp.where(rests, stop, jnp.where(end[k] > gap, gap, jnp.where(end[k] < -gap, -gap, end[k])))
         return with_rows(end, {k: angle, k + 1: jnp.where(rests, 0.0, end[k + 1])})
 
-    # Most steps are all in contact or all in flight. Each way through a step is compiled once: they are long.
-    meets = ~stays & (impacts | separation.separates)
-    elsewhere = shortcut(lambda: (~meets, lambda: in_flight), meeting)
-    return jnp.where(stays[None], shortcut(lambda: (~stays, lambda: elsewhere), in_contact), elsewhere)
+    # Most steps are all in contact or all in flight. Each result is selected where it holds: a branch is
+    # computed if any of the states side by side needs it, and stands in the program once.
+    changes = ~stays & (impacts | separation.separates)
+    apart = shortcut(lambda: (~changes, lambda: in_flight), with_change_of_contact)
+    return jnp.where(stays[None], shortcut(lambda: (~stays, lambda: apart), in_contact), apart)
 
 
 class Separation(NamedTuple):

@@ -14,8 +14,8 @@ from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, mi
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
-# Segments that arrays of one call have place for at least; those that are not there take no time.
-LEAST_SEGMENTS_PER_CALL = 64
+# Rows of the arrays of a call at least: calls with fewer segments share one program.
+LEAST_ROWS = 64
 # Increment of a state for a difference quotient.
 DIFFERENCE = 1e-6
 # Evaluations of one segment at most.
@@ -78,9 +78,10 @@ def _fitted_states(
 ) -> Array:
     """Positions and speeds (W, m) with the least squared error, each of the first `count` segments by itself.
 
-    Segments follow on each other: each ends where it has converged, and a step takes a quick way where its
-    own few runs allow that. Slopes are difference quotients: segments are short, and the derivative of the
-    simulation would take longer to compile than all the runs take.
+    They are fitted one after another: each stops where it has converged, and a shortcut through a step has
+    to suffice for the runs of one segment only. Rows from `count` on return their guess. Slopes are
+    difference quotients: segments are short, and the derivative of the simulation would take longer to
+    compile than all the runs take.
     """
     m = guess.shape[1]
     increments = jnp.concatenate([jnp.zeros((1, m)), DIFFERENCE * jnp.eye(m)])
@@ -131,8 +132,8 @@ def initial_states(
         rest = rest_state(structure, np.float64)[2 * Layout.of(structure).n :]
         hidden = np.tile(rest, (len(u), 1))
     guess = rough_states(structure, y, Ts)
-    # Filled up with copies of the last, so that few numbers of segments are compiled for.
-    rows = np.minimum(np.arange(max(LEAST_SEGMENTS_PER_CALL, 2 ** (len(u) - 1).bit_length())), len(u) - 1)
+    # Rows beyond the segments are not evaluated; with them few shapes are compiled for.
+    rows = np.minimum(np.arange(max(LEAST_ROWS, 2 ** (len(u) - 1).bit_length())), len(u) - 1)
     with double_precision():
         segments = map(jnp.asarray, (guess[rows], hidden[rows], u[rows], y[rows], np.float64(Ts)))
         parameters = map(jnp.asarray, (mechanism.values, gates))

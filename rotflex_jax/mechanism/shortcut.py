@@ -26,7 +26,7 @@ def shortcut(quick: Callable[[], tuple[Bool[Array, "*S"], Way]], general: Way) -
 
     Args:
         quick: Gives where the quick way leads to the result of the general one, and that way.
-        general: The general way; right everywhere.
+        general: The general way; right wherever the result is used.
     """
     if not _tracing.shortcuts:
         return general()

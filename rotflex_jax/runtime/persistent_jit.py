@@ -58,6 +58,7 @@ FOLDER_VARIABLE = "ROTFLEX_PROGRAMS"
 # With these settings JAX does more at each call than run a program.
 _WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
 _FOR_COMPILER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+# What XLA takes by itself.
 _FULL_LEVEL = 3
 _programs: list["PersistentJit"] = []
 # Programs held in memory, that used last at the end: each takes some 14 MB, and loading it again 0.1 s. Where
@@ -135,9 +136,9 @@ class PersistentJit:
     Args:
         function: Pure; a function of a module of this package that returns arrays, in tuples or named tuples.
         static: How many of the first arguments are static.
-        optimisation_level: That of LLVM. For loops over samples level 1 is as good as 3 and compiles in four
-            fifths of the time, slopes apart, which want 3. Level 0 is for large programs that run a few
-            times: half of the time to compile, runs of simple loops that are five to ten times as long.
+        optimisation_level: Of LLVM. At level 1 loops over samples run as fast as at level 3 and compile in
+            four fifths of the time; runs with slopes need level 3. Level 0 is for large programs that run a
+            few times: they compile in half of the time, and loops take five to ten times as long.
     """
 
     def __init__(

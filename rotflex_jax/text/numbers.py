@@ -1,4 +1,4 @@
-"""Numbers, units and equations as they are printed; text of others made harmless for a terminal."""
+"""Numbers, units and equations as they are printed or go into JSON; text of others made harmless."""
 
 import math
 import re
@@ -96,16 +96,16 @@ def plain_number(value: float | None, digits: int = 3) -> str:
 
 
 def json_number(value: float) -> float | None:
-    """A number that JSON can carry; None where it is infinite or none.
+    """A number that JSON can carry; None where it is infinite or not a number.
 
-    >>> json_number(0.5), json_number(float("inf"))
-    (0.5, None)
+    >>> json_number(0.5), json_number(float("inf")), json_number(float("nan"))
+    (0.5, None, None)
     """
     return float(value) if math.isfinite(value) else None
 
 
 def json_numbers(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Several by their names, as `json_number`."""
+    """The values of a mapping, each as `json_number` gives it."""
     return {name: json_number(value) for name, value in values.items()}
 
 
