@@ -1,4 +1,4 @@
-"""Innovations and their slopes for several parameter sets in one call."""
+"""Innovations and their slopes for several parameter sets, side by side on threads."""
 
 import dataclasses
 import functools
@@ -26,11 +26,6 @@ from rotflex_jax.models.model import program_length
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import cores, double_precision
 
-# Parameter sets per call for values alone, where further ones cost nearly nothing. Slopes run one set a call:
-# their directions fill the vector units, so more sets would only take longer to compile.
-PARAMETER_SETS_PER_CALL = 4
-
-
 # Windows of a program, at least.
 LEAST_WINDOWS = 16
 
@@ -52,7 +47,7 @@ class ProgramSamples(NamedTuple):
 
 
 class ParameterSet(NamedTuple):
-    """What one hypothesis runs with on all recordings; stacked, a leading axis is added.
+    """What one hypothesis runs with on all recordings.
 
     Attributes:
         values: Parameter values of each recording.
@@ -61,10 +56,10 @@ class ParameterSet(NamedTuple):
         K: Gains of the predictor.
     """
 
-    values: Float[Any, "*L R P"]
-    x0: Float[Any, "*L R W m"]
-    gates: Float[Any, "*L E"]
-    K: Float[Any, "*L R n C"]
+    values: Float[Any, "R P"]
+    x0: Float[Any, "R W m"]
+    gates: Float[Any, " E"]
+    K: Float[Any, "R n C"]
 
 
 class Directions(NamedTuple):
@@ -89,16 +84,12 @@ class Directions(NamedTuple):
 def _innovations(
     structure: Mechanism,
     solver: Solver,
-    parameter_sets: ParameterSet,
+    p: ParameterSet,
     samples: ProgramSamples,
 ) -> jax.Array:
     data, window, count = samples
-
-    def one(p: ParameterSet) -> jax.Array:
-        y_hat = predicted(structure, solver, p.values, p.x0, p.gates, data, p.K, window, count.max())
-        return jnp.where(data.seen[:, :, None] > 0, data.y - y_hat, 0.0)
-
-    return jax.vmap(one)(parameter_sets)
+    y_hat = predicted(structure, solver, p.values, p.x0, p.gates, data, p.K, window, count.max())
+    return jnp.where(data.seen[:, :, None] > 0, data.y - y_hat, 0.0)
 
 
 @persistent_jit(static=2)
@@ -133,12 +124,6 @@ def _slopes(
         return e[None], J[:, None]
     e, J = jax.lax.map(lambda row: one(*row), rows)
     return e, jnp.swapaxes(J, 0, 1)
-
-
-def _stacked(parameter_sets: list[ParameterSet]) -> ParameterSet:
-    """Leading axis over parameter sets; a short batch is filled up with copies of its last one."""
-    full = parameter_sets + [parameter_sets[-1]] * (PARAMETER_SETS_PER_CALL - len(parameter_sets))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *full)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,21 +184,17 @@ class BatchedPredictor:
         It is called on the thread that has run the program.
         """
 
-        def run(job: tuple[ReducedModel, list[int]]) -> list[Used]:
-            model, indices = job
+        def run(job: tuple[ReducedModel, int]) -> Used:
+            model, i = job
             with double_precision():
-                batch = _stacked([self.restrict(parameter_sets[i], model) for i in indices])
-                e = _innovations(model.mechanism.structure, self.solver, batch, self.on_device(window))
-            return [use(i, x[:, : window.shape[1]]) for i, x in zip(indices, np.asarray(e), strict=False)]
+                inputs = self.restrict(parameter_sets[i], model)
+                e = _innovations(model.mechanism.structure, self.solver, inputs, self.on_device(window))
+            return use(i, np.asarray(e)[:, : window.shape[1]])
 
-        size = PARAMETER_SETS_PER_CALL
-        jobs: list[tuple[ReducedModel, list[int]]] = []
-        for model, indices in self._by_structure([p.gates for p in parameter_sets]):
-            jobs += [(model, indices[i : i + size]) for i in range(0, len(indices), size)]
+        grouped = self._by_structure([p.gates for p in parameter_sets])
+        jobs = [(model, i) for model, indices in grouped for i in indices]
         results = self.run_jobs(run, jobs, lambda job: ("innovations", job[0].effects))
-        found: dict[int, Used] = {}
-        for (_, indices), used in zip(jobs, results, strict=True):
-            found.update(zip(indices, used, strict=True))
+        found = {i: used for (_, i), used in zip(jobs, results, strict=True)}
         return [found[i] for i in range(len(parameter_sets))]
 
     def slopes(
@@ -300,8 +281,8 @@ class BatchedPredictor:
 def on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
     """Results of independent calls, on as many threads as there are cores.
 
-    A scan keeps one core busy however many parameter sets it carries; compiled code runs outside of Python's
-    lock. Where one call fails, those that have begun end before its error is raised.
+    A scan keeps one core busy; compiled code runs outside of Python's lock. Where one call fails, those that
+    have begun end before its error is raised.
 
     Args:
         run: What to call; no two calls may run a program that spreads over devices. What several calls need
