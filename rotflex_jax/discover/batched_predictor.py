@@ -191,11 +191,8 @@ class BatchedPredictor:
                 e = _innovations(model.mechanism.structure, self.solver, inputs, self.on_device(window))
             return use(i, np.asarray(e)[:, : window.shape[1]])
 
-        grouped = self._by_structure([p.gates for p in parameter_sets])
-        jobs = [(model, i) for model, indices in grouped for i in indices]
-        results = self.run_jobs(run, jobs, lambda job: ("innovations", job[0].effects))
-        found = {i: used for (_, i), used in zip(jobs, results, strict=True)}
-        return [found[i] for i in range(len(parameter_sets))]
+        jobs = [(self.supermodel.active(p.gates), i) for i, p in enumerate(parameter_sets)]
+        return self.run_jobs(run, jobs, lambda job: ("innovations", job[0].effects))
 
     def slopes(
         self,
@@ -234,18 +231,8 @@ class BatchedPredictor:
             return use(i, np.asarray(e)[:, : window.shape[1]], np.asarray(J)[:, :, : window.shape[1]])
 
         gates = [np.vstack([p.gates, d.gates]) for p, d in zip(parameter_sets, directions, strict=True)]
-        jobs = [(model, i) for model, indices in self._by_structure(gates) for i in indices]
-        results = self.run_jobs(run, jobs, lambda job: ("slopes", len(directions[job[1]].x0), job[0].effects))
-        found = {i: x for (_, i), x in zip(jobs, results, strict=True)}
-        return [found[i] for i in range(len(parameter_sets))]
-
-    def _by_structure(self, gates: list[np.ndarray]) -> list[tuple[ReducedModel, list[int]]]:
-        """Which parameter sets run on which reduced model."""
-        groups: dict[tuple[int, ...], tuple[ReducedModel, list[int]]] = {}
-        for i, g in enumerate(gates):
-            model = self.supermodel.active(g)
-            groups.setdefault(model.effects, (model, []))[1].append(i)
-        return list(groups.values())
+        jobs = [(self.supermodel.active(g), i) for i, g in enumerate(gates)]
+        return self.run_jobs(run, jobs, lambda job: ("slopes", len(directions[job[1]].x0), job[0].effects))
 
     def has_innovations(self, gates: Float[np.ndarray, " E"]) -> bool:
         """Whether innovations with what these gates switch on were run."""

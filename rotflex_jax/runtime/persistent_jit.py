@@ -58,8 +58,6 @@ FOLDER_VARIABLE = "ROTFLEX_PROGRAMS"
 # With these settings JAX does more at each call than run a program.
 _WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
 _FOR_COMPILER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
-# What XLA takes by itself.
-_FULL_LEVEL = 3
 _programs: list["PersistentJit"] = []
 # Programs held in memory, that used last at the end: each takes some 14 MB, and loading it again 0.1 s. Where
 # there are more than the first number, those not used for longest are released down to the second.
@@ -136,16 +134,18 @@ class PersistentJit:
     Args:
         function: Pure; a function of a module of this package that returns arrays, in tuples or named tuples.
         static: How many of the first arguments are static.
-        optimisation_level: Of LLVM. At level 1 loops over samples run as fast as at level 3 and compile in
-            four fifths of the time; runs with slopes need level 3. Level 0 is for large programs that run a
-            few times: they compile in half of the time, and loops take five to ten times as long.
+        optimisation_level: Of LLVM; what XLA takes by itself, 3, if None. At level 1 loops over samples run
+            as fast as at level 3 and compile in four fifths of the time; runs with slopes need level 3.
+            Level 0 is for large programs that run a few times: they compile in half of the time, and loops
+            take five to ten times as long.
     """
 
     def __init__(
-        self, function: Callable[..., Any], static: int, optimisation_level: int = _FULL_LEVEL
+        self, function: Callable[..., Any], static: int, optimisation_level: int | None = None
     ) -> None:
         self.jitted = jax.jit(function, static_argnums=tuple(range(static)))
-        self._level = optimisation_level
+        level = optimisation_level
+        self._level = {} if level is None else {"xla_backend_optimization_level": level}
         self._static = static
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._held: dict[Any, _Held] = {}
@@ -222,10 +222,7 @@ class PersistentJit:
         def flat(*leaves: Any) -> Any:
             return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
 
-        options = _options() | (
-            {} if self._level == _FULL_LEVEL else {"xla_backend_optimization_level": self._level}
-        )
-        program = jax.jit(flat, compiler_options=options)
+        program = jax.jit(flat, compiler_options=_options() | self._level)
         began = time.perf_counter()
         stored = None if file is None else _read(file, leaves)
         if stored is not None:
@@ -244,7 +241,7 @@ class PersistentJit:
 
 
 def persistent_jit(
-    static: int, optimisation_level: int = _FULL_LEVEL
+    static: int, optimisation_level: int | None = None
 ) -> Callable[[Callable[..., Any]], PersistentJit]:
     """Decorator: the function as a `PersistentJit`; arguments as there."""
     return lambda function: PersistentJit(function, static, optimisation_level)
