@@ -491,8 +491,8 @@ def test_the_user_is_told_what_to_look_at(run, search, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        (None, f"--xla_backend_extra_options={xla._OPTION}=262144"),
-        ("--xla_a=1", f"--xla_a=1 --xla_backend_extra_options={xla._OPTION}=262144"),
+        (None, f"--xla_backend_extra_options={xla._OPTION}=2097152"),
+        ("--xla_a=1", f"--xla_a=1 --xla_backend_extra_options={xla._OPTION}=2097152"),
         (f"--xla_backend_extra_options={xla._OPTION}=7",) * 2,
         ("flags.txt",) * 2,
     ],

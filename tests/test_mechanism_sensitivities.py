@@ -31,7 +31,7 @@ from rotflex_jax.mechanism.sensitivities import (
     outputs_with_sensitivities,
 )
 from rotflex_jax.mechanism.simulate import PredictorStep, read_outputs
-from rotflex_jax.runtime.xla import double_precision
+from rotflex_jax.runtime.xla import double_precision, loops_are_fast
 
 Ts, N = 0.004, 150
 SOLVER = Exponential(passes=2)
@@ -255,3 +255,20 @@ def test_slopes_are_those_that_jax_takes(case: str) -> None:
         )
     np.testing.assert_allclose(got[0], y_hat, rtol=1e-10, atol=1e-12 * np.abs(y_hat).max())
     np.testing.assert_allclose(got[1], J, rtol=1e-7, atol=1e-9 * np.abs(J).max())
+
+
+@pytest.mark.skipif(not loops_are_fast(), reason="XLA was started without the option for small loops")
+def test_slopes_of_a_large_structure_are_one_function():
+    """Play, a memory and friction of two kinds, in as many directions as it has parameters and more."""
+    joint = paper() + fx.Backlash("hub") + fx.Dahl("hub") + fx.LuGre("joint") + fx.Cogging("arm")
+    structure, D = joint.structure, 32
+    with double_precision():
+        P, E, n = len(joint.values), len(joint.effects), Layout.of(structure).size
+        numbers = RunParameters(jnp.asarray(joint.values), jnp.ones(E), jnp.zeros(n), jnp.zeros((n, 2)))
+        directions = TangentDirections(jnp.ones((D, P)), jnp.zeros((D, E)), jnp.zeros((D, n)))
+        samples = RecordingSamples(jnp.zeros(N), jnp.zeros((N, 2)), jnp.ones(N), jnp.asarray(Ts))
+        run = jax.jit(functools.partial(outputs_with_sensitivities, structure, SOLVER))
+        program = run.lower(numbers, directions, samples).compile(ROUGH).as_text()
+    main = program[program.index("ENTRY") :].splitlines()
+    over_samples = [line for line in main if f"[{N},2,{D}]" in line and ("call(" in line or "while(" in line)]
+    assert over_samples and all("xla_cpu_small_call" in line for line in over_samples)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from rotflex_jax.fit.problem import moved_by, normal_equations
+from rotflex_jax.fit.problem import directions, normal_equations
 from rotflex_jax.mechanism import Exponential, free_run, simulate
 from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters, outputs_with_sensitivities
 from rotflex_jax.runtime.xla import double_precision
@@ -104,13 +104,13 @@ def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any, Any]
             return free_run(structure, solver, values.at[eight].set(z), gates, x0, U, T)[1]
 
         def carried(values: jax.Array) -> Any:
-            ways = moved_by(structure, one, jnp.asarray(eight), 0)
+            ways = directions(structure, one, jnp.asarray(eight), 0)
             return outputs_with_sensitivities(
                 structure, solver, RunParameters(values, gates, x0, None), ways, samples
             )
 
         def sums(values: jax.Array) -> Any:
-            ways, scale = moved_by(structure, one, jnp.asarray(eight), 4), jnp.asarray([0.1, 0.01])
+            ways, scale = directions(structure, one, jnp.asarray(eight), 4), jnp.asarray([0.1, 0.01])
             numbers = RunParameters(values, gates, x0, None)
             return normal_equations(structure, solver, numbers, ways, samples, scale)
 
