@@ -363,6 +363,20 @@ def test_sentence_is_for_people(cls):
         assert effect.at in said
 
 
+@pytest.mark.parametrize(
+    ("level", "damping", "says", "does_not_say"),
+    [
+        (0.02, 0.0, ["sticks up to 0.03 N m", "slides at 0.02 N m"], "damps"),
+        (0.02, 0.05, ["sticks up to 0.03 N m", "damps motion below 0.4 rad/s by 0.05 N m s/rad"], "without"),
+        (1e-11, 0.05, ["without a level", "damps motion below 0.4 rad/s by 0.05 N m s/rad"], "sticks"),
+        (0.0, 0.0, ["sticks up to 0 N m"], "damps"),
+    ],
+)
+def test_lugre_friction_speaks_of_what_it_does(level, damping, says, does_not_say):
+    said = CATALOG["lugre"]("hub", level, rise=0.5, slow=0.4, presliding=0.003, damping=damping).sentence()
+    assert all(part in said for part in [*says, "0.003 rad (0.17 degrees)"]) and does_not_say not in said
+
+
 @every_effect
 def test_frozen_hashable_and_replaced_by_value(cls):
     effect = example(cls)

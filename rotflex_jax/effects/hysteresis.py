@@ -146,12 +146,17 @@ class LuGre(Memory):
         return [[a | {"presliding": size} for a in (friction, bristles)] for size in (0.001, 0.005)]
 
     def sentence(self) -> str:
-        """In words."""
-        return (
-            f"the {self.at} sticks up to {self.level * (1 + self.rise):.3g} N m and slides at "
-            f"{self.level:.3g} N m, its friction building up over {self.presliding:.2g} rad "
-            f"({math.degrees(self.presliding):.2g} degrees)"
+        """In words: the friction, the damping of the bristles, or both, as far as they show."""
+        within = f"{self.presliding:.2g} rad ({math.degrees(self.presliding):.2g} degrees)"
+        breakaway, bristles = self.level * (1 + self.rise), self.damping * self.slow  # torques [N m]
+        damps = f"damps motion below {self.slow:.2g} rad/s by {self.damping:.3g} N m s/rad"
+        if bristles > 0 and breakaway < 1e-3 * bristles:
+            return f"friction of the {self.at} without a level {damps}, over {within} after each reversal"
+        sticks = (
+            f"the {self.at} sticks up to {breakaway:.3g} N m and slides at {self.level:.3g} N m, "
+            f"its friction building up over {within}"
         )
+        return sticks if bristles <= 1e-3 * breakaway else f"{sticks}; meanwhile it {damps}"
 
 
 @register
