@@ -257,9 +257,10 @@ def test_slopes_are_those_that_jax_takes(case: str) -> None:
     np.testing.assert_allclose(got[1], J, rtol=1e-7, atol=1e-9 * np.abs(J).max())
 
 
-@pytest.mark.skipif(not loops_are_fast(), reason="XLA was started without the option for small loops")
 def test_slopes_of_a_large_structure_are_one_function():
-    """Play, a memory and friction of two kinds, in as many directions as it has parameters and more."""
+    """Play, two kinds of friction with a state, and cogging, in more directions than it has parameters."""
+    if not loops_are_fast():
+        pytest.skip("XLA was started without the option for small loops")
     joint = paper() + fx.Backlash("hub") + fx.Dahl("hub") + fx.LuGre("joint") + fx.Cogging("arm")
     structure, D = joint.structure, 32
     with double_precision():

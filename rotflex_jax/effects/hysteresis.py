@@ -150,7 +150,7 @@ class LuGre(Memory):
         within = f"{self.presliding:.2g} rad ({math.degrees(self.presliding):.2g} degrees)"
         breakaway, bristles = self.level * (1 + self.rise), self.damping * self.slow  # torques [N m]
         damps = f"damps motion below {self.slow:.2g} rad/s by {self.damping:.3g} N m s/rad"
-        if bristles > 0 and breakaway < 1e-3 * bristles:
+        if breakaway < 1e-3 * bristles:
             return f"friction of the {self.at} without a level {damps}, over {within} after each reversal"
         sticks = (
             f"the {self.at} sticks up to {breakaway:.3g} N m and slides at {self.level:.3g} N m, "

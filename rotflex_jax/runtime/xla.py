@@ -23,7 +23,7 @@ from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 
 # A step with play, memories and friction touches some 17 KB for each direction of its slopes; beyond the
-# limit a run takes three to four times as long. Loops with matrix products of 64 to 300 rows lose nothing.
+# limit a run takes 2.7 to 4.4 times as long. Loops with matrix products of 64 to 300 rows lose nothing.
 _OPTION, _LIMIT = "xla_cpu_small_while_loop_byte_threshold", 2**21
 FAST_LOOPS_FLAG = f"--xla_backend_extra_options={_OPTION}={_LIMIT}"
 """What `enable_fast_loops` adds to `XLA_FLAGS` unless it is given another limit."""
