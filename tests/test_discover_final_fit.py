@@ -21,6 +21,7 @@ from rotflex_jax.discover.selection import choose
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
 from rotflex_jax.effects import Coulomb
 from rotflex_jax.experiment import until_decided
+from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.parameters import Estimate
 
 MODULE = sys.modules[log_error_ratio.__module__]
@@ -252,6 +253,22 @@ def fits(monkeypatch):
     return SimpleNamespace(each=each, best=best)
 
 
+def test_an_end_that_the_recordings_do_not_reach_is_taken_only_alone(monkeypatch):
+    """Even where it is likelier; an end without a cost comes last."""
+    remark = Remark("hub.cogging.periods", "beyond the recordings", "")
+    bound = Remark("hub.lugre.damping", "at a bound", "")
+
+    def ends(*kinds: tuple[float, tuple[Remark, ...]]) -> float:
+        structure = SimpleNamespace(starts=range(len(kinds)), local=(), window_seconds=2.0)
+        of_starts = [SimpleNamespace(cost=cost, remarks=remarks) for cost, remarks in kinds]
+        monkeypatch.setattr(STRUCTURE, "fit", lambda start, recordings, **how: of_starts[start])
+        return STRUCTURE.fit_structures([(structure, [])])[0].fit.cost
+
+    assert ends((-5.0, (remark,)), (-3.0, (bound,)), (-2.0, ())) == -3.0
+    assert ends((-5.0, (remark,)), (-6.0, (remark,))) == -6.0
+    assert ends((np.nan, ()), (-5.0, ())) == -5.0
+
+
 def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, fits, monkeypatch):
     """Of what was found first the sizes are kept, then nothing; the user's model is then as given."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
@@ -271,7 +288,9 @@ def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, f
             for m, r, local, e in fits.each
             if (len(r), local) == (len(given), structure.local) and any(m is s for s in structure.starts)
         ]
-        assert len(ends) == len(structure.starts) and end.cost == min(e.cost for e in ends)
+        # With a Stribeck speed that the arm has reached, if there is one.
+        reached = [e for e in ends if not any(r.kind == "beyond the recordings" for r in e.remarks)]
+        assert len(ends) == len(structure.starts) and end.cost == min(e.cost for e in reached or ends)
         # The fit to all starts from that to training recordings besides.
         assert more in ([],) if len(given) == 1 else more[0] in [values_of(e.model) for e in alone]
 

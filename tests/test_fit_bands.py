@@ -13,6 +13,7 @@ import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import Discovery
 from rotflex_jax.discover.probabilities import Probabilities, SetProbability
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import Inertia, Motor
 from rotflex_jax.fit import Fit
 from rotflex_jax.fit.result import FitOptions
@@ -142,7 +143,16 @@ def test_bands_of_a_search_are_those_of_its_probable_sets():
     found = Probabilities(tuple(SetProbability(s, p) for s, p in shares.items()), {}, 0.09)
     model = rf.Model(axis())
     stage = SimpleNamespace(model=model)
-    search = SimpleNamespace(probabilities=found, train=(train,), baseline=stage, final=stage, model=model)
+    search = SimpleNamespace(
+        probabilities=found,
+        train=(train,),
+        validation=(recording(2),),
+        baseline=stage,
+        final=stage,
+        model=model,
+        final_fit=None,
+        verdict=Verdict.FOUND,
+    )
     bands = Discovery.prediction_bands(search, rec, 0.8)
     damped = rf.fit(axis() + rf.effects.Viscous("hub"), train)
     expected = rf.prediction_bands([(fitted(), 0.7), (damped, 0.2)], rec, 0.8)

@@ -194,6 +194,22 @@ def test_a_size_that_no_signal_reaches_is_said():
     assert [r.parameter for r in beyond_recordings(slow, reach)] == ["hub.stribeck.speed"]
 
 
+def test_a_cogging_that_repeats_less_than_half_a_time_is_beyond_the_recordings():
+    """Half a period within the motion is a phase of pi over it; the limit is a little below."""
+    cogging = fx.Cogging(at="hub", sine=0.01, periods=4.0)
+    name = "hub.cogging.periods"
+    for travel, hidden in ((2.8, True), (3.1, False)):  # phase over the whole motion [rad]
+        half = travel / 2 / cogging.periods
+        reach = Reach(input=1.0, position={"hub": half}, speed={}, seconds=10.0)
+        m = paper() + cogging
+        found = beyond_recordings(m, reach)
+        assert [r.parameter for r in found] == [name] * hidden
+        assert not beyond_recordings(m.trust(name), reach)
+        assert not beyond_recordings(m, reach._replace(position={}))
+    close = beyond_recordings(m, reach._replace(position={"hub": np.radians(10.0)}))
+    assert "(20 degrees)" in close[0].sentence and "spring or a constant torque" in close[0].sentence
+
+
 def test_a_search_leaves_out_candidates_of_sizes_that_no_signal_reaches():
     found = sp.recordings(sp.records())
     at = sp.problem(found)

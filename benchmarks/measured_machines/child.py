@@ -74,12 +74,21 @@ def row(
             "final": errors(result.final.model, way.test),
             "fitted to all": errors(result.model_of, way.test) if result.final_fit else None,
         },
+        "bands": [bands(result, r) for r in way.test],
         "each_test": [errors(result.final.model, [r]) for r in way.test] if len(way.test) > 1 else None,
         "seconds": {
             part: sum(r.N * r.Ts for r in getattr(way, part)) for part in ("train", "validation", "test")
         },
         "others": compared(model, way, methods, say) if methods else None,
     }
+
+
+def bands(result: rf.Discovery, recording: rf.Recording) -> dict[str, Any]:
+    """Share of the samples of a test recording in their band, its mean half width, and what widens it."""
+    try:
+        return result.prediction_bands(recording).to_dict()
+    except rf.InputError as problem:
+        return {"error": str(problem)}
 
 
 def reported(stage: dict[str, Any]) -> dict[str, Any]:

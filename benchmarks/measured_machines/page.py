@@ -25,6 +25,8 @@ has law A in the place of the law B that was found; "without C": it does without
 "D separate for each run": each run has a value of its own of this parameter.
 
 """
+BANDS = """Bands of 90 % around free runs over each test recording, by what the search has learnt from and
+decided on: how many samples they hold, their mean half width, and what gives most of their variance."""
 
 
 def evaluated(row: Row, stage: str) -> tuple[dict[str, Any], str]:
@@ -133,10 +135,35 @@ def page(results: dict[str, Any]) -> str:
         commit = row["commit"] + ("" if row["clean"] else ", changed")
         cells = [row["machine"], row["direction"], row["verdict"], said(row), *times(row), again, commit]
         lines.append("| " + " | ".join(cells) + " |")
-    lines.append("")
+    lines += ["", *bands_of_tests(good), ""]
     lines += [f"- {r['machine']}, {r['direction']}: failed, {r['error']}" for r in rows if "error" in r]
     lines += [f"- {name}: left out, {reason}" for name, reason in results.get("left_out", {}).items()]
     return HEAD + "\n".join(lines).rstrip() + "\n"
+
+
+def bands_of_tests(rows: list[Row]) -> list[str]:
+    """Table of the bands over test recordings, of directions that have some."""
+    lines = [
+        "| machine | direction | unit | samples inside [%] | mean half width | widened by |",
+        "|---|---|---|---:|---:|---|",
+    ]
+    for row in rows:
+        machine, found = MACHINES[row["machine"]], row.get("bands") or []
+        for k, band in enumerate(found, 1):
+            direction = row["direction"] + (f", test {k}" if len(found) > 1 else "")
+            cells = ["-", "-", band.get("error")]
+            if "error" not in band:
+                inside = " / ".join(f"{100 * share:.0f}" for share in band["coverage"].values())
+                by = " / ".join(map(most_of, band["shares"].values()))
+                cells = [inside, told(band["mean_half_width"], machine.factor), by]
+            lines.append("| " + " | ".join([row["machine"], direction, machine.unit, *cells]) + " |")
+    return [BANDS, "", *lines] if len(lines) > 2 else []
+
+
+def most_of(shares: dict[str, float]) -> str:
+    """The largest parts of a variance, down to a fifth of it."""
+    large = sorted((pair for pair in shares.items() if pair[1] >= 0.2), key=lambda pair: -pair[1])
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in large)
 
 
 def _place(key: str) -> tuple[int, str]:

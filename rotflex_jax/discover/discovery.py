@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax import checks
+from rotflex_jax.discover.bands import bands_of_final_fit, bands_of_sets
 from rotflex_jax.discover.conclusion import proposed
 from rotflex_jax.discover.explanation import (
     SHOWN_SECONDS,
@@ -31,12 +32,13 @@ from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.experiment.until_decided import models_of
-from rotflex_jax.fit.bands import Bands, prediction_bands
+from rotflex_jax.fit.bands import Bands, known_recordings
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.identifiable import Identifiability, identifiable
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.model_json import Saved, save
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, single
 from rotflex_jax.text.markup import as_json, bullets, card, folded, paragraph, picture, table, write_files
 from rotflex_jax.text.numbers import equation, plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import staircase
@@ -125,10 +127,16 @@ class Discovery(SearchResult):
         known: Recording | Sequence[Recording] = (),
         progress: Callable[[str], None] | None = None,
     ) -> Bands:
-        """Bands of a free run over the probable sets of effects, each fitted to the training recordings.
+        """Bands around the free run of `model_of(recording)`, or of the probable sets of effects.
 
-        Sets weigh as much as they are probable; that the right one is none of them is not in the bands,
-        unless recordings are `known`. Of a search without probabilities the final model counts alone.
+        Where a search ends unexplained and has a final fit, bands are of that fit, and what it lacks is as
+        large as free runs over the fitted recordings show it. Otherwise the probable sets are fitted to the
+        training recordings and weigh as much as they are probable; of a search without probabilities the
+        final model counts alone. That none of the sets is right is in the bands of a search that ends
+        unexplained, by its validation recordings, and wherever recordings are `known`.
+
+        A run that was not fitted has offsets and biases of its own, about as large as those of fitted runs,
+        unless other runs have shown the same ones.
 
         Args:
             recording: Its input and first samples are used, its other samples only by `coverage`.
@@ -140,11 +148,15 @@ class Discovery(SearchResult):
             InputError: As `rotflex_jax.prediction_bands`.
         """
         say = checks.progress(progress)
+        recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
+        others = known_recordings(known)
+        if self.final_fit:
+            return bands_of_final_fit(self, recording, level, others)
         fits, share = (
             models_of(self, say) if self.probabilities else ({"": fit(self.model, self.train)}, None)
         )
         weighted = [(fitted, share[name] if share else 1.0) for name, fitted in fits.items()]
-        return prediction_bands(weighted, recording, level, known=known)
+        return bands_of_sets(self, weighted, recording, level, others)
 
     def next_experiment(self, **changes: Any) -> Experiment | None:
         """Design the input that distinguishes the first effect found from its equal; None where it has none.

@@ -15,6 +15,7 @@ from rotflex_jax.discover.hypothesis import Hypothesis, replacing, usual_start, 
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.fit.greybox import fit
+from rotflex_jax.fit.plausibility import BEYOND_RECORDINGS
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.models.model import Model
@@ -212,10 +213,11 @@ class FittedStructure:
 def fit_structures(
     asked: Sequence[tuple[FinalStructure, Sequence[Recording]]],
 ) -> list[FittedStructure]:
-    """Structures fitted to free runs of recordings, each the likelier of the ends from its starts.
+    """Structures fitted to free runs of recordings, each the likeliest of the ends from its starts.
 
-    Parameters of predictions may lead to another local minimum of free runs than usual ones: to stiff,
-    damped bristles of a friction instead of soft ones. Those of the search's free runs may, too.
+    An end whose parameters the recordings do not reach is taken only if there is no other. Parameters of
+    predictions may lead to another local minimum of free runs than usual ones: to stiff, damped bristles of
+    a friction instead of soft ones. Those of the search's free runs may, too.
     """
 
     def end(job: tuple[int, Model]) -> Fit:
@@ -232,7 +234,12 @@ def fit_structures(
     ends: list[list[Fit]] = [[] for _ in asked]
     for (k, _), found in zip(jobs, fits, strict=True):
         ends[k].append(found)
-    best = [min(each, key=lambda found: float(np.nan_to_num(found.cost, nan=np.inf))) for each in ends]
+
+    def order(found: Fit) -> tuple[bool, float]:
+        beyond = any(remark.kind == BEYOND_RECORDINGS for remark in found.remarks)
+        return beyond, float(np.nan_to_num(found.cost, nan=np.inf))
+
+    best = [min(each, key=order) for each in ends]
     return [FittedStructure(structure, found) for (structure, _), found in zip(asked, best, strict=True)]
 
 

@@ -47,7 +47,7 @@ from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, validate
 from rotflex_jax.effects import CATALOG, ChannelDelay, SensorBias
 from rotflex_jax.effects.labels import effect_phrase
-from rotflex_jax.fit.plausibility import Remark, at_bounds, beyond_recordings
+from rotflex_jax.fit.plausibility import BEYOND_RECORDINGS, Remark, at_bounds, beyond_recordings
 from rotflex_jax.recording import Recording
 
 
@@ -330,9 +330,7 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
 def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
     """Which parameters of an effect the recordings do not speak for."""
     head = f"{location.port}.{location.effect}."
-    return tuple(
-        r.sentence for r in remarks if r.kind == "beyond the recordings" and r.parameter.startswith(head)
-    )
+    return tuple(r.sentence for r in remarks if r.kind == BEYOND_RECORDINGS and r.parameter.startswith(head))
 
 
 def _doubts(

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from rotflex_jax.effects.base import Force, Probe, Scalar, Scale, register
+from rotflex_jax.effects.base import HALF_A_PERIOD, Force, Probe, Scalar, Scale, register
 from rotflex_jax.parameters import parameter
 
 
@@ -91,6 +91,7 @@ class Cogging(Force):
     contains: ClassVar[tuple[str, ...]] = ("gravity",)
     searched: ClassVar[tuple[str, ...]] = ("hub", "arm")
     turning: ClassVar[bool] = True
+    repeats: ClassVar[str] = "periods"
 
     sine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the sine")
     cosine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the cosine")
@@ -105,9 +106,8 @@ class Cogging(Force):
     def probes(cls, scale: Scale) -> list[list[Probe]]:
         """Sine and cosine at each number of periods that the travel can show."""
         torque = 0.1 * scale.torque
-        # Less than half a period within the travel is a spring.
         known = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 18, 20, 24)
-        counts = [n for n in known if n * scale.position > 1.5] or known[-1:]
+        counts = [n for n in known if n * scale.position > HALF_A_PERIOD] or known[-1:]
         return [
             [
                 {"sine": torque, "cosine": 0.0, "periods": float(n)},

@@ -55,6 +55,11 @@ class Stamp(NamedTuple):
     torque: tuple[Scalar, ...] = ()
 
 
+# Phase at the ends of the travel of a port, about its middle [rad], below which a law that repeats with the
+# angle is a spring or a constant torque there.
+HALF_A_PERIOD = 1.5
+
+
 @dataclasses.dataclass(frozen=True)
 class Scale:
     """How large the signals of a recording are, so that an effect can propose shapes worth trying.
@@ -104,6 +109,7 @@ class Effect(abc.ABC):
     # Its volts are the unit of the input, also where that is no voltage but a current or a goal.
     volts_of_input: ClassVar[bool] = False
     turning: ClassVar[bool] = False  # a function of an angle: no meaning where a port moves along a line
+    repeats: ClassVar[str] = ""  # its parameter that counts repetitions per turn of the port
     per_recording: ClassVar[bool] = False  # its parameters belong to a recording, not to the machine
     # Its frequency [Hz], if it is tried only at lines that the errors of a model have and the input has not.
     # All recordings share it; its amplitudes have a phase, so no recording tells those of another.

@@ -9,7 +9,7 @@ process torques, the sensor, and what the model lacks, as large as free runs ove
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -191,19 +191,39 @@ def prediction_bands(
     Source: L. Ljung, System Identification, 2nd ed., 1999, section 9.4 (propagation of a covariance); V.
     Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, 2005 (width by known errors).
     """
-    level = checks.number(level, "level", above=0, below=1, example="0.9")
-    models = _weighted(fitted)
     recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
-    others = list(listed(known, "known", shortest=SHORTEST_TO_FIT)) if _any(known) else []
+    pairs = _weighted(fitted)
+    others = known_recordings(known)
+    sources = [BandSource(fit, weight, tuple((fit, r) for r in others)) for fit, weight in pairs]
+    return mixed_bands(sources, recording, level)
+
+
+class BandSource(NamedTuple):
+    """One of the models that a band is made of.
+
+    Attributes:
+        fit: As it stands for the recording; in `local` is what is not known of this one.
+        weight: Probability, up to a factor that all share.
+        known: Recordings by which the error of the model is measured, each with the fit as it stands for it.
+    """
+
+    fit: Fit
+    weight: float
+    known: Sequence[tuple[Fit, Recording]] = ()
+
+
+def mixed_bands(sources: Sequence[BandSource], recording: Recording, level: float) -> Bands:
+    """Bands over a recording of the mixture of several models; see `prediction_bands`."""
+    level = checks.number(level, "level", above=0, below=1, example="0.9")
     quantile = float(scipy.stats.norm.ppf((1 + level) / 2))
     runs, variances, weights = [], [], []
-    for one, weight in models:
-        y_hat, parts = _run(one, recording)
-        lacks = _lacking(one, others, quantile, level, parts["sensor"][0])
+    for source in sources:
+        y_hat, parts = _run(source.fit, recording)
+        lacks = _lacking(source, quantile, level, parts["sensor"][0])
         parts["what the model lacks"] = np.broadcast_to(lacks, y_hat.shape)
         runs.append(y_hat)
         variances.append(parts)
-        weights.append(weight)
+        weights.append(source.weight)
     w = np.array(weights) / np.sum(weights)
     middle = np.einsum("m,mnc->nc", w, np.array(runs))
     combined = {
@@ -213,7 +233,7 @@ def prediction_bands(
     combined["between models"] = np.einsum("m,mnc->nc", w, np.square(np.array(runs) - middle))
     totals = np.array([np.sum(list(v.values()), axis=0) for v in variances])
     lower, upper = _mixture(np.array(runs), np.sqrt(totals), w, (1 - level) / 2, quantile)
-    m = models[0][0].model.mechanism
+    m = sources[0].fit.model.mechanism
     return Bands(
         recording=recording,
         channels=m.channels,
@@ -226,8 +246,10 @@ def prediction_bands(
     )
 
 
-def _any(known: Any) -> bool:
-    return not (isinstance(known, Sequence) and len(known) == 0)
+def known_recordings(known: Any) -> tuple[Recording, ...]:
+    """The recordings of an argument `known`, which may be none."""
+    none = isinstance(known, Sequence) and len(known) == 0
+    return () if none else tuple(listed(known, "known", shortest=SHORTEST_TO_FIT))
 
 
 def _weighted(fitted: Any) -> list[tuple[Fit, float]]:
@@ -300,11 +322,12 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
         "first state": _propagated(J[..., F:], inverse @ scatter @ inverse),
         "sensor": np.broadcast_to(noise**2, y.shape),
     }
-    own = np.zeros_like(y)
+    own, held = np.zeros_like(y), dict(zip(names, m.values.tolist(), strict=True))
     for name, each in fitted.local.items():
-        if len(each) > 1:
-            spread = float(np.var([e.value for e in each], ddof=1))
-            own = own + spread * np.square(whole[..., fitted.free_names.index(name)])
+        # About the value of the model: the mean of the recordings, or what is taken where nothing is known.
+        squares = np.square([e.value - held[name] for e in each])
+        spread = float(np.sum(squares)) / max(len(each) - 1, 1)
+        own = own + spread * np.square(whole[..., fitted.free_names.index(name)])
     if own.any():
         parts["own of each recording"] = own
     if fitted.options.process_noise is not None:
@@ -457,20 +480,20 @@ def _process_variance(
 
 
 def _lacking(
-    fitted: Fit, known: Sequence[Recording], quantile: float, level: float, sensor: Float[np.ndarray, " C"]
+    source: BandSource, quantile: float, level: float, sensor: Float[np.ndarray, " C"]
 ) -> Float[np.ndarray, " C"]:
     """Variance of each channel by what the model lacks."""
-    m = fitted.model.mechanism
-    residual = np.array([fitted.noise[c] for c in m.channels])
-    if not known:
+    fitted = source.fit
+    residual = np.array([fitted.noise[c] for c in fitted.model.mechanism.channels])
+    if not source.known:
         if fitted.options.process_noise is not None:
             return np.zeros(len(residual))  # predictions leave innovations, which are no errors of a free run
         return np.maximum(residual**2 - sensor, 0.0)
     errors, others = [], []
-    for recording in known:
-        y_hat, parts = _run(fitted, recording)
+    for fit, recording in source.known:
+        y_hat, parts = _run(fit, recording)
         seen = slice(recording.n_init, None)
-        errors.append((fitted.model.measured(recording).astype(float) - y_hat)[seen])
+        errors.append((fit.model.measured(recording).astype(float) - y_hat)[seen])
         others.append(np.sum(list(parts.values()), axis=0)[seen])
     e, v = np.concatenate(errors), np.concatenate(others)
     # Of each sample the variance with which it would lie on the edge of its band.

@@ -1,13 +1,14 @@
 """What is physically plausible: ranges of parameters, signs of channels, sizes the recordings speak for."""
 
 import itertools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.effects.base import Effect, Linear
+from rotflex_jax.effects.base import HALF_A_PERIOD, Effect, Linear
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, linearise
 from rotflex_jax.mechanism.assembly import Layout
@@ -163,8 +164,10 @@ def _correlation(a: np.ndarray, b: np.ndarray, step: int) -> float:
     return float(np.corrcoef(moves[0], moves[1])[0, 1])
 
 
-# A size is beyond the recordings where they reach less than this share of it.
+# A size is beyond the recordings where it is so many times what they reach.
 BEYOND = 3.0
+BEYOND_RECORDINGS = "beyond the recordings"
+"""Kind of a remark on such a size."""
 
 
 class Reach(NamedTuple):
@@ -216,7 +219,7 @@ class Remark(NamedTuple):
 
     Attributes:
         parameter: Full name.
-        kind: `beyond the recordings` or `at a bound`.
+        kind: `BEYOND_RECORDINGS` or "at a bound".
         sentence: In words, with numbers.
     """
 
@@ -230,9 +233,11 @@ class Remark(NamedTuple):
 
 
 def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | None = None) -> list[Remark]:
-    """Free parameters that are sizes of a signal and more than three times as large as it ever was.
+    """Free parameters of sizes that the recordings do not reach.
 
-    There the recordings cannot tell one size from another, and an effect with such a threshold is inactive.
+    They are sizes of a signal and more than three times as large as it ever was: the recordings cannot tell
+    one size from another, and an effect with such a threshold is inactive. Or they count the repetitions of
+    a law that repeats less than half a time within the motion: it is a spring or a constant torque there.
 
     Args:
         m: With the values in question.
@@ -243,15 +248,24 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
     for effect in m.effects if effects is None else effects:
         for name, spec in specifications(effect).items():
             full, value = f"{effect.at}.{effect.name}.{name}", float(getattr(effect, name))
-            limit = None if full in m.trusted else reach.limit(effect, spec.unit)
-            if limit is None or abs(value) <= BEYOND * limit[0]:
+            if full in m.trusted:
                 continue
-            unit = m.units.unit(spec.unit, effect.volts_of_input)
-            sentence = (
-                f"{full} = {value:.3g} {unit} is far beyond what these recordings reach ({limit[1]}: "
-                f"{limit[0]:.3g} {unit}), so that they do not determine it"
-            )
-            found.append(Remark(full, "beyond the recordings", sentence))
+            unit, limit = m.units.unit(spec.unit, effect.volts_of_input), reach.limit(effect, spec.unit)
+            if limit is not None and abs(value) > BEYOND * limit[0]:
+                why = (
+                    f"is far beyond what these recordings reach ({limit[1]}: {limit[0]:.3g} {unit}), so that "
+                    "they do not determine it"
+                )
+            elif name == effect.repeats and value * reach.position.get(effect.at, np.inf) < HALF_A_PERIOD:
+                travel = math.degrees(2 * reach.position[effect.at])
+                why = (
+                    f"per turn is less than half a period within the motion of {effect.at} ({travel:.3g} "
+                    "degrees), where the law is a spring or a constant torque"
+                )
+            else:
+                continue
+            sentence = f"{full} = {value:.3g} {unit}".rstrip() + f" {why}"
+            found.append(Remark(full, BEYOND_RECORDINGS, sentence))
     return found
 
 
