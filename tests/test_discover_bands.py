@@ -83,7 +83,7 @@ def test_an_unknown_run_has_an_offset_about_as_far_off_as_those_of_fitted_runs()
     result = searched([run(1, 0.1)], [run(2, 0.3)], carried=0.15)
     found = bands(result, other)
     np.testing.assert_allclose(found.middle, result.model.simulate(other), atol=1e-9)
-    spread = np.sqrt((0.15 - 0.1) ** 2 + (0.15 - 0.3) ** 2)
+    spread = np.sqrt(0.2**2 / 2 + (0.2 - 0.15) ** 2)  # variance of 0.1 and 0.3, and their mean less the value
     np.testing.assert_allclose(found.parts[OWN][:, 0], spread * per_volt(other), rtol=0.02, atol=1e-9)
 
 

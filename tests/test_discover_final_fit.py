@@ -266,7 +266,7 @@ def test_an_end_that_the_recordings_do_not_reach_is_taken_only_alone(monkeypatch
 
     assert ends((-5.0, (remark,)), (-3.0, (bound,)), (-2.0, ())) == -3.0
     assert ends((-5.0, (remark,)), (-6.0, (remark,))) == -6.0
-    assert ends((np.nan, ()), (-5.0, ())) == -5.0
+    assert ends((np.nan, ()), (-5.0, ())) == ends((np.nan, ()), (-5.0, (remark,))) == -5.0
 
 
 def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, fits, monkeypatch):

@@ -66,7 +66,9 @@ def bands_of_sets(
             ends unexplained, its validation recordings.
     """
     runs = KnownRuns.of(result.train, result.validation)
-    calibrating = {f"{port}.{effect}." for effect, port in calibrations(result.baseline.model.mechanism)}
+    baseline = result.baseline.model.mechanism
+    given = {(e.name, e.at) for e in baseline.effects}  # the machine's own, in `model_of` for every run
+    calibrating = {f"{port}.{effect}." for effect, port in set(calibrations(baseline)) - given}
 
     def standing_for(fit: Fit, r: Recording) -> Fit:
         if runs.compared or runs.index(r) is not None:

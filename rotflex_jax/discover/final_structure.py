@@ -235,9 +235,9 @@ def fit_structures(
     for (k, _), found in zip(jobs, fits, strict=True):
         ends[k].append(found)
 
-    def order(found: Fit) -> tuple[bool, float]:
+    def order(found: Fit) -> tuple[bool, bool, float]:
         beyond = any(remark.kind == BEYOND_RECORDINGS for remark in found.remarks)
-        return beyond, float(np.nan_to_num(found.cost, nan=np.inf))
+        return not np.isfinite(found.cost), beyond, float(found.cost)
 
     best = [min(each, key=order) for each in ends]
     return [FittedStructure(structure, found) for (structure, _), found in zip(asked, best, strict=True)]

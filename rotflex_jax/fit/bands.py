@@ -324,9 +324,10 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
     }
     own, held = np.zeros_like(y), dict(zip(names, m.values.tolist(), strict=True))
     for name, each in fitted.local.items():
-        # About the value of the model: the mean of the recordings, or what is taken where nothing is known.
-        squares = np.square([e.value - held[name] for e in each])
-        spread = float(np.sum(squares)) / max(len(each) - 1, 1)
+        # About the value of the model: the mean of the recordings, or the value assumed for an unknown run.
+        values = np.array([e.value for e in each])
+        scatter = float(np.var(values, ddof=1)) if len(values) > 1 else 0.0
+        spread = scatter + float(np.mean(values) - held[name]) ** 2
         own = own + spread * np.square(whole[..., fitted.free_names.index(name)])
     if own.any():
         parts["own of each recording"] = own
