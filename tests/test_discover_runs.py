@@ -84,6 +84,14 @@ def test_runs_are_compared_where_validation_has_another_one(parts):
     assert KnownRuns.of([other, first], [second]).index(third) == 1
 
 
+def test_of_parts_of_one_run_the_one_that_has_a_recording_knows_its_offset(parts):
+    first, second, third, other = parts
+    known = KnownRuns.of([first, third], [second])
+    assert [known.index(r) for r in (first, third, third.slice(200, 900), other)] == [0, 1, 1, None]
+    # Where none has it, the one that is nearest.
+    assert [known.index(second.slice(a, a + 600)) for a in (100, second.N - 700)] == [0, 1]
+
+
 def test_another_run_starts_without_the_offset_of_one(found, parts):
     *_, third, other = parts
     value = dict(zip(found.model.mechanism.parameter_names, found.model.mechanism.values, strict=True))

@@ -141,25 +141,18 @@ def test_bands_of_a_search_are_those_of_its_probable_sets():
     train, rec = recording(1), recording(9)
     shares = {frozenset(): 0.7, frozenset({"viscous@hub"}): 0.2, frozenset({"coulomb@hub"}): 0.01}
     found = Probabilities(tuple(SetProbability(s, p) for s, p in shares.items()), {}, 0.09)
-    model = rf.Model(axis())
-    stage = SimpleNamespace(model=model)
-    search = SimpleNamespace(
-        probabilities=found,
-        train=(train,),
-        validation=(recording(2),),
-        baseline=stage,
-        final=stage,
-        model=model,
-        final_fit=None,
-        verdict=Verdict.FOUND,
+    baseline, said = SimpleNamespace(model=rf.Model(axis())), []
+    search = Discovery(
+        Verdict.FOUND, "", (train,), (recording(2),), baseline, (), (), (), {}, 0.0, probabilities=found
     )
-    bands = Discovery.prediction_bands(search, rec, 0.8)
+    bands = search.prediction_bands(rec, 0.8, progress=said.append)
     damped = rf.fit(axis() + rf.effects.Viscous("hub"), train)
     expected = rf.prediction_bands([(fitted(), 0.7), (damped, 0.2)], rec, 0.8)
     np.testing.assert_allclose(bands.upper, expected.upper, rtol=1e-6)
     np.testing.assert_allclose(bands.middle, expected.middle, rtol=1e-6)
-    search.probabilities = None
-    alone = Discovery.prediction_bands(search, rec, 0.8)
+    search.prediction_bands(rec, 0.9, progress=said.append)
+    assert len(said) == 2  # fitted once
+    alone = dataclasses.replace(search, probabilities=None).prediction_bands(rec, 0.8)
     np.testing.assert_allclose(alone.upper, rf.prediction_bands(fitted(), rec, 0.8).upper, rtol=1e-6)
 
 

@@ -185,7 +185,7 @@ def _with_catalogue(model: Model) -> Model:
 def _box(model: Model, whole: Model) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest value of every free parameter."""
     mechanism = whole.mechanism
-    values = dict(zip(mechanism.parameter_names, mechanism.values.tolist(), strict=True))
+    values = mechanism.named_values
     limits = dict(zip(mechanism.parameter_names, mechanism.parameter_specifications, strict=True))
     amplitudes = {f"{e.at}.{e.name}.{a}" for e in mechanism.effects for a in e.amplitudes}
     own, box = set(model.mechanism.free_names), []

@@ -32,9 +32,10 @@ from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.experiment.until_decided import models_of
-from rotflex_jax.fit.bands import Bands, known_recordings
+from rotflex_jax.fit.bands import Bands, checked_level, known_recordings
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.identifiable import Identifiability, identifiable
+from rotflex_jax.fit.result import Fit
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.model_json import Saved, save
 from rotflex_jax.recording import Recording
@@ -50,6 +51,11 @@ LISTED_CANDIDATES = 8
 @dataclasses.dataclass(frozen=True)
 class Discovery(SearchResult):
     """What a search found, with its report, the torques that are missing, and the next experiment."""
+
+    # Once fitted; what takes another field by `dataclasses.replace` begins without.
+    _fits: list[tuple[Fit, float]] = dataclasses.field(
+        default_factory=list, init=False, repr=False, compare=False
+    )
 
     def __str__(self) -> str:
         return "\n".join(part for part in (super().__str__(), final_fit_sentence(self)) if part)
@@ -147,16 +153,20 @@ class Discovery(SearchResult):
         Raises:
             InputError: As `rotflex_jax.prediction_bands`.
         """
-        say = checks.progress(progress)
         recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
-        others = known_recordings(known)
+        say, level, others = checks.progress(progress), checked_level(level), known_recordings(known)
         if self.final_fit:
             return bands_of_final_fit(self, recording, level, others)
-        fits, share = (
-            models_of(self, say) if self.probabilities else ({"": fit(self.model, self.train)}, None)
-        )
-        weighted = [(fitted, share[name] if share else 1.0) for name, fitted in fits.items()]
-        return bands_of_sets(self, weighted, recording, level, others)
+        return bands_of_sets(self, self._probable_fits(say), recording, level, others)
+
+    def _probable_fits(self, say: Callable[[str], None]) -> list[tuple[Fit, float]]:
+        """Probable sets of effects with their probabilities, fitted to the training recordings once."""
+        if not self._fits:
+            fits, share = (
+                models_of(self, say) if self.probabilities else ({"": fit(self.model, self.train)}, None)
+            )
+            self._fits.extend((fitted, share[name] if share else 1.0) for name, fitted in fits.items())
+        return self._fits
 
     def next_experiment(self, **changes: Any) -> Experiment | None:
         """Design the input that distinguishes the first effect found from its equal; None where it has none.

@@ -132,7 +132,7 @@ def with_effects_of(small: Model, large: Model) -> Model:
     missing = [e for e in own.effects if (e.name, e.at) not in {(f.name, f.at) for f in m.effects}]
     for e in missing:
         m = m + e
-    values = dict(zip(own.parameter_names, own.values.tolist(), strict=True))
+    values = own.named_values
     gates = tuple(1.0 if (e.name, e.at) in present else 0.0 for e in m.effects)
     return Model(m.with_values(values), large.solver, gates)
 

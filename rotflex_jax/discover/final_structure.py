@@ -192,11 +192,8 @@ class FittedStructure:
             if any(e.value for e in shared.values()):
                 common |= shared
                 carried.append(location)
-        model = self.fit.model
-        mechanism = model.mechanism.with_values({n: e.value for n, e in common.items()})
         found = dataclasses.replace(
-            self.fit,
-            model=dataclasses.replace(model, mechanism=mechanism),
+            self.fit.with_values({n: e.value for n, e in common.items()}),
             parameters=tuple(common.get(e.name, e) for e in self.fit.parameters),
         )
         return FittedStructure(self.structure.carrying(*carried), found)

@@ -181,8 +181,18 @@ class KnownRuns(NamedTuple):
         return cls(tuple(train), any(not of_one_run(a, b) for a in train for b in validation))
 
     def index(self, recording: Recording) -> int | None:
-        """Which of the recordings is of the same run as another one; None if none is."""
-        return next((k for k, r in enumerate(self.recordings) if of_one_run(r, recording)), None)
+        """Which of the recordings is of the same run as another one; None if none is.
+
+        Of several parts of the run it is the one that the recording shares most time with, or is nearest to.
+        """
+        end = recording.start + recording.N * recording.Ts
+
+        def shared(k: int) -> float:
+            part = self.recordings[k]
+            return min(part.start + part.N * part.Ts, end) - max(part.start, recording.start)
+
+        of_run = [k for k, r in enumerate(self.recordings) if of_one_run(r, recording)]
+        return max(of_run, key=shared, default=None)
 
 
 def _parameters(estimates: Sequence[Estimate]) -> dict[str, Any]:

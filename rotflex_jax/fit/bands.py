@@ -8,7 +8,7 @@ process torques, the sensor, and what the model lacks, as large as free runs ove
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -26,6 +26,7 @@ from rotflex_jax.mechanism import Mechanism, linearise
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.linear import inverse_mass, output_units, process_covariance
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed, single
 from rotflex_jax.runtime.xla import double_precision
@@ -192,33 +193,59 @@ def prediction_bands(
     Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, 2005 (width by known errors).
     """
     recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
-    pairs = _weighted(fitted)
-    others = known_recordings(known)
-    sources = [BandSource(fit, weight, tuple((fit, r) for r in others)) for fit, weight in pairs]
+    level, others = checked_level(level), known_recordings(known)
+    sources = []
+    for fit, weight in _weighted(fitted):
+        values = fit.model.mechanism.named_values
+        run = FitForRun(fit, {name: scatter(each, values[name]) for name, each in fit.local.items()})
+        sources.append(BandSource(run, weight, [(run, r) for r in others]))
     return mixed_bands(sources, recording, level)
+
+
+class FitForRun(NamedTuple):
+    """A fit as it is used for the recordings of one run.
+
+    Attributes:
+        fit: Its model has the values for this run.
+        own: Parameter that belongs to runs -> variance about the value for this one, beside that of the fit.
+    """
+
+    fit: Fit
+    own: Mapping[str, float]
 
 
 class BandSource(NamedTuple):
     """One of the models that a band is made of.
 
     Attributes:
-        fit: As it stands for the recording; in `local` is what is not known of this one.
+        run: The model for the run of the recording.
         weight: Probability, up to a factor that all share.
-        known: Recordings by which the error of the model is measured, each with the fit as it stands for it.
+        known: Recordings by which the error of the model is measured, each with the model for its run.
     """
 
-    fit: Fit
+    run: FitForRun
     weight: float
-    known: Sequence[tuple[Fit, Recording]] = ()
+    known: Sequence[tuple[FitForRun, Recording]] = ()
+
+
+def scatter(of_runs: Sequence[Estimate], value: float) -> float:
+    """Variance of a parameter of another run about a value, by the estimates of some runs."""
+    values = np.array([e.value for e in of_runs])
+    variance = float(np.var(values, ddof=1)) if len(values) > 1 else 0.0
+    return variance + (float(np.mean(values)) - value) ** 2
+
+
+def checked_level(level: Any) -> float:
+    """The argument `level`, a probability."""
+    return checks.number(level, "level", above=0, below=1, example="0.9")
 
 
 def mixed_bands(sources: Sequence[BandSource], recording: Recording, level: float) -> Bands:
     """Bands over a recording of the mixture of several models; see `prediction_bands`."""
-    level = checks.number(level, "level", above=0, below=1, example="0.9")
     quantile = float(scipy.stats.norm.ppf((1 + level) / 2))
     runs, variances, weights = [], [], []
     for source in sources:
-        y_hat, parts = _run(source.fit, recording)
+        y_hat, parts = _run(source.run, recording)
         lacks = _lacking(source, quantile, level, parts["sensor"][0])
         parts["what the model lacks"] = np.broadcast_to(lacks, y_hat.shape)
         runs.append(y_hat)
@@ -233,7 +260,7 @@ def mixed_bands(sources: Sequence[BandSource], recording: Recording, level: floa
     combined["between models"] = np.einsum("m,mnc->nc", w, np.square(np.array(runs) - middle))
     totals = np.array([np.sum(list(v.values()), axis=0) for v in variances])
     lower, upper = _mixture(np.array(runs), np.sqrt(totals), w, (1 - level) / 2, quantile)
-    m = sources[0].fit.model.mechanism
+    m = sources[0].run.fit.model.mechanism
     return Bands(
         recording=recording,
         channels=m.channels,
@@ -278,9 +305,11 @@ def _weighted(fitted: Any) -> list[tuple[Fit, float]]:
     return found
 
 
-def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], dict[str, np.ndarray]]:
+def _run(
+    fit_for_run: FitForRun, recording: Recording
+) -> tuple[Float[np.ndarray, "N C"], dict[str, np.ndarray]]:
     """A free run, and the variances of its samples by what is uncertain of machine, start and sensor."""
-    model = fitted.model
+    fitted, model = fit_for_run.fit, fit_for_run.fit.model
     m = model.at(recording).mechanism
     names = m.parameter_names
     free = np.array([names.index(n) for n in fitted.free_names], int)
@@ -300,9 +329,11 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
         start = _first_state(run, start, unseen, y, noise, recording.n_init, F)
     y_hat, J = run(start)
     if not (np.isfinite(y_hat).all() and np.isfinite(J).all()):
+        of = f"{recording.source or 'a recording'} ({recording.N * recording.Ts:.3g} s)"
         raise InputError(
-            "The model diverges over a recording, so that it has no bands; fit it first, or leave the "
-            "recording out."
+            f"The model diverges over {of}; bands need finite runs over the recording and over those by "
+            "which the error of the model is measured, which `known` names. Fit the model first, or choose "
+            "other recordings."
         )
     known = np.array([n in recording.constants for n in fitted.free_names], bool)
     J[..., :F][..., known] = 0.0
@@ -322,13 +353,9 @@ def _run(fitted: Fit, recording: Recording) -> tuple[Float[np.ndarray, "N C"], d
         "first state": _propagated(J[..., F:], inverse @ scatter @ inverse),
         "sensor": np.broadcast_to(noise**2, y.shape),
     }
-    own, held = np.zeros_like(y), dict(zip(names, m.values.tolist(), strict=True))
-    for name, each in fitted.local.items():
-        # About the value of the model: the mean of the recordings, or the value assumed for an unknown run.
-        values = np.array([e.value for e in each])
-        scatter = float(np.var(values, ddof=1)) if len(values) > 1 else 0.0
-        spread = scatter + float(np.mean(values) - held[name]) ** 2
-        own = own + spread * np.square(whole[..., fitted.free_names.index(name)])
+    own = np.zeros_like(y)
+    for name, variance in fit_for_run.own.items():
+        own = own + variance * np.square(whole[..., fitted.free_names.index(name)])
     if own.any():
         parts["own of each recording"] = own
     if fitted.options.process_noise is not None:
@@ -484,17 +511,17 @@ def _lacking(
     source: BandSource, quantile: float, level: float, sensor: Float[np.ndarray, " C"]
 ) -> Float[np.ndarray, " C"]:
     """Variance of each channel by what the model lacks."""
-    fitted = source.fit
+    fitted = source.run.fit
     residual = np.array([fitted.noise[c] for c in fitted.model.mechanism.channels])
     if not source.known:
         if fitted.options.process_noise is not None:
             return np.zeros(len(residual))  # predictions leave innovations, which are no errors of a free run
         return np.maximum(residual**2 - sensor, 0.0)
     errors, others = [], []
-    for fit, recording in source.known:
-        y_hat, parts = _run(fit, recording)
+    for run, recording in source.known:
+        y_hat, parts = _run(run, recording)
         seen = slice(recording.n_init, None)
-        errors.append((fit.model.measured(recording).astype(float) - y_hat)[seen])
+        errors.append((run.fit.model.measured(recording).astype(float) - y_hat)[seen])
         others.append(np.sum(list(parts.values()), axis=0)[seen])
     e, v = np.concatenate(errors), np.concatenate(others)
     # Of each sample the variance with which it would lie on the edge of its band.

@@ -51,7 +51,7 @@ def with_held_constants(mechanism: Mechanism, estimates: Sequence[Estimate]) -> 
     Returns:
         The estimates in the same order.
     """
-    now = dict(zip(mechanism.parameter_names, mechanism.values.tolist(), strict=True))
+    now = mechanism.named_values
     estimates = tuple(
         dataclasses.replace(e, value=now[e.name], note=f"tied to {mechanism.followers[e.name]}")
         if e.name in mechanism.followers

@@ -164,7 +164,7 @@ def _correlation(a: np.ndarray, b: np.ndarray, step: int) -> float:
     return float(np.corrcoef(moves[0], moves[1])[0, 1])
 
 
-# A size is beyond the recordings where it is so many times what they reach.
+# A size is beyond the recordings where it is more than this many times the largest signal in them.
 BEYOND = 3.0
 BEYOND_RECORDINGS = "beyond the recordings"
 """Kind of a remark on such a size."""
@@ -237,7 +237,7 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
 
     They are sizes of a signal and more than three times as large as it ever was: the recordings cannot tell
     one size from another, and an effect with such a threshold is inactive. Or they count the repetitions of
-    a law that repeats less than half a time within the motion: it is a spring or a constant torque there.
+    a law of which the motion covers less than half a period: it is a spring or a constant torque there.
 
     Args:
         m: With the values in question.

@@ -106,7 +106,7 @@ class Along:
                 f"Argument `of` must be the full name of a parameter or a function of the values by name, "
                 f"but is {checks.shown(of)}; give for instance {fitted.free_names[0]!r}."
             )
-        values = dict(zip(m.parameter_names, m.values.tolist(), strict=True))
+        values = m.named_values
         try:
             value = checks.real(of(values))
         except (KeyError, TypeError, ValueError, ArithmeticError) as error:
@@ -393,7 +393,7 @@ def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Wal
     plain = _variance(here.H[np.ix_(moves, moves)], row[moves])
     # By the names of the parameters, as their covariance has them.
     m = again.model.mechanism
-    base = dict(zip(m.parameter_names, m.values.tolist(), strict=True))
+    base = m.named_values
     transform = Transform.of(m.parameter_specifications)
     z = transform.unconstrain(m.values)
     gradient = np.zeros(len(again.free_names))

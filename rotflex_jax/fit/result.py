@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -134,8 +134,12 @@ class Fit:
 
     def model_of(self, recording: int) -> Model:
         """The model with the local parameters of one of the fitted recordings, by its number."""
-        own = {name: each[recording].value for name, each in self.local.items()}
-        return dataclasses.replace(self.model, mechanism=self.model.mechanism.with_values(own))
+        return self.with_values({name: each[recording].value for name, each in self.local.items()}).model
+
+    def with_values(self, values: Mapping[str, float]) -> "Fit":
+        """The fit with other values of some parameters in its model; its estimates stay."""
+        mechanism = self.model.mechanism.with_values(values)
+        return dataclasses.replace(self, model=dataclasses.replace(self.model, mechanism=mechanism))
 
     def __getitem__(self, name: str) -> Estimate:
         """An estimate by full name."""

@@ -230,7 +230,7 @@ def random_values(m: Mechanism, free: Sequence[str], seed: int) -> dict[str, Fra
     draw = random.Random(seed)
     return {
         name: Fraction(draw.randint(11, 99), draw.randint(11, 99)) if name in free else exact(value)
-        for name, value in zip(m.parameter_names, m.values.tolist(), strict=True)
+        for name, value in m.named_values.items()
     }
 
 

@@ -361,6 +361,11 @@ class Mechanism:
         return np.array([v for e in self.effects for v in e.values.values()], dtype=float)
 
     @property
+    def named_values(self) -> dict[str, float]:
+        """Parameter values by full name [declared units]."""
+        return dict(zip(self.parameter_names, self.values.tolist(), strict=True))
+
+    @property
     def free_names(self) -> tuple[str, ...]:
         """Parameters that a fit estimates, all but the trusted ones."""
         return tuple(n for n in self.parameter_names if n not in self.trusted)

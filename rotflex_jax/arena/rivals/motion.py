@@ -72,7 +72,7 @@ def motion(train: rf.Recording, fit: rf.Fit | None = None) -> Motion:
     """
     mechanism = (fit or linear_joint(train)).model.mechanism
     joint, inverse = rf.linearise(mechanism), inverse_mass(mechanism)
-    values = dict(zip(mechanism.parameter_names, mechanism.values.tolist(), strict=True))
+    values = mechanism.named_values
     back_emf = values["hub.motor.back_emf"] * values["hub.motor.gear_ratio"]
     mass = np.linalg.inv(inverse)
     found = [_smoothed(train, joint, mass, window, back_emf) for window in WINDOWS]
