@@ -5,7 +5,6 @@ Shared by B0 (wrong worlds) and B9 (measured machines).
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import math
 from collections.abc import Callable, Sequence
@@ -99,7 +98,7 @@ def calibrated(model: rf.Model, recording: rf.Recording) -> tuple[rf.Model, floa
     y, first = shifted.measured(beginning)[:, 0], beginning.n_init
 
     def with_offset(offset: float) -> rf.Model:
-        return dataclasses.replace(shifted, mechanism=shifted.mechanism.with_values({name: offset}))
+        return shifted.with_values({name: offset})
 
     def missed(offset: float) -> float:
         e = (y - with_offset(offset).simulate(beginning)[:, 0])[first:]

@@ -94,7 +94,7 @@ def test_of_parts_of_one_run_the_one_that_has_a_recording_knows_its_offset(parts
 
 def test_another_run_starts_without_the_offset_of_one(found, parts):
     *_, third, other = parts
-    value = dict(zip(found.model.mechanism.parameter_names, found.model.mechanism.values, strict=True))
+    value = found.model.mechanism.named_values
     assert value[OFFSET] == pytest.approx(0.04, abs=0.004)
     assert found.offsets == (("voltage_offset", "input"),)
     assert OFFSET in found.model_of(third).mechanism.parameter_names

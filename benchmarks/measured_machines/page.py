@@ -25,8 +25,9 @@ has law A in the place of the law B that was found; "without C": it does without
 "D separate for each run": each run has a value of its own of this parameter.
 
 """
-BANDS = """Bands of 90 % around free runs over each test recording, made from training and validation data
-alone: how many samples they hold, their mean half width, and what gives most of their variance."""
+BANDS = """Bands of 90 % around free runs over each test recording, of models that have seen training and
+validation data alone: how many samples they hold, their mean half width, and what gives most of their
+variance."""
 
 
 def evaluated(row: Row, stage: str) -> tuple[dict[str, Any], str]:

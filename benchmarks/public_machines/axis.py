@@ -56,7 +56,7 @@ def run(say: Say) -> dict[str, Any]:
 
 def _as_found(start: rf.Mechanism, found: rf.Mechanism) -> rf.Mechanism:
     """The machine with the effects that were found, without the offset that the search carries along."""
-    named = dict(zip(found.parameter_names, found.values.tolist(), strict=True))
+    named = found.named_values
     machine = start
     for effect in found.effects:
         known = {(e.name, e.at) for e in start.effects} | {("voltage_offset", "input")}

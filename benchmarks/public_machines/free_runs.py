@@ -29,7 +29,7 @@ TYPICAL_FORCE = 500.0
 
 def fitted(machine: rf.Mechanism, record: rf.Recording, most: int = 40) -> rf.Mechanism:
     """Numbers with the least squared free run, the first state as the first samples tell it."""
-    named = dict(zip(machine.parameter_names, machine.values.tolist(), strict=True))
+    named = machine.named_values
     specs = dict(zip(machine.parameter_names, machine.parameter_specifications, strict=True))
     free = machine.free_names
     size = np.array([max(abs(named[n]), specs[n].typical) for n in free])
@@ -55,7 +55,7 @@ def missed_by(machine: rf.Mechanism, record: rf.Recording) -> np.ndarray:
     A drift counts from the beginning of the record, so that it is further on in a later part.
     """
     name = "input.voltage_drift.rate"
-    rate = dict(zip(machine.parameter_names, machine.values.tolist(), strict=True)).get(name, 0.0)
+    rate = machine.named_values.get(name, 0.0)
     run = rf.Model(machine).simulate(dataclasses.replace(record, u=record.u + rate * record.start))
     return (run - record.y)[record.n_init :]
 

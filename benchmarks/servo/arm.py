@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import multiprocessing
 import time
@@ -145,8 +144,7 @@ def _run(parameters: dict[str, Any], name: str, recording: rf.Recording) -> np.n
         return run[: recording.N * SUBSTEPS : SUBSTEPS]
     model = with_effects(starts()[0], _effects(name))
     values = {n: v[0] if isinstance(v, list) else v for n, v in parameters.items()}
-    model = dataclasses.replace(model, mechanism=model.mechanism.with_values(values))
-    return model.simulate(recording)[:, 0]
+    return model.with_values(values).simulate(recording)[:, 0]
 
 
 def joint_row(

@@ -8,7 +8,6 @@ diverse legged robots, 2025, arXiv 2509.06342 (PACE).
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -105,7 +104,7 @@ def evolved_alike(
     began = time.perf_counter()
     found = minimise(cost, lower, upper, rollouts, seed)
     values: Mapping[str, float] = dict(zip(names, found.x.tolist(), strict=True))
-    return dataclasses.replace(model, mechanism=model.mechanism.with_values(values)), {
+    return model.with_values(values), {
         "seconds": time.perf_counter() - began,
         "rollouts": found.evaluations * len(train),
         "restarts": found.restarts,

@@ -7,8 +7,9 @@ An offset of the voltage or a bias of a sensor belongs to a run. A run that was 
 one nothing is known but how large they were in the runs that were fitted, and its band is wider by that.
 """
 
-import math
 from collections.abc import Sequence
+
+import numpy as np
 
 from rotflex_jax.discover.result import KnownRuns, SearchResult
 from rotflex_jax.discover.verdict import Verdict
@@ -29,7 +30,7 @@ def bands_of_final_fit(
 
     Args:
         result: A search with a final fit.
-        recording: Its input and first samples are used.
+        recording: Its input, its first samples and the noise of its sensors are used.
         level: Probability.
         known: Recordings by which the error of the model is measured; those that were fitted if none.
     """
@@ -38,14 +39,13 @@ def bands_of_final_fit(
     runs = KnownRuns.of(result.train, result.validation)._replace(recordings=fitted)
 
     def for_run(r: Recording) -> FitForRun:
-        has, k = result.model_of(r).mechanism.named_values, runs.index(r)
-        values = {name: has.get(name, 0.0) for name in fit.local}  # an offset that the model lacks is zero
-        own = {
-            name: scatter(each, values[name])
-            if k is None
-            else scatter([each[k]], values[name]) + _more_than_of_mean(each[k], fit[name])
-            for name, each in fit.local.items()
-        }
+        used, k = result.model_of(r).mechanism.named_values, runs.index(r)
+        values = {name: used.get(name, 0.0) for name in fit.local}  # an offset that the model lacks is zero
+        if k is None:
+            own = {name: scatter(each, values[name]) for name, each in fit.local.items()}
+        else:
+            of_run = {name: each[k] for name, each in fit.local.items()}
+            own = {n: (e.value - values[n]) ** 2 + _beyond_mean(fit, e) for n, e in of_run.items()}
         return FitForRun(fit.with_values(values), own)
 
     measured_by = [(for_run(r), r) for r in known or fitted]
@@ -64,7 +64,7 @@ def bands_of_sets(
     Args:
         result: A search.
         fits: Its probable sets fitted to the training recordings, each with its probability.
-        recording: Its input and first samples are used.
+        recording: Its input, its first samples and the noise of its sensors are used.
         level: Probability.
         known: Recordings by which the error of each model is measured. Where there are none and the search
             ends unexplained, its validation recordings.
@@ -90,7 +90,11 @@ def bands_of_sets(
     return mixed_bands(sources, recording, level)
 
 
-def _more_than_of_mean(own: Estimate, mean: Estimate) -> float:
-    """Variance of the value of a run beyond that of the mean over runs, which the covariance of a fit has."""
-    more = own.std**2 - mean.std**2
-    return max(more, 0.0) if math.isfinite(more) else 0.0
+def _beyond_mean(fit: Fit, own: Estimate) -> float:
+    """Variance of a run's own value beyond that of the mean over runs, which the covariance of a fit holds.
+
+    What the value has in common with other parameters is taken to be as in the mean.
+    """
+    i = fit.free_names.index(own.name)
+    of_mean = float(np.nan_to_num(fit.covariance[i, i]))
+    return max(own.std**2 - of_mean, 0.0) if np.isfinite(own.std) else 0.0

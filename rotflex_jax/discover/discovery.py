@@ -1,6 +1,7 @@
 """The result of `discover`: what was found, and what can be done with it."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -52,10 +53,10 @@ LISTED_CANDIDATES = 8
 class Discovery(SearchResult):
     """What a search found, with its report, the torques that are missing, and the next experiment."""
 
-    # Once fitted; what takes another field by `dataclasses.replace` begins without.
-    _fits: list[tuple[Fit, float]] = dataclasses.field(
-        default_factory=list, init=False, repr=False, compare=False
-    )
+    @functools.cached_property
+    def _fits(self) -> list[tuple[Fit, float]]:
+        """Filled by the first call of `_probable_fits`."""
+        return []
 
     def __str__(self) -> str:
         return "\n".join(part for part in (super().__str__(), final_fit_sentence(self)) if part)
@@ -137,18 +138,19 @@ class Discovery(SearchResult):
 
         Where a search ends unexplained and has a final fit, bands are of that fit, and what it lacks is as
         large as free runs over the fitted recordings show it. Otherwise the probable sets are fitted to the
-        training recordings and weigh as much as they are probable; of a search without probabilities the
-        final model counts alone. That none of the sets is right is in the bands of a search that ends
+        training recordings, once, and weigh as much as they are probable; of a search without probabilities
+        the final model counts alone. That none of the sets is right is in the bands of a search that ends
         unexplained, by its validation recordings, and wherever recordings are `known`.
 
-        A run that was not fitted has offsets and biases of its own, about as large as those of fitted runs,
-        unless other runs have shown the same ones.
+        A run that was not fitted has offsets and biases of its own in the place of those that single runs
+        have shown, about as large.
 
         Args:
-            recording: Its input and first samples are used, its other samples only by `coverage`.
+            recording: Its input, its first samples and the noise of its sensors are used, its other samples
+                only by `coverage`.
             level: Probability, between 0 and 1.
             known: Recordings by which the error of models is measured, see `rotflex_jax.prediction_bands`.
-            progress: Called with a line of text at each fit.
+            progress: Called with a line of text at each fit of a set.
 
         Raises:
             InputError: As `rotflex_jax.prediction_bands`.
@@ -165,7 +167,7 @@ class Discovery(SearchResult):
             fits, share = (
                 models_of(self, say) if self.probabilities else ({"": fit(self.model, self.train)}, None)
             )
-            self._fits.extend((fitted, share[name] if share else 1.0) for name, fitted in fits.items())
+            self._fits[:] = [(fitted, share[name] if share else 1.0) for name, fitted in fits.items()]
         return self._fits
 
     def next_experiment(self, **changes: Any) -> Experiment | None:

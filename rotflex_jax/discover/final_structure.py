@@ -241,7 +241,7 @@ def fit_structures(
 
 
 def _common(of_runs: Sequence[Estimate]) -> Estimate:
-    """What runs have in common by the estimates of each; see `Structure.with_common_offsets`.
+    """What runs have in common by the estimates of each; see `FittedStructure.with_common_offsets`.
 
     Its interval has the width of that of their mean, by how they differ.
     """

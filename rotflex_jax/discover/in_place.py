@@ -147,6 +147,8 @@ def _in_place(
             final.free_run, hypothesis=without(s, final.free_run.hypothesis, location)
         ),
     )
+    if starts:
+        state.say(f"  fitting {', '.join(str(c.location) for c in starts)} in the place of {location}")
     fitted = refit_and_validate(state, less, starts, starts) if starts else []
     counts = {r: parameter_count(s, v.hypothesis, r) for r, v in known.items()}
     return [

@@ -258,6 +258,12 @@ def _eliminate(state: SearchState) -> Eliminated:
     h, runs = state.current.hypothesis, state.current.free_run.hypothesis
     needed = eliminate(state.horizons, h, runs, list(state.scores))
     state.worth = needed.worth
+    for location in (p for p in state.scores if p in h.locations):
+        if location not in needed.prediction.locations:
+            state.say(f"  left out: {location}")
+        elif 0 < needed.worth.get(location, 0.0) < np.inf:
+            lost = f"{needed.worth[location]:.0f} nats less of predictions on training data"
+            state.say(f"  without {location}: {lost}")
     state.current = state.horizons.validated(needed.prediction, needed.free_run, state.current)
     state.tried.insert(0, state.current)
     return needed

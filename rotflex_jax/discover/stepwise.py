@@ -544,7 +544,7 @@ def calibration_notes(
         own: Those that the search does not carry over.
         used: The mechanism to use, which may have what all runs have in common of them.
     """
-    common = dict(zip(used.parameter_names, used.values.tolist(), strict=True))
+    common = used.named_values
     out = []
     for location in own:
         for i in s.parameter_indices(location):

@@ -95,7 +95,7 @@ def rival_set(
     for m, (_, source) in zip(complete, items, strict=True):
         mine = {(e.name, e.at) for e in m.effects}
         gates.append([float((e.name, e.at) in mine) for e in union.effects])
-        of = dict(zip(m.parameter_names, m.values, strict=True))
+        of = m.named_values
         v = np.array([of.get(n, x) for n, x in zip(names, union.values, strict=True)])
         v[own] = 0.0
         pick = np.array(

@@ -170,7 +170,7 @@ def prediction_bands(
     as that of a friction, are estimated from them too where the recording does not start at rest. The
     variance of a sample adds up parameters (by the covariance of the fit, with the first state that follows
     them), the first state (by the noise of the samples that it is estimated on), parameters that each
-    recording has for itself (by their spread), process torques (by the linear part of the machine), the
+    recording has for itself (by their scatter), process torques (by the linear part of the machine), the
     noise of the sensors, and what the model lacks. That is a constant for each channel, so large that bands
     over `known` recordings hold the share `level` of their samples; without any as large as the residuals of
     the fit beyond the sensor's noise, and nothing where these are of predictions, which do not show what a
@@ -181,7 +181,8 @@ def prediction_bands(
 
     Args:
         fitted: A fit; or pairs of a fit and its weight, one for each set of effects that may be true.
-        recording: Its input and first samples are used, its other samples only by `coverage`.
+        recording: Its input, its first samples and the noise of its sensors are used, its other samples only
+            by `coverage`.
         level: Probability, between 0 and 1.
         known: Recordings of the same machine by which the error of the model is measured, best some that were
             not fitted.
@@ -332,8 +333,8 @@ def _run(
         of = f"{recording.source or 'a recording'} ({recording.N * recording.Ts:.3g} s)"
         raise InputError(
             f"The model diverges over {of}; bands need finite runs over the recording and over those by "
-            "which the error of the model is measured, which `known` names. Fit the model first, or choose "
-            "other recordings."
+            "which the error of the model is measured (`known`; of a search without it, its own). Choose "
+            "other recordings, or fit again."
         )
     known = np.array([n in recording.constants for n in fitted.free_names], bool)
     J[..., :F][..., known] = 0.0
@@ -346,11 +347,11 @@ def _run(
     H = np.einsum("ncs,c,nct->st", first, weight, first) + prior
     inverse = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
     follows = -inverse @ np.einsum("ncs,c,ncp->sp", first, weight, by)
-    scatter = np.einsum("ncs,c,nct->st", first, (weight * noise) ** 2, first) + prior
+    squares = np.einsum("ncs,c,nct->st", first, (weight * noise) ** 2, first) + prior
     whole = J[..., :F] + J[..., F:] @ follows
     parts = {
         "parameters": _propagated(whole, _finite(fitted.covariance)),
-        "first state": _propagated(J[..., F:], inverse @ scatter @ inverse),
+        "first state": _propagated(J[..., F:], inverse @ squares @ inverse),
         "sensor": np.broadcast_to(noise**2, y.shape),
     }
     own = np.zeros_like(y)

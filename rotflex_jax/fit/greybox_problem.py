@@ -331,8 +331,7 @@ class GreyBoxProblem:
 
     def model_at(self, point: FitPoint, recording: int) -> Model:
         """The model of a recording."""
-        m = self.model.mechanism
-        return dataclasses.replace(self.model, mechanism=m.with_values(self.physical(point)[0][recording]))
+        return self.model.with_values(self.physical(point)[0][recording])
 
     def horizons(self, seconds: float | None) -> list[Windows]:
         """Windows of some seconds, or whole recordings, behind those of shorter horizons on the way there.

@@ -315,7 +315,7 @@ def many_starts(
         raise InputError(
             "The model diverges from every start, so that none has an error; give values that are nearer."
         )
-    fitted = dataclasses.replace(model, mechanism=m.with_values(found.values[order[0]]))
+    fitted = model.with_values(found.values[order[0]])
     cost = float(found.cost[order[0]])
     return ManyStarts(fitted, cost, found.cost[order], found.values[order], found.steps[order], starts)
 

@@ -134,12 +134,11 @@ class Fit:
 
     def model_of(self, recording: int) -> Model:
         """The model with the local parameters of one of the fitted recordings, by its number."""
-        return self.with_values({name: each[recording].value for name, each in self.local.items()}).model
+        return self.model.with_values({name: each[recording].value for name, each in self.local.items()})
 
     def with_values(self, values: Mapping[str, float]) -> "Fit":
         """The fit with other values of some parameters in its model; its estimates stay."""
-        mechanism = self.model.mechanism.with_values(values)
-        return dataclasses.replace(self, model=dataclasses.replace(self.model, mechanism=mechanism))
+        return dataclasses.replace(self, model=self.model.with_values(values))
 
     def __getitem__(self, name: str) -> Estimate:
         """An estimate by full name."""

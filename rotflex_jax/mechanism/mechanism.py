@@ -377,7 +377,7 @@ class Mechanism:
         if isinstance(values, Mapping):
             for name in values:
                 self._must_exist(name)
-            old = dict(zip(self.parameter_names, self.values, strict=True))
+            old = self.named_values
             for name in self.followers:
                 # Beside a value of what it follows it may stand as it was: the whole vector by name.
                 own = values.get(name, old[name])

@@ -127,6 +127,12 @@ class Model:
 
         return read(path).model
 
+    def with_values(
+        self, values: Mapping[str, float] | Sequence[Any] | Real[np.ndarray, " P"] | Real[jax.Array, "P ..."]
+    ) -> "Model":
+        """The model with other parameter values, by full name or as the whole vector."""
+        return dataclasses.replace(self, mechanism=self.mechanism.with_values(values))
+
     def at(self, recording: Recording) -> "Model":
         """The model with the constants of a recording in the place of its own.
 
@@ -143,7 +149,7 @@ class Model:
                     f"{parameter!r}; use one of {own}."
                 )
         known = {n: v for n, v in recording.constants.items() if n in names}
-        return dataclasses.replace(self, mechanism=self.mechanism.with_values(known)) if known else self
+        return self.with_values(known) if known else self
 
     def measured(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """The channels of a recording that the mechanism has as outputs, in its order."""

@@ -286,7 +286,7 @@ class Explorer:
         fitted = fit(Model(mechanism, **self._solver), self._train, window_seconds=self._seconds)
         self._remember()
         found = fitted.model.mechanism
-        values = dict(zip(found.parameter_names, found.values.tolist(), strict=True))
+        values = found.named_values
         self._base, self._factors = on.mechanism.with_values(values), {}
         self._said = f"refitted: {fitted.ending}"
         self._silently(self._set_sliders)
@@ -387,7 +387,7 @@ class Explorer:
         """The model that the widgets say."""
         labels = [effect_label(e.name, e.at) for e in self._base.effects]
         gates = tuple(float(self.switches[x].value) if x in self.switches else 1.0 for x in labels)
-        values = dict(zip(self._base.parameter_names, self._base.values.tolist(), strict=True))
+        values = self._base.named_values
         changed = {name: factor * values[name] for name, factor in self._factors.items()}
         return Model(self._base.with_values(changed), gates=gates, **self._solver)
 
@@ -412,7 +412,7 @@ class Explorer:
             read = readable(1.0, self._units[channel])
             rows.append((channel, read[1], *(plain_number(read[0] * e) for e in (before, now)), change))
         m, named = self.model.mechanism, dict.fromkeys((*self.sliders, self.parameter.value))
-        values = dict(zip(m.parameter_names, m.values.tolist(), strict=True))
+        values = m.named_values
         lines = [f"{name} = {values[name]:.4g} {self._unit[name]}".rstrip() for name in named]
         self._text.value = card(
             f"Error of free runs of {self._seconds:g} s",

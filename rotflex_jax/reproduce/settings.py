@@ -359,7 +359,7 @@ def machine_rows(s: Settings) -> list[dict[str, Any]]:
     ['hub.inertia.inertia', 'arm.inertia.inertia']
     """
     before, after = _scenario(s), machine(s)
-    listed = dict(zip(linear_joint(s).parameter_names, linear_joint(s).values, strict=True))
+    listed = linear_joint(s).named_values
     settings_of_their_own = {"hub.motor.efficiency", "hub.motor.inductance", "input.saturation.limit"}
     rows = []
     for name, spec, default, value in zip(
