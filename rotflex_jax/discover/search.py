@@ -225,7 +225,7 @@ def _simplify(state: SearchState) -> None:
     if swaps:  # beside another law other effects and calibrations may be needless
         needed = _eliminate(state)
     final = state.current.hypothesis
-    order = [p for p in state.scores if p in final.locations]
+    order = state.in_order(final.locations)
     order += sorted(set(final.locations) - set(order), key=lambda p: -state.worth[p])
     reported = state.reported
     problem, validation = reported.problem, reported.validation

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from rotflex_jax.discover.checkpoint import (
@@ -209,6 +209,20 @@ class SearchState:
         self.current = dataclasses.replace(found, location=None, parameter_count=0)
         self.passed.append(self.current)
         self.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
+
+    def in_order(self, on: Collection[EffectLocation]) -> list[EffectLocation]:
+        """Those of some effects that were added, in order.
+
+        A law stands where an earlier one of the same thing was added that is off: more of what was already
+        found is no later discovery.
+        """
+        added, other_laws = list(self.scores), self.problem.supermodel.other_laws
+
+        def place(location: EffectLocation) -> int:
+            before = [p for p in other_laws(location) if p in added and p not in on]
+            return min(map(added.index, [location, *before]))
+
+        return sorted((p for p in added if p in on), key=place)
 
     def replace(self, old: EffectLocation, found: ValidatedHypothesis) -> None:
         """Put another law in the place of an effect that was added, whose score and gains remain."""
