@@ -1,6 +1,7 @@
 """The model of a search that ends unexplained is fitted once more, to all recordings that had a say."""
 
 import dataclasses
+import functools
 import json
 import re
 import sys
@@ -18,6 +19,7 @@ from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
 from rotflex_jax.discover.final_structure import FinalStructure
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.selection import choose
+from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
 from rotflex_jax.effects import Coulomb
 from rotflex_jax.experiment import until_decided
@@ -686,3 +688,83 @@ def test_the_ratio_of_errors_weighs_channels_alike():
     assert log_error_ratio(RunErrors({}, a), RunErrors({}, b | {"alpha": np.inf})) == -np.inf
     assert log_error_ratio(RunErrors({}, a), RunErrors({}, b | {"alpha": 0.0})) > MOST_WORSE
     assert 0 < MOST_WORSE < np.log(2)
+
+
+COULOMB_HUB, LAG, COGGING, BIAS, LUGRE_HUB = (
+    EffectLocation(*p)
+    for p in (
+        ("coulomb", "hub"),
+        ("lag", "input"),
+        ("cogging", "arm"),
+        ("sensor_bias", "alpha"),
+        ("lugre", "hub"),
+    )
+)
+
+
+def fewer_effects(monkeypatch, needed=(), spoken_for=(), unlike_search=()):
+    """What becomes of friction, lag, cogging and a bias, where LuGre friction took the place of Coulomb's.
+
+    Args:
+        monkeypatch: Replaces the fits.
+        needed: Effects that free runs of all recordings prefer.
+        spoken_for: Those without which runs of validation data are worse by more than a tenth.
+        unlike_search: Those without which they are worse than the search's by more than is allowed.
+    """
+    said, every = [], (LUGRE_HUB, LAG, COGGING, BIAS)
+
+    def fitted(on):
+        structure = SimpleNamespace(on=on)
+        less = lambda left_out: SimpleNamespace(on=tuple(p for p in on if p not in left_out))  # noqa: E731
+        return SimpleNamespace(structure=structure, fit=on, without=less)
+
+    def errors(on):
+        lost = 0.15 if set(spoken_for) - set(on) else 0.0
+        return RunErrors({}, {"theta": np.exp(lost + (0.05 if set(unlike_search) - set(on) else 0.0))})
+
+    def tried(structures):
+        return [MODULE._Tried([fitted(x.on)], errors(x.on)) for x in structures]
+
+    monkeypatch.setattr(MODULE, "fit_structures", lambda asked: [fitted(x.on) for x, _ in asked])
+    last = SimpleNamespace(
+        state=SimpleNamespace(
+            say=said.append,
+            problem=SimpleNamespace(supermodel=SimpleNamespace(calibrations=(BIAS,))),
+        ),
+        recordings=(),
+        runs_prefer=lambda a, b: bool((set(a) - set(b)) & set(needed)),
+        tried=tried,
+        searched=RunErrors({}, {"theta": np.exp(-0.17)}),
+    )
+    last.without_effect = functools.partial(MODULE._LastFit.without_effect, last)
+    candidate = MODULE._Candidate(*tried([SimpleNamespace(on=every)]), fitted(every))
+    candidate = candidate._replace(laws=((COULOMB_HUB, LUGRE_HUB),))
+    return MODULE._LastFit.without_needless_effects(last, candidate), said
+
+
+def test_effects_that_free_runs_hardly_need_are_not_in_the_model_to_use(monkeypatch):
+    """The last one is tried first; the first one and calibrations are not tried."""
+    found, said = fewer_effects(monkeypatch)
+    assert said == [f"  without {p}" for p in (COGGING, LAG)]
+    assert found.left_out == (COGGING, LAG) and found.fitted.structure.on == (LUGRE_HUB, BIAS)
+    assert found.tried.structure.on == (LUGRE_HUB, BIAS) and found.laws == ((COULOMB_HUB, LUGRE_HUB),)
+
+
+@pytest.mark.parametrize("reason", ["needed", "spoken_for", "unlike_search"])
+def test_an_effect_that_free_runs_need_stays(monkeypatch, reason):
+    found, _ = fewer_effects(monkeypatch, **{reason: [COGGING]})
+    assert found.left_out == (LAG,) and found.fitted.structure.on == (LUGRE_HUB, COGGING, BIAS)
+
+
+def test_of_a_law_in_the_place_of_one_that_was_found_that_one_is_left_out(monkeypatch):
+    candidate, _ = fewer_effects(monkeypatch, needed=[LAG, COGGING])
+    candidate = candidate._replace(laws=((EffectLocation("delay", "input"), LAG),))
+    last = SimpleNamespace(
+        state=SimpleNamespace(say=print),
+        recordings=(),
+        runs_prefer=lambda a, b: False,
+        tried=lambda structures: [candidate.tried],
+        searched=candidate.tried.errors,
+    )
+    found = MODULE._LastFit.without_effect(last, candidate, LAG)
+    assert found.left_out == (EffectLocation("delay", "input"),) and found.laws == ()

@@ -21,8 +21,8 @@ Written by `python benchmarks/B9_measured.py`. Learnt from some recordings, deci
 evaluated on others that had no say. Root mean square errors of free runs over the whole test and over windows
 of 2 s, of all channels; calibrated: with the voltage offset that the first 2 s of each test recording ask
 for. Provisional rounds are in brackets, look-alikes after an equals sign. "fitted to all, A for B": that fit
-has law A in the place of the law B that was found; "without C": it does without an offset that was found;
-"D separate for each run": each run has a value of its own of this parameter.
+has law A in the place of the law B that was found; "without C": it does without an effect or offset that
+was found; "D separate for each run": each run has a value of its own of this parameter.
 
 """
 BANDS = """Bands of 90 % around free runs over each test recording, of models that have seen training and

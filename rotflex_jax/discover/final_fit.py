@@ -15,7 +15,8 @@ In a search each free run has a first state of its own, which hides much of what
 friction from another. From measured first states it shows: a law that the search cannot exclude, or that
 contains the one found, takes its place where these runs prefer it beyond doubt. Where every run prefers
 beyond doubt a friction of its own size, each has it. An offset that a single run has shown is left out where
-that run hardly needs it.
+that run hardly needs it; so is an effect beside the first one that such runs are not clearly better with:
+predictions may ask for it to make up, within a few samples, for what no candidate explains.
 """
 
 import dataclasses
@@ -130,7 +131,7 @@ class _Candidate(NamedTuple):
         tried: The structure fitted without the validation data, which may speak against it.
         fitted: It is fitted to all; its friction may belong to runs, unlike in `tried`.
         laws: Pairs of an effect that was found and the law that stands in its place.
-        left_out: Offsets that were found and that the structure does without.
+        left_out: Effects and offsets that were found and that the structure does without.
     """
 
     tried: _Tried
@@ -184,7 +185,12 @@ class _LastFit:
         ]
         best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
         candidates = [_Candidate(best, self.fitted_to_all(best))]
-        for improved in (self.without_needless_offsets, self.with_better_laws, self.with_own_friction):
+        for improved in (
+            self.without_needless_offsets,
+            self.with_better_laws,
+            self.without_needless_effects,
+            self.with_own_friction,
+        ):
             if (better := improved(candidates[-1])) is not candidates[-1]:
                 candidates.append(better)
         made = self.accepted(candidates.pop())
@@ -231,6 +237,35 @@ class _LastFit:
             return candidate
         fewer = candidate._replace(tried=tried, fitted=fitted, left_out=tuple(offsets))
         return candidate if isinstance(self.accepted(fewer), Refused) else fewer
+
+    def without_needless_effects(self, candidate: _Candidate) -> _Candidate:
+        """The same without effects that free runs of all recordings are not clearly better with.
+
+        The last one found is tried first, and the first one stays.
+        """
+        calibrations = self.state.problem.supermodel.calibrations
+        effects = [p for p in candidate.tried.structure.on if p not in calibrations]
+        for location in reversed(effects[1:]):
+            candidate = self.without_effect(candidate, location)
+        return candidate
+
+    def without_effect(self, candidate: _Candidate, location: EffectLocation) -> _Candidate:
+        """The candidate without an effect, if that is not clearly worse."""
+        self.state.say(f"  without {location}")
+        (fewer,) = fit_structures([(candidate.fitted.without([location]), self.recordings)])
+        if self.runs_prefer(candidate.fitted.fit, fewer.fit):
+            return candidate
+        (tried,) = self.tried([fewer.structure])
+        worse = log_error_ratio(tried.errors, candidate.tried.errors)
+        if worse > FREE_RUN_BETTER or log_error_ratio(tried.errors, self.searched) > MOST_WORSE:
+            return candidate
+        found = {used: before for before, used in candidate.laws}
+        return candidate._replace(
+            tried=tried,
+            fitted=fewer,
+            laws=tuple(pair for pair in candidate.laws if pair[1] != location),
+            left_out=(*candidate.left_out, found.get(location, location)),
+        )
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
         """The same with laws that free runs of all recordings prefer in the places of those found."""

@@ -219,7 +219,8 @@ class FinalFit:
         test_calibrated: The same with each recording's own offsets.
         laws: Pairs of an effect that the search has found and the law that stands in its place in this model.
         friction: Sizes of dry friction that each run has for itself, by full name; `model` has their mean.
-        left_out: Offsets that the search has found in the only run, which is not clearly worse without.
+        left_out: Effects, and offsets of the only run, that the search has found and without which free runs
+            are not clearly worse.
     """
 
     fit: Fit

@@ -176,11 +176,11 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         if sizes
         else ""
     )
-    offsets = " and ".join(effect_phrase(*p) for p in found.left_out)
+    needless = " and ".join(effect_phrase(*p) for p in found.left_out)
     left_out = (
-        f" It is without {offsets}, which the search has found: such runs are not clearly worse, and "
+        f" It is without {needless}, which the search has found: such runs are not clearly worse, and "
         "other recordings may not have it."
-        if offsets
+        if needless
         else ""
     )
     return (
