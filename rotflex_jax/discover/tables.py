@@ -177,9 +177,10 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         else ""
     )
     needless = " and ".join(effect_phrase(*p) for p in found.left_out)
+    pronoun = "it" if len(found.left_out) == 1 else "them"
     left_out = (
         f" It is without {needless}, which the search has found: such runs are not clearly worse, and "
-        "other recordings may not have it."
+        f"other recordings may not have {pronoun}."
         if needless
         else ""
     )
