@@ -147,7 +147,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
             (name, *_shown(e), together(e.unit), _later(discovery, e), e.note, together(e.given_words))
             for name, e in added.parameters.items()
         ],
-        "gain": plain_number(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
+        "gain": _with_sign(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
         "status_sentence": status_sentence(added),
         "is_established": added.status == "established",
         "score": plain_number(added.score),
@@ -311,3 +311,12 @@ def render(discovery: SearchResult, explanation: Explanation | None = None) -> s
     return fill_template(
         "rotflex_jax.report", "report.html.j2", content(discovery, explanation or Explanation())
     )
+
+
+def _with_sign(value: float) -> str:
+    """A number with its sign.
+
+    >>> _with_sign(416.2), _with_sign(-89.3)
+    ('+ 416', '− 89.3')
+    """
+    return f"{'+' if value >= 0 else '−'} {plain_number(abs(value))}"
