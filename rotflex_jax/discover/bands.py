@@ -78,7 +78,7 @@ def bands_of_sets(
         if runs.compared or runs.index(r) is not None:
             return FitForRun(fit, {})
         of_run = [n for n in fit.free_names if any(n.startswith(each) for each in calibrating)]
-        own = {n: scatter([fit[n]], 0.0) for n in of_run}
+        own = {n: fit[n].value ** 2 for n in of_run}
         return FitForRun(fit.with_values(dict.fromkeys(of_run, 0.0)), own)
 
     if not known and result.verdict == Verdict.UNEXPLAINED:

@@ -147,9 +147,10 @@ def _in_place(
             final.free_run, hypothesis=without(s, final.free_run.hypothesis, location)
         ),
     )
+    fitted = []
     if starts:
         state.say(f"  fitting {', '.join(str(c.location) for c in starts)} in the place of {location}")
-    fitted = refit_and_validate(state, less, starts, starts) if starts else []
+        fitted = refit_and_validate(state, less, starts, starts)
     counts = {r: parameter_count(s, v.hypothesis, r) for r, v in known.items()}
     return [
         *(dataclasses.replace(v, location=r, parameter_count=counts[r]) for r, v in known.items()),

@@ -285,9 +285,7 @@ class Explorer:
                 mechanism = mechanism.without(e.name, e.at)
         fitted = fit(Model(mechanism, **self._solver), self._train, window_seconds=self._seconds)
         self._remember()
-        found = fitted.model.mechanism
-        values = found.named_values
-        self._base, self._factors = on.mechanism.with_values(values), {}
+        self._base, self._factors = on.mechanism.with_values(fitted.model.mechanism.named_values), {}
         self._said = f"refitted: {fitted.ending}"
         self._silently(self._set_sliders)
         self._changed(None)

@@ -188,6 +188,15 @@ def _later(discovery: SearchResult, estimate: Estimate) -> str:
     return ""
 
 
+def _with_sign(value: float) -> str:
+    """A number with its sign.
+
+    >>> _with_sign(416.2), _with_sign(-89.3)
+    ('+ 416', '− 89.3')
+    """
+    return f"{'−' if value < 0 else '+'} {plain_number(abs(value))}"
+
+
 def _p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
 
@@ -273,7 +282,7 @@ def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> di
         "port": learned.at,
         "kept": learned.kept,
         "falls": ", ".join(falls),
-        "gain": plain_number(learned.held_out_gain_nats) + "\xa0nat",
+        "gain": _with_sign(learned.held_out_gain_nats) + "\xa0nat",
         "formula": together(equation(f"tau = {learned.reading}")) if learned.formula.terms else "",
         "terms": [
             (
@@ -311,12 +320,3 @@ def render(discovery: SearchResult, explanation: Explanation | None = None) -> s
     return fill_template(
         "rotflex_jax.report", "report.html.j2", content(discovery, explanation or Explanation())
     )
-
-
-def _with_sign(value: float) -> str:
-    """A number with its sign.
-
-    >>> _with_sign(416.2), _with_sign(-89.3)
-    ('+ 416', '− 89.3')
-    """
-    return f"{'+' if value >= 0 else '−'} {plain_number(abs(value))}"
