@@ -702,69 +702,62 @@ COULOMB_HUB, LAG, COGGING, BIAS, LUGRE_HUB = (
 )
 
 
-def fewer_effects(monkeypatch, needed=(), spoken_for=(), unlike_search=()):
+def fewer_effects(needed=(), spoken_for=(), refused=()):
     """What becomes of friction, lag, cogging and a bias, where LuGre friction took the place of Coulomb's.
 
     Args:
-        monkeypatch: Replaces the fits.
         needed: Effects that free runs of all recordings prefer.
         spoken_for: Those without which runs of validation data are worse by more than a tenth.
-        unlike_search: Those without which they are worse than the search's by more than is allowed.
+        refused: Those without which the fit would not be accepted.
     """
     said, every = [], (LUGRE_HUB, LAG, COGGING, BIAS)
 
-    def fitted(on):
-        structure = SimpleNamespace(on=on)
-        less = lambda left_out: SimpleNamespace(on=tuple(p for p in on if p not in left_out))  # noqa: E731
-        return SimpleNamespace(structure=structure, fit=on, without=less)
-
-    def errors(on):
-        lost = 0.15 if set(spoken_for) - set(on) else 0.0
-        return RunErrors({}, {"theta": np.exp(lost + (0.05 if set(unlike_search) - set(on) else 0.0))})
+    def fitted(on, data):
+        less = lambda left_out: SimpleNamespace(  # noqa: E731
+            on=tuple(p for p in on if p not in left_out), start=data
+        )
+        return SimpleNamespace(structure=SimpleNamespace(on=on), fit=on, without=less)
 
     def tried(structures):
-        return [MODULE._Tried([fitted(x.on)], errors(x.on)) for x in structures]
+        (structure,) = structures
+        assert structure.start == "training"  # a fit to all has seen the validation data
+        lost = 0.15 if set(spoken_for) - set(structure.on) else 0.0
+        errors = RunErrors({}, {"theta": np.exp(lost)})
+        return [MODULE._Tried([fitted(structure.on, "training")], errors)]
 
-    monkeypatch.setattr(MODULE, "fit_structures", lambda asked: [fitted(x.on) for x, _ in asked])
     last = SimpleNamespace(
         state=SimpleNamespace(
             say=said.append,
             problem=SimpleNamespace(supermodel=SimpleNamespace(calibrations=(BIAS,))),
         ),
-        recordings=(),
         runs_prefer=lambda a, b: bool((set(a) - set(b)) & set(needed)),
         tried=tried,
-        searched=RunErrors({}, {"theta": np.exp(-0.17)}),
+        fitted_to_all=lambda tried: fitted(tried.structure.on, "all"),
+        accepted=lambda c: MODULE.Refused("") if set(refused) - set(c.fitted.structure.on) else (),
     )
-    last.without_effect = functools.partial(MODULE._LastFit.without_effect, last)
-    candidate = MODULE._Candidate(*tried([SimpleNamespace(on=every)]), fitted(every))
-    candidate = candidate._replace(laws=((COULOMB_HUB, LUGRE_HUB),))
-    return MODULE._LastFit.without_needless_effects(last, candidate), said
+    last.without = functools.partial(MODULE._LastFit.without, last)
+    (found,) = tried([SimpleNamespace(on=every, start="training")])
+    candidate = MODULE._Candidate(found, last.fitted_to_all(found), laws=((COULOMB_HUB, LUGRE_HUB),))
+    return MODULE._LastFit.without_needless_effects(last, candidate), said, last
 
 
-def test_effects_that_free_runs_hardly_need_are_not_in_the_model_to_use(monkeypatch):
+def test_effects_that_free_runs_hardly_need_are_not_in_the_model_to_use():
     """The last one is tried first; the first one and calibrations are not tried."""
-    found, said = fewer_effects(monkeypatch)
+    found, said, _ = fewer_effects()
     assert said == [f"  without {p}" for p in (COGGING, LAG)]
     assert found.left_out == (COGGING, LAG) and found.fitted.structure.on == (LUGRE_HUB, BIAS)
     assert found.tried.structure.on == (LUGRE_HUB, BIAS) and found.laws == ((COULOMB_HUB, LUGRE_HUB),)
 
 
-@pytest.mark.parametrize("reason", ["needed", "spoken_for", "unlike_search"])
-def test_an_effect_that_free_runs_need_stays(monkeypatch, reason):
-    found, _ = fewer_effects(monkeypatch, **{reason: [COGGING]})
+@pytest.mark.parametrize("reason", ["needed", "spoken_for", "refused"])
+def test_an_effect_that_free_runs_need_stays(reason):
+    found, _, _ = fewer_effects(**{reason: [COGGING]})
     assert found.left_out == (LAG,) and found.fitted.structure.on == (LUGRE_HUB, COGGING, BIAS)
 
 
-def test_of_a_law_in_the_place_of_one_that_was_found_that_one_is_left_out(monkeypatch):
-    candidate, _ = fewer_effects(monkeypatch, needed=[LAG, COGGING])
+def test_of_a_law_in_the_place_of_one_that_was_found_that_one_is_left_out():
+    candidate, _, last = fewer_effects(needed=[LAG, COGGING])
     candidate = candidate._replace(laws=((EffectLocation("delay", "input"), LAG),))
-    last = SimpleNamespace(
-        state=SimpleNamespace(say=print),
-        recordings=(),
-        runs_prefer=lambda a, b: False,
-        tried=lambda structures: [candidate.tried],
-        searched=candidate.tried.errors,
-    )
-    found = MODULE._LastFit.without_effect(last, candidate, LAG)
+    last.runs_prefer = lambda a, b: False
+    found = last.without(candidate, [LAG])
     assert found.left_out == (EffectLocation("delay", "input"),) and found.laws == ()

@@ -226,46 +226,40 @@ class _LastFit:
 
         Other parameters make up for an offset that is not fitted, but not for one that is left out later.
         """
-        structure, s = candidate.tried.structure, self.state.problem.supermodel
-        offsets = [p for p in structure.on if p in s.calibrations]
+        offsets = [p for p in candidate.tried.structure.on if p in self.state.problem.supermodel.calibrations]
         if self.evaluation.runs.compared or not offsets:
             return candidate
-        self.state.say(f"  without {', '.join(map(str, offsets))}")
-        (tried,) = self.tried([candidate.tried.fits[0].without(offsets)])
-        fitted = self.fitted_to_all(tried)
-        if self.runs_prefer(candidate.fitted.fit, fitted.fit):
-            return candidate
-        fewer = candidate._replace(tried=tried, fitted=fitted, left_out=tuple(offsets))
-        return candidate if isinstance(self.accepted(fewer), Refused) else fewer
+        return self.without(candidate, offsets)
 
     def without_needless_effects(self, candidate: _Candidate) -> _Candidate:
         """The same without effects that free runs of all recordings are not clearly better with.
 
-        The last one found is tried first, and the first one stays.
+        The last one found is tried first, and the first one stays. Validation data must not be clearly
+        better with the effect either.
         """
         calibrations = self.state.problem.supermodel.calibrations
         effects = [p for p in candidate.tried.structure.on if p not in calibrations]
         for location in reversed(effects[1:]):
-            candidate = self.without_effect(candidate, location)
+            fewer = self.without(candidate, [location])
+            if log_error_ratio(fewer.tried.errors, candidate.tried.errors) <= FREE_RUN_BETTER:
+                candidate = fewer
         return candidate
 
-    def without_effect(self, candidate: _Candidate, location: EffectLocation) -> _Candidate:
-        """The candidate without an effect, if that is not clearly worse."""
-        self.state.say(f"  without {location}")
-        (fewer,) = fit_structures([(candidate.fitted.without([location]), self.recordings)])
-        if self.runs_prefer(candidate.fitted.fit, fewer.fit):
-            return candidate
-        (tried,) = self.tried([fewer.structure])
-        worse = log_error_ratio(tried.errors, candidate.tried.errors)
-        if worse > FREE_RUN_BETTER or log_error_ratio(tried.errors, self.searched) > MOST_WORSE:
+    def without(self, candidate: _Candidate, locations: Sequence[EffectLocation]) -> _Candidate:
+        """The candidate fitted without some of what was found; itself, if free runs need it."""
+        self.state.say(f"  without {', '.join(map(str, locations))}")
+        (tried,) = self.tried([candidate.tried.fits[0].without(locations)])
+        fitted = self.fitted_to_all(tried)
+        if self.runs_prefer(candidate.fitted.fit, fitted.fit):
             return candidate
         found = {used: before for before, used in candidate.laws}
-        return candidate._replace(
+        fewer = _Candidate(
             tried=tried,
-            fitted=fewer,
-            laws=tuple(pair for pair in candidate.laws if pair[1] != location),
-            left_out=(*candidate.left_out, found.get(location, location)),
+            fitted=fitted,
+            laws=tuple(pair for pair in candidate.laws if pair[1] not in locations),
+            left_out=(*candidate.left_out, *(found.get(p, p) for p in locations)),
         )
+        return candidate if isinstance(self.accepted(fewer), Refused) else fewer
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
         """The same with laws that free runs of all recordings prefer in the places of those found."""
