@@ -1,19 +1,28 @@
-"""B13: many runs of a joint at once, on the processor and on an accelerator.
+"""B13: many runs, steps of fits and adaptive filters at once, on the processor and on an accelerator.
 
     python benchmarks/B13_accelerator.py
 
-One compiled program simulates K machines side by side (`jax.vmap` over the parameters), in double precision:
-the joint of the paper with dry friction at the hub, 2 s at 500 Hz. The time is that of one call, results left
-on the device, the least of several; on a processor one program uses one core. An accelerator that JAX lacks
-is left out. Writes `results/B13.json`.
+One compiled program works on K sets of parameters, in double precision, over 1000 samples: on an accelerator
+side by side, on a processor as many side by side as its cache holds.
+
+- `runs`: the joint of the paper with dry friction at the hub, 2 s at 500 Hz;
+- `fit_steps`: what a fit of all its parameters asks of such a run: its slopes, error and normal equations;
+- `filters`: LMS filters of a Volterra series of second order and 5 delays (21 weights), one for each pair of
+  step sizes.
+
+The time is that of one call, results left on the device, the least of several; on a processor one program
+uses one core. What would take longer than `LONGEST` is left out, and so is an accelerator that JAX lacks.
+Writes `results/B13.json`.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import platform
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,31 +31,95 @@ if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import rotflex_jax as rf
 from origin import begin
+from rotflex_jax.adaptive import LMS
+from rotflex_jax.adaptive.running import scan
+from rotflex_jax.basis import Delays, Volterra
+from rotflex_jax.fit.problem import directions, normal_equations
 from rotflex_jax.mechanism.assembly import rest_state
+from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
 from rotflex_jax.mechanism.simulate import free_run
 from rotflex_jax.text.files import write_file
 
 SAMPLES, TS = 1000, 0.002
 COUNTS = (1, 16, 256, 4096, 65536)
 ROUNDS = 5
-# Longest that a call may take for the next larger one to be tried [s].
+# Sets of parameters side by side on a processor.
+TOGETHER = 16
+# Longest that a call may take [s].
 LONGEST = 20.0
 
+Work = tuple[Callable[[jax.Array], Any], Callable[[int], np.ndarray]]
+"""What is done with one set of parameters, and sets of that many."""
 
-def times(device: jax.Device, counts: tuple[int, ...]) -> list[dict[str, float]]:
-    """Seconds of a call for each number of machines."""
-    m, solver = rf.joints.paper() + rf.effects.Coulomb(at="hub", level=0.02), rf.Exponential()
-    rng = np.random.default_rng(0)
-    u = np.repeat(rng.uniform(-4, 4, SAMPLES // 20), 20)
-    gates, x0 = np.ones(len(m.effects)), rest_state(m.structure, np.float64)
-    run = jax.jit(jax.vmap(lambda p: free_run(m.structure, solver, p, gates, x0, u, np.float64(TS))[1]))
+
+def voltage() -> np.ndarray:
+    """Random steps of 40 ms [V]."""
+    return np.repeat(np.random.default_rng(0).uniform(-4, 4, SAMPLES // 20), 20)
+
+
+def spread_about(values: np.ndarray, count: int) -> np.ndarray:
+    """Sets of parameters up to a fifth away from some values."""
+    return values * np.random.default_rng(1).uniform(0.8, 1.2, (count, len(values)))
+
+
+def joint() -> tuple[rf.Mechanism, rf.Exponential]:
+    """The joint of the paper with dry friction."""
+    return rf.joints.paper() + rf.effects.Coulomb(at="hub", level=0.02), rf.Exponential()
+
+
+def runs() -> Work:
+    """Free runs of the joint."""
+    m, solver = joint()
+    gates, x0, u = np.ones(len(m.effects)), rest_state(m.structure, np.float64), voltage()
+    run = lambda p: free_run(m.structure, solver, p, gates, x0, u, np.float64(TS))[1]  # noqa: E731
+    return run, functools.partial(spread_about, m.values)
+
+
+def fit_steps() -> Work:
+    """Normal equations of free runs of the joint in all its parameters."""
+    m, solver = joint()
+    run, sets = runs()
+    given = voltage(), run(jnp.asarray(m.values)), np.ones(SAMPLES), np.float64(TS)
+    samples = RecordingSamples(*map(jnp.asarray, given))
+    gates, x0 = jnp.ones(len(m.effects)), jnp.asarray(rest_state(m.structure, np.float64))
+    free, scale = jnp.arange(len(m.values)), jnp.full(samples.y.shape[1], 1e-3)
+
+    def step(p: jax.Array) -> Any:
+        ways = directions(m.structure, p, free, 0)  # as if by the logarithm of each parameter
+        return normal_equations(m.structure, solver, RunParameters(p, gates, x0, None), ways, samples, scale)
+
+    return step, sets
+
+
+def filters() -> Work:
+    """Mean squared error of LMS filters."""
+    basis, rng = Volterra(Delays(5)), np.random.default_rng(3)
+    u = rng.standard_normal(SAMPLES)
+    y = u + 0.2 * u**2 + 0.1 * rng.standard_normal(SAMPLES)
+    phi, y = jnp.asarray(basis.regressors(u)), jnp.asarray(y)
+
+    def error(sizes: jax.Array) -> jax.Array:
+        mu = basis.step_sizes({0: sizes[0], 1: sizes[0], 2: sizes[1]})
+        return jnp.mean(scan(LMS(mu), phi, y)[1] ** 2)
+
+    return error, functools.partial(spread_about, np.array([2e-3, 2e-4]))
+
+
+def times(device: jax.Device, work: Callable[[], Work]) -> list[dict[str, float]]:
+    """Seconds of a call for each number of sets of parameters."""
+    one, sets = work()
+    together = TOGETHER if device.platform == "cpu" else max(COUNTS)
+    run = jax.jit(lambda values: jax.lax.map(one, values, batch_size=min(together, len(values))))
     rows = list[dict[str, float]]()
-    for count in counts:
-        values = jax.device_put(m.values * rng.uniform(0.8, 1.2, (count, len(m.values))), device)
+    for count in COUNTS:
+        if rows and rows[-1]["seconds"] * count / rows[-1]["count"] > LONGEST:
+            break
+        values = jax.device_put(sets(count), device)
         began = time.perf_counter()
         jax.block_until_ready(run(values))
         first, least = time.perf_counter() - began, np.inf
@@ -54,14 +127,12 @@ def times(device: jax.Device, counts: tuple[int, ...]) -> list[dict[str, float]]
             began = time.perf_counter()
             jax.block_until_ready(run(values))
             least = min(least, time.perf_counter() - began)
-        rows.append({"machines": count, "seconds": least, "first_call": first})
+        rows.append({"count": count, "seconds": least, "first_call": first})
         rate = 1e9 * least / (count * SAMPLES)
         print(
-            f"{device.platform}: {count} machines, {least:.4g} s, {rate:.3g} ns a sample and machine",
+            f"{device.platform}: {work.__name__}, {count}: {least:.4g} s, {rate:.3g} ns a sample and set",
             flush=True,
         )
-        if least > LONGEST:
-            break
     return rows
 
 
@@ -75,7 +146,8 @@ def main() -> int:
     with jax.enable_x64(True):
         for name, device in devices.items():
             with jax.default_device(device):
-                found[name] = {"device": device.device_kind, "rows": times(device, COUNTS)}
+                rows = {work.__name__: times(device, work) for work in (runs, fit_steps, filters)}
+                found[name] = {"device": device.device_kind, **rows}
     found["cpu"]["device"] = platform.processor() or platform.machine()
     result: dict[str, Any] = {"benchmark": "B13", "samples": SAMPLES, "devices": found}
     begin(result, __file__)
