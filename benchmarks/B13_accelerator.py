@@ -8,7 +8,7 @@ side by side, on a processor as many side by side as its cache holds.
 - `runs`: the joint of the paper with dry friction at the hub, 2 s at 500 Hz;
 - `fit_steps`: what a fit of all its parameters asks of such a run: its slopes, error and normal equations;
 - `filters`: LMS filters of a Volterra series of second order and 5 delays (21 weights), one for each pair of
-  step sizes.
+  step sizes; on a processor as the package sweeps them.
 
 The time is that of one call, results left on the device, the least of several; on a processor one program
 uses one core. What would take longer than `LONGEST` is left out, and so is an accelerator that JAX lacks.
@@ -37,7 +37,7 @@ import numpy as np
 import rotflex_jax as rf
 from origin import begin
 from rotflex_jax.adaptive import LMS
-from rotflex_jax.adaptive.running import scan
+from rotflex_jax.adaptive.objectives import evaluate, tuning_data, values_at
 from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.fit.problem import directions, normal_equations
 from rotflex_jax.mechanism.assembly import rest_state
@@ -54,7 +54,13 @@ TOGETHER = 16
 LONGEST = 20.0
 
 Work = tuple[Callable[[jax.Array], Any], Callable[[int], np.ndarray]]
-"""What is done with one set of parameters, and sets of that many."""
+"""What is done with sets of parameters, and sets of that many."""
+
+
+def side_by_side(one: Callable[[jax.Array], Any], device: jax.Device) -> Callable[[jax.Array], Any]:
+    """What is done with one set of parameters, done with many."""
+    together = TOGETHER if device.platform == "cpu" else max(COUNTS)
+    return lambda values: jax.lax.map(one, values, batch_size=min(together, len(values)))
 
 
 def voltage() -> np.ndarray:
@@ -72,19 +78,19 @@ def joint() -> tuple[rf.Mechanism, rf.Exponential]:
     return rf.joints.paper() + rf.effects.Coulomb(at="hub", level=0.02), rf.Exponential()
 
 
-def runs() -> Work:
+def runs(device: jax.Device) -> Work:
     """Free runs of the joint."""
     m, solver = joint()
     gates, x0, u = np.ones(len(m.effects)), rest_state(m.structure, np.float64), voltage()
     run = lambda p: free_run(m.structure, solver, p, gates, x0, u, np.float64(TS))[1]  # noqa: E731
-    return run, functools.partial(spread_about, m.values)
+    return side_by_side(run, device), functools.partial(spread_about, m.values)
 
 
-def fit_steps() -> Work:
+def fit_steps(device: jax.Device) -> Work:
     """Normal equations of free runs of the joint in all its parameters."""
     m, solver = joint()
-    run, sets = runs()
-    given = voltage(), run(jnp.asarray(m.values)), np.ones(SAMPLES), np.float64(TS)
+    run, sets = runs(device)
+    given = voltage(), run(jnp.asarray(m.values[None]))[0], np.ones(SAMPLES), np.float64(TS)
     samples = RecordingSamples(*map(jnp.asarray, given))
     gates, x0 = jnp.ones(len(m.effects)), jnp.asarray(rest_state(m.structure, np.float64))
     free, scale = jnp.arange(len(m.values)), jnp.full(samples.y.shape[1], 1e-3)
@@ -93,28 +99,31 @@ def fit_steps() -> Work:
         ways = directions(m.structure, p, free, 0)  # as if by the logarithm of each parameter
         return normal_equations(m.structure, solver, RunParameters(p, gates, x0, None), ways, samples, scale)
 
-    return step, sets
+    return side_by_side(step, device), sets
 
 
-def filters() -> Work:
-    """Mean squared error of LMS filters."""
+def filters(device: jax.Device) -> Work:
+    """Mean squared error of LMS filters, in units of the smallest."""
     basis, rng = Volterra(Delays(5)), np.random.default_rng(3)
     u = rng.standard_normal(SAMPLES)
     y = u + 0.2 * u**2 + 0.1 * rng.standard_normal(SAMPLES)
-    phi, y = jnp.asarray(basis.regressors(u)), jnp.asarray(y)
+    data = tuning_data(basis, [rf.Recording(u=u, y=y, Ts=TS, channels="alpha")], "alpha", "mean_error")
+    sets = functools.partial(spread_about, np.array([2e-3, 2e-4]))
+    names = ("linear", "quadratic")
 
-    def error(sizes: jax.Array) -> jax.Array:
-        mu = basis.step_sizes({0: sizes[0], 1: sizes[0], 2: sizes[1]})
-        return jnp.mean(scan(LMS(mu), phi, y)[1] ** 2)
+    def build(sizes: dict[str, Any]) -> LMS:
+        return LMS(basis.step_sizes({0: sizes["linear"], 1: sizes["linear"], 2: sizes["quadratic"]}))
 
-    return error, functools.partial(spread_about, np.array([2e-3, 2e-4]))
+    if device.platform == "cpu":
+        return functools.partial(values_at, data=data, names=names, build=build, objective="mean_error"), sets
+    one = lambda sizes: evaluate(data, "mean_error", build(dict(zip(names, sizes, strict=True))))  # noqa: E731
+    return side_by_side(one, device), sets
 
 
-def times(device: jax.Device, work: Callable[[], Work]) -> list[dict[str, float]]:
+def times(device: jax.Device, work: Callable[[jax.Device], Work]) -> list[dict[str, float]]:
     """Seconds of a call for each number of sets of parameters."""
-    one, sets = work()
-    together = TOGETHER if device.platform == "cpu" else max(COUNTS)
-    run = jax.jit(lambda values: jax.lax.map(one, values, batch_size=min(together, len(values))))
+    many, sets = work(device)
+    run = jax.jit(many)
     rows = list[dict[str, float]]()
     for count in COUNTS:
         if rows and rows[-1]["seconds"] * count / rows[-1]["count"] > LONGEST:
