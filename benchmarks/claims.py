@@ -14,7 +14,7 @@ import scipy.stats
 
 from arena.probability import classes, credible, scatter_of_right, usable
 from arena.wrong_table import SEEN as SEEN_WORLDS
-from rotflex_jax.arena.scores import calibration_error
+from rotflex_jax.arena.scores import Event, calibration_error
 from rotflex_jax.effects.labels import law_of
 from rotflex_jax.parameters import HALF_WIDTH_95
 from speed.table import waiting
@@ -137,12 +137,23 @@ def worlds_claimed() -> str:
     return f"{100 * statistics.mean(classes(row)[0].probability for row in _worlds_with_probabilities()):.0f}"
 
 
+def _calibrated(machines: list[list[Event]], digits: int) -> str:
+    """Mean distance between probability and frequency, and what right probabilities would show."""
+    chance, _ = scatter_of_right([[e.probability for e in answers] for answers in machines])
+    error = calibration_error([e for answers in machines for e in answers])
+    return f"{error:.{digits}f} ({chance:.{digits}f} if all were right)"
+
+
 @named
 def worlds_calibrated() -> str:
-    """Mean distance between probability and frequency of these, and what right probabilities would show."""
-    top = [classes(row)[0] for row in _worlds_with_probabilities()]
-    chance, _ = scatter_of_right([[e.probability] for e in top])
-    return f"{calibration_error(top):.2f} ({chance:.2f} if all were right)"
+    """Calibration error of the most probable sets, and what right probabilities would show."""
+    return _calibrated([classes(row)[:1] for row in _worlds_with_probabilities()], 2)
+
+
+@named
+def worlds_calibrated_all() -> str:
+    """The same of all sets."""
+    return _calibrated([classes(row) for row in _worlds_with_probabilities()], 3)
 
 
 @named
