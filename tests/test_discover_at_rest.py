@@ -38,7 +38,7 @@ def arm(
 
 
 def values(model: rf.Model) -> dict[str, float]:
-    return dict(zip(model.mechanism.parameter_names, model.mechanism.values.tolist(), strict=True))
+    return model.mechanism.named_values
 
 
 def test_a_baseline_that_does_not_move_hides_no_friction() -> None:

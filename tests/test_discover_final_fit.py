@@ -76,7 +76,7 @@ def found(runs, arm):
 
 
 def level_of(model: rf.Model) -> float:
-    return float(dict(zip(model.mechanism.parameter_names, model.mechanism.values, strict=True))[LEVEL])
+    return float(model.mechanism.named_values[LEVEL])
 
 
 def short_runs_miss(model: rf.Model, r: rf.Recording) -> float:
@@ -135,7 +135,7 @@ def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypa
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
     given = run(0.06, 0.06, 0), run(0.06, 0.02, 1)
     found = rf.discover(arm + Coulomb("hub", level=0.02), *given, candidates=[], rounds=0)
-    value = dict(zip(found.model.mechanism.parameter_names, found.model.mechanism.values, strict=True))
+    value = found.model.mechanism.named_values
     assert value[OFFSET] == pytest.approx(0.03, abs=0.003)  # 0.04 (1 - 0.0008 / (2 0.04^2))
     estimate = next(e for e in found.estimates if e.name == OFFSET)
     assert estimate.value == value[OFFSET]
@@ -233,7 +233,7 @@ def test_what_runs_have_in_common(values, common):
 
 
 def values_of(model: rf.Model) -> dict[str, float]:
-    return dict(zip(model.mechanism.parameter_names, model.mechanism.values.tolist(), strict=True))
+    return model.mechanism.named_values
 
 
 @pytest.fixture
@@ -322,7 +322,7 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
     assert last.laws == ((("coulomb", "hub"), ("stribeck", "hub")),)
     assert ("stribeck", "hub") in found.added and ("coulomb", "hub") not in found.added
-    values = dict(zip(last.model.mechanism.parameter_names, last.model.mechanism.values, strict=True))
+    values = last.model.mechanism.named_values
     assert LEVEL not in values and values["hub.stribeck.excess"] == pytest.approx(0.1, rel=0.2)
     assert last.test.windows["theta"] == pytest.approx(short_runs_miss(last.model, test), rel=1e-6)
     assert last.test.windows["theta"] < 0.5 * found.final.test.windows["theta"]

@@ -42,7 +42,7 @@ def duty(gain: float, error: float, limit: float = 1.0) -> float:
 
 def by_solve_ivp(mechanism: rf.Mechanism, goal: np.ndarray) -> np.ndarray:
     """Angles of the pendulum on the servo, the goal held over each sample."""
-    n = dict(zip(mechanism.parameter_names, mechanism.values.tolist(), strict=True))
+    n = mechanism.named_values
     servo = dict.fromkeys(("derivative", "dead_band", "source_resistance"), 0.0)
     servo |= {name.rpartition(".")[2]: value for name, value in n.items() if "position_servo" in name}
     kt, R, J = servo["torque_constant"], servo["resistance"], n["hub.inertia.inertia"]

@@ -13,7 +13,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.models.model_json import read
 
 K_T, DAMPER, EMF = "hub.motor.torque_constant", "hub.viscous.coefficient", "hub.motor.back_emf"
-NUMBERS = dict(zip((PAPER := joints.paper()).parameter_names, PAPER.values.tolist(), strict=True))
+NUMBERS = (PAPER := joints.paper()).named_values
 RATIO, R = NUMBERS["hub.motor.gear_ratio"], NUMBERS["hub.motor.resistance"]
 
 
@@ -93,8 +93,8 @@ def test_tied_constants_are_fitted_as_one(untied: rf.Fit, recording: Recording, 
 def test_a_tied_constant_has_no_value_of_its_own() -> None:
     tied = joints.quanser_2010(tied=True)
     moved = tied.with_values({K_T: 0.009})
-    assert dict(zip(moved.parameter_names, moved.values, strict=True))[EMF] == 0.009
-    assert tied.with_values(dict(zip(tied.parameter_names, tied.values, strict=True))) == tied
+    assert moved.named_values[EMF] == 0.009
+    assert tied.with_values(tied.named_values) == tied
     for refused in (lambda: tied.with_values({EMF: 0.009}), lambda: tied.release(EMF)):
         with pytest.raises(InputError, match=f"'{EMF}'.*tied to '{K_T}'.*tied=False"):
             refused()

@@ -105,7 +105,7 @@ def test_shorter_horizons_are_tried_only_where_something_is_missing(lacking):
 
 def linear_run(damping: float, emf: float = 1.0) -> Recording:
     """A joint without friction by the matrix exponential, its joint and its back-EMF damped otherwise."""
-    p = dict(zip((m := paper()).parameter_names, m.values, strict=True))
+    p = paper().named_values
     Jh, Ja, k = p["hub.inertia.inertia"], p["arm.inertia.inertia"], p["joint.spring.stiffness"]
     gain = p["hub.motor.gear_ratio"] * p["hub.motor.torque_constant"] / p["hub.motor.resistance"]
     hub = gain * p["hub.motor.gear_ratio"] * p["hub.motor.back_emf"] * emf
@@ -137,7 +137,7 @@ def test_a_joint_that_would_feed_energy_in_is_held_at_none_and_that_is_said():
 def test_a_damper_beside_a_motor_may_take_away_what_the_motor_has_too_much():
     """The back-EMF is a tenth less than what is trusted: the damper says so."""
     m = paper()
-    p = dict(zip(m.parameter_names, m.values, strict=True))
+    p = m.named_values
     constant, emf = p["hub.motor.torque_constant"], p["hub.motor.back_emf"]
     motor = p["hub.motor.gear_ratio"] ** 2 * constant * emf / p["hub.motor.resistance"]
     found = fit(paper(stiffness=1.4), linear_run(0.002, emf=0.9))["hub.viscous.coefficient"]

@@ -93,7 +93,7 @@ def test_inertias_of_the_maker():
 
 def test_paper_holds_its_table_and_takes_other_values():
     joint = joints.paper()
-    values = dict(zip(joint.parameter_names, joint.values, strict=True))
+    values = joint.named_values
     assert values == {
         "hub.inertia.inertia": 0.0021,
         "arm.inertia.inertia": 0.0059,
@@ -107,7 +107,7 @@ def test_paper_holds_its_table_and_takes_other_values():
         "joint.viscous.coefficient": 0.0,
     }
     other = joints.paper(stiffness=1.5, hub_damping=0.004, efficiency=0.621, inductance=0.18e-3)
-    changed = dict(zip(other.parameter_names, other.values, strict=True))
+    changed = other.named_values
     assert set(changed) - set(values) == {"hub.motor.inductance"}
     assert {n for n in values if changed[n] != values[n]} == {
         "joint.spring.stiffness",
@@ -195,7 +195,7 @@ def test_from_the_deflection_alone_a_linear_joint_has_four_numbers() -> None:
         return np.concatenate([[*(C @ np.linalg.solve(x * np.eye(3) - A, B)).ravel()] for x in s])
 
     def rank(free) -> int:
-        values = dict(zip(alone.parameter_names, alone.values, strict=True))
+        values = alone.named_values
         columns = []
         for name in free:
             up, down = (coefficients(alone.with_values({name: values[name] * f})) for f in (1.001, 0.999))

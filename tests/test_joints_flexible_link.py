@@ -112,8 +112,8 @@ def test_a_fit_finds_the_gain_of_the_gauge():
     u = np.repeat(rng.uniform(-4, 4, 200), 20)
     y = simulate(true, u, Ts) + [5e-4, 5e-4] * rng.normal(size=(len(u), 2))
     fit = rf.fit(flexible_link(), rf.Recording(u=u, y=y, Ts=Ts, accept=("units",)))
-    found = dict(zip(fit.model.mechanism.parameter_names, fit.model.mechanism.values, strict=True))
-    sure = dict(zip(true.parameter_names, true.values, strict=True))
+    found = fit.model.mechanism.named_values
+    sure = true.named_values
     for name in ("alpha.sensor_gain.error", "joint.spring.stiffness", "second.spring.stiffness"):
         assert found[name] == pytest.approx(sure[name], rel=0.02), name
     assert found["hub.motor.torque_constant"] == pytest.approx(0.0085, rel=0.02)

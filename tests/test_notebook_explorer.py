@@ -108,7 +108,7 @@ def test_several_sliders_a_refit_and_undo(explorer: Explorer) -> None:
     for name, factor in ((level, 0.4), (stiffness, 1.2)):
         explorer.keep_slider(name)
         explorer.sliders[name].value = factor
-    values = dict(zip((m := explorer.model.mechanism).parameter_names, m.values, strict=True))
+    values = explorer.model.mechanism.named_values
     assert (values[level], values[stiffness]) == pytest.approx((0.4 * 0.05, 1.2 * 1.61))
     assert f"{level} = 0.02 N m" in explorer._text.value and explorer.errors["theta"] > 3 * best["theta"]
     worse = dict(explorer.errors)

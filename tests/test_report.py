@@ -55,7 +55,7 @@ def moved(N: int = 2000, Ts: float = 0.005, source: str = NASTY, **named) -> Rec
 
 def stage(mechanism, test: Recording, error: np.ndarray, free: dict[str, float]) -> Stage:
     nan = float("nan")
-    values = dict(zip(mechanism.parameter_names, mechanism.values, strict=True))
+    values = mechanism.named_values
     specs = dict(zip(mechanism.parameter_names, mechanism.parameter_specifications, strict=True))
     estimates = tuple(
         Estimate(n, v, free[n], (v - 1.96 * free[n], v + 1.96 * free[n]), specs[n].unit)

@@ -113,7 +113,7 @@ def test_numbers_of_the_machine_are_settings_too() -> None:
     assert rows["hub.coulomb.level"]["source"] == "assumption"
     assert rows["hub.inertia.inertia"]["source"] == "paper"
     # The twin with symmetric friction has the same friction, and no offset at all.
-    twin = dict(zip(symmetric_twin(s).parameter_names, symmetric_twin(s).values, strict=True))
+    twin = symmetric_twin(s).named_values
     assert twin["hub.coulomb.level"] == 0.05
     assert "input.voltage_offset.offset" not in twin
     for change, word in (

@@ -91,7 +91,7 @@ def test_series_of_unlike_springs() -> None:
 def test_the_mechanism_carries_the_springs() -> None:
     _, K, K2, K3 = spring_series(3, 2, "C", 3)
     mechanism = plant("S5p")
-    values = dict(zip(mechanism.parameter_names, mechanism.values, strict=True))
+    values = mechanism.named_values
     assert values["joint.spring.stiffness"] == K
     assert values["joint.quadratic_spring.stiffness"] == K2
     assert values["joint.cubic_spring.stiffness"] == K3
