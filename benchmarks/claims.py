@@ -240,6 +240,49 @@ def joint_theta_fall() -> str:
     return f"{before / after:.1f}"
 
 
+# -- measured machines --------------------------------------------------------------------------------------
+
+
+def _measured() -> dict[str, dict[str, Any]]:
+    return results("B9.json")["rows"]
+
+
+@named
+def measured_others() -> str:
+    """Other methods that had the same recordings."""
+    (count,) = {len(row["others"]["rows"]) for row in _measured().values()}
+    return str(count)
+
+
+def measured_lead(row: dict[str, Any], horizon: str) -> float | None:
+    """Error of the best other method over that of the model to use, in its first channel.
+
+    Args:
+        row: A direction.
+        horizon: "" for whole runs, "_windows" for runs of 2 s.
+
+    Returns:
+        The ratio, above one where the model to use is ahead; None where there is no such error.
+    """
+    key, reported = f"rmse{horizon}", row["reported"]
+    used = (reported.get("fitted to all") or reported["final"])[f"test_{key}"]
+    if used is None:
+        return None
+    channel = next(c for c in used if c != "seconds")
+    errors = [(other[f"held_out_{key}"] or {}).get(channel) for other in row["others"]["rows"]]
+    return min(e for e in errors if e is not None) / used[channel]
+
+
+def measured_ahead(horizon: str) -> str:
+    """Directions in which the model to use is ahead of every other method, and all."""
+    leads = [lead for row in _measured().values() if (lead := measured_lead(row, horizon)) is not None]
+    return f"{sum(lead > 1 for lead in leads)} of {len(leads)}"
+
+
+NAMED["measured_ahead_windows"] = functools.partial(measured_ahead, "_windows")
+NAMED["measured_ahead_whole"] = functools.partial(measured_ahead, "")
+
+
 # -- the arena ----------------------------------------------------------------------------------------------
 
 SEEN = (1000, 1001)
