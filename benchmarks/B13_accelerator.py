@@ -3,7 +3,7 @@
     python benchmarks/B13_accelerator.py
 
 One compiled program works on K sets of parameters, in double precision, over 1000 samples: on an accelerator
-side by side, on a processor as many side by side as its cache holds.
+all at the same time, on a processor `TOGETHER` at a time.
 
 - `runs`: the joint of the paper with dry friction at the hub, 2 s at 500 Hz;
 - `fit_steps`: what a fit of all its parameters asks of such a run: its slopes, error and normal equations;

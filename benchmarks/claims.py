@@ -139,9 +139,10 @@ def worlds_claimed() -> str:
 
 def _calibrated(machines: list[list[Event]], digits: int) -> str:
     """Mean distance between probability and frequency, and what right probabilities would show."""
-    chance, _ = scatter_of_right([[e.probability for e in answers] for answers in machines])
+    chance, most = scatter_of_right([[e.probability for e in answers] for answers in machines])
     error = calibration_error([e for answers in machines for e in answers])
-    return f"{error:.{digits}f} ({chance:.{digits}f} if all were right)"
+    show = lambda x: f"{x:.{digits}f}"  # noqa: E731
+    return f"{show(error)} ({show(chance)} if all were right, up to {show(most)} in 95 %)"
 
 
 @named
@@ -254,33 +255,37 @@ def measured_others() -> str:
     return str(count)
 
 
-def measured_lead(row: dict[str, Any], horizon: str) -> float | None:
-    """Error of the best other method over that of the model to use, in its first channel.
+def measured_lead(row: dict[str, Any], horizon: str, channel: int) -> float | None:
+    """Error of the best other method over that of the model to use.
 
     Args:
         row: A direction.
         horizon: "" for whole runs, "_windows" for runs of 2 s.
+        channel: Which of the row's channels.
 
     Returns:
-        The ratio, above one where the model to use is ahead; None where there is no such error.
+        The ratio, above one where the model to use is ahead; None where the machine has no such channel.
     """
     key, reported = f"rmse{horizon}", row["reported"]
     used = (reported.get("fitted to all") or reported["final"])[f"test_{key}"]
-    if used is None:
+    names = [c for c in used if c != "seconds"]
+    if channel >= len(names):
         return None
-    channel = next(c for c in used if c != "seconds")
-    errors = [(other[f"held_out_{key}"] or {}).get(channel) for other in row["others"]["rows"]]
-    return min(e for e in errors if e is not None) / used[channel]
+    ok = [other for other in row["others"]["rows"] if other["status"] == "ok"]
+    errors = [e for other in ok if (e := (other[f"held_out_{key}"] or {}).get(names[channel])) is not None]
+    return min(errors) / used[names[channel]]
 
 
-def measured_ahead(horizon: str) -> str:
+def measured_ahead(horizon: str, channel: int) -> str:
     """Directions in which the model to use is ahead of every other method, and all."""
-    leads = [lead for row in _measured().values() if (lead := measured_lead(row, horizon)) is not None]
-    return f"{sum(lead > 1 for lead in leads)} of {len(leads)}"
+    leads = [measured_lead(row, horizon, channel) for row in _measured().values()]
+    have = [lead for lead in leads if lead is not None]
+    return f"{sum(lead > 1 for lead in have)} of {len(have)}"
 
 
-NAMED["measured_ahead_windows"] = functools.partial(measured_ahead, "_windows")
-NAMED["measured_ahead_whole"] = functools.partial(measured_ahead, "")
+for _number, _channel in enumerate(("first", "second")):
+    for _name, _horizon in (("windows", "_windows"), ("whole", "")):
+        NAMED[f"measured_{_channel}_{_name}"] = functools.partial(measured_ahead, _horizon, _number)
 
 
 # -- the arena ----------------------------------------------------------------------------------------------

@@ -750,14 +750,15 @@ def test_effects_that_free_runs_hardly_need_are_not_in_the_model_to_use():
 
 
 @pytest.mark.parametrize("reason", ["needed", "spoken_for", "refused"])
-def test_an_effect_that_free_runs_need_stays(reason):
+def test_an_effect_that_data_need_stays(reason):
     found, _, _ = fewer_effects(**{reason: [COGGING]})
     assert found.left_out == (LAG,) and found.fitted.structure.on == (LUGRE_HUB, COGGING, BIAS)
 
 
 def test_of_a_law_in_the_place_of_one_that_was_found_that_one_is_left_out():
     candidate, _, last = fewer_effects(needed=[LAG, COGGING])
-    candidate = candidate._replace(laws=((EffectLocation("delay", "input"), LAG),))
+    delays = EffectLocation("delay", "input"), EffectLocation("channel_delay", "alpha")
+    candidate = candidate._replace(laws=tuple((p, LAG) for p in delays))
     last.runs_prefer = lambda a, b: False
     found = last.without(candidate, [LAG])
-    assert found.left_out == (EffectLocation("delay", "input"),) and found.laws == ()
+    assert found.left_out == delays and found.laws == ()

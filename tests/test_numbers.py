@@ -92,6 +92,21 @@ def test_a_section_says_where_its_results_are_of_an_earlier_version(monkeypatch)
     assert quoted.renewed(marked).count("<!--= versions --><!--=-->") == 1
 
 
+def test_the_model_to_use_is_compared_with_the_best_method_that_worked():
+    """It is the fit to all where that was taken; errors of a method that failed do not count."""
+    others = [
+        {"status": "ok", "held_out_rmse": {"theta": 3.0, "alpha": 0.5}},
+        {"status": "ok", "held_out_rmse": {"theta": 4.0, "alpha": None}},
+        {"status": "ok", "held_out_rmse": None},
+        {"status": "diverged", "held_out_rmse": {"theta": 1.0, "alpha": 0.1}},
+    ]
+    reported = {"final": {"test_rmse": {"seconds": 9.0, "theta": 2.0, "alpha": 1.0}}, "fitted to all": None}
+    row: dict[str, Any] = {"reported": reported, "others": {"rows": others}}
+    assert [claims.measured_lead(row, "", channel) for channel in range(3)] == [1.5, 0.5, None]
+    reported["fitted to all"] = {"test_rmse": {"theta": 6.0}}
+    assert claims.measured_lead(row, "", 0) == 0.5
+
+
 @pytest.mark.parametrize("name", SETTINGS)
 def test_no_number_stands_outside_of_marks(name: str) -> None:
     assert quoted.MARK.search(about_results(name))

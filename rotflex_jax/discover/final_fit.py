@@ -234,30 +234,42 @@ class _LastFit:
     def without_needless_effects(self, candidate: _Candidate) -> _Candidate:
         """The same without effects that free runs of all recordings are not clearly better with.
 
-        The last one found is tried first, and the first one stays. Validation data must not be clearly
-        better with the effect either.
+        The last one found is tried first, and the first one stays. Runs of validation data must not be
+        clearly better with the effect either.
         """
         calibrations = self.state.problem.supermodel.calibrations
         effects = [p for p in candidate.tried.structure.on if p not in calibrations]
         for location in reversed(effects[1:]):
-            fewer = self.without(candidate, [location])
-            if log_error_ratio(fewer.tried.errors, candidate.tried.errors) <= FREE_RUN_BETTER:
-                candidate = fewer
+            candidate = self.without(candidate, [location], FREE_RUN_BETTER)
         return candidate
 
-    def without(self, candidate: _Candidate, locations: Sequence[EffectLocation]) -> _Candidate:
-        """The candidate fitted without some of what was found; itself, if free runs need it."""
+    def without(
+        self, candidate: _Candidate, locations: Sequence[EffectLocation], most_worse: float = np.inf
+    ) -> _Candidate:
+        """The candidate fitted without some of what was found, unless data need it.
+
+        Args:
+            candidate: With all of it.
+            locations: What is left out.
+            most_worse: Logarithm of the ratio by which errors on validation data may be larger without it.
+
+        Returns:
+            The candidate itself where free runs of all recordings are clearly better than without, where
+            errors on validation data grow by more than that, and where the fit without is refused.
+        """
         self.state.say(f"  without {', '.join(map(str, locations))}")
         (tried,) = self.tried([candidate.tried.fits[0].without(locations)])
+        if log_error_ratio(tried.errors, candidate.tried.errors) > most_worse:
+            return candidate
         fitted = self.fitted_to_all(tried)
         if self.runs_prefer(candidate.fitted.fit, fitted.fit):
             return candidate
-        found = {used: before for before, used in candidate.laws}
+        found = [[before for before, used in candidate.laws if used == p] or [p] for p in locations]
         fewer = _Candidate(
             tried=tried,
             fitted=fitted,
             laws=tuple(pair for pair in candidate.laws if pair[1] not in locations),
-            left_out=(*candidate.left_out, *(found.get(p, p) for p in locations)),
+            left_out=(*candidate.left_out, *(p for each in found for p in each)),
         )
         return candidate if isinstance(self.accepted(fewer), Refused) else fewer
 
