@@ -212,6 +212,18 @@ def test_a_run_that_diverges_has_no_bands():
         rf.prediction_bands(fit, calm, known=[huge])
 
 
+def test_a_run_whose_slopes_grow_without_limit_has_no_bands():
+    """Negative damping that friction does not hold; neither the run nor its slopes are infinite."""
+    calm = recording(8)
+    m = axis() + rf.effects.Viscous("hub") + rf.effects.Dahl("hub", level=0.5, presliding=0.02)
+    held, loose = (rf.Model(m.with_values({"hub.viscous.coefficient": d})) for d in (-0.1, -0.3))
+    fit = with_std(fitted(), 0.1)
+    assert np.isfinite(loose.simulate(calm)).all() and np.ptp(held.simulate(calm)) < 0.1
+    assert np.ptp(rf.prediction_bands(dataclasses.replace(fit, model=held), calm).upper) < 1.0
+    with pytest.raises(rf.InputError, match="negative damping, and to first order nothing is known"):
+        rf.prediction_bands(dataclasses.replace(fit, model=loose), calm)
+
+
 def test_bands_are_of_one_recording():
     with pytest.raises(rf.InputError, match="2 recordings were given as `recording`, but one is needed"):
         rf.prediction_bands(fitted(), [recording(1), recording(2)])

@@ -51,6 +51,8 @@ AT_REST = 0.02
 # Steps of the search for a first state, halvings of one, and the gain below which it ends [squared error
 # in units of the noise].
 FIRST_STATE_STEPS, HALVED_STEPS, ENOUGH_GAIN = 12, 4, 0.1
+# Standard deviation, in ranges of the measured motion, from which on propagation to first order says nothing.
+MOST_RANGES = 100
 # Halvings of an interval that holds a quantile of a mixture.
 HALVINGS = 60
 
@@ -188,7 +190,8 @@ def prediction_bands(
             not fitted.
 
     Raises:
-        InputError: No fit, weights that are not positive, models with other channels.
+        InputError: No fit, weights that are not positive, models with other channels; a run that diverges, or
+            whose slopes do (`MOST_RANGES`).
 
     Source: L. Ljung, System Identification, 2nd ed., 1999, section 9.4 (propagation of a covariance); V.
     Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, 2005 (width by known errors).
@@ -359,9 +362,29 @@ def _run(
         own = own + variance * np.square(whole[..., fitted.free_names.index(name)])
     if own.any():
         parts["own of each recording"] = own
+    _refuse_growing(model, recording, parts, np.maximum(np.ptp(y, axis=0), noise))
     if fitted.options.process_noise is not None:
         parts["process torque"] = _process_variance(m, fitted.options.process_noise, recording)
     return y_hat, parts
+
+
+def _refuse_growing(
+    model: Model, recording: Recording, parts: Mapping[str, np.ndarray], ranges: Float[np.ndarray, " C"]
+) -> None:
+    """Refuse a run whose slopes grow without limit, as those of an unstable machine that friction holds.
+
+    Raises:
+        InputError: The standard deviation of a channel is beyond any motion.
+    """
+    widths = np.sqrt(np.mean(np.sum(list(parts.values()), axis=0), axis=0))
+    for channel, width, motion in zip(model.mechanism.channels, widths, ranges, strict=True):
+        if width > MOST_RANGES * motion:
+            raise InputError(
+                f"The band of {channel} would be {width / motion:.1g} times as wide as its motion in "
+                f"{recording.source or 'a recording'}: the slopes of this model grow along the run, as with "
+                "negative damping, and to first order nothing is known. Fit a model that is stable, or give "
+                "a shorter recording."
+            )
 
 
 def _unseen(
