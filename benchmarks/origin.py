@@ -316,7 +316,7 @@ def begin(
     measured = dict(sources(Path(script).stem, *scripts))
     measured |= {path: meaning((ROOT / path).read_text(encoding="utf-8")) for path in files}
     name = hashlib.sha256(json.dumps(sorted(measured.items())).encode()).hexdigest()[:12]
-    made = provenance() | {"arguments": arguments}
+    made = provenance() | {"arguments": without_place(arguments)}
     run = made | {"sources": name}
     # What was changed and not committed beside the same sources made no other numbers.
     same = lambda old: (old.get("code"), old.get("sources")) == (run["code"], run["sources"])  # noqa: E731
@@ -330,6 +330,14 @@ def begin(
     used = {run.get("sources") for run in results["runs"]}
     results["sources"] = {key: value for key, value in results["sources"].items() if key in used}
     return made
+
+
+def without_place(arguments: Any) -> Any:
+    """Arguments without `--out` and the file that it names, which says nothing of the results."""
+    if not isinstance(arguments, list) or "--out" not in arguments:
+        return arguments
+    k = arguments.index("--out")
+    return arguments[:k] + arguments[k + 2 :]
 
 
 def part(results: dict[str, Any], name: str) -> None:

@@ -14,6 +14,7 @@ from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.supermodel import EffectLocation, build, scales
+from rotflex_jax.errors import InputError
 from rotflex_jax.fit import fit
 from rotflex_jax.fit.inference import RecordingSlopes, curvature, nats_that_count
 from rotflex_jax.fit.plausibility import Reach, beyond_recordings, physical_ranges
@@ -90,17 +91,33 @@ def test_a_long_run_of_a_model_that_lacks_something_ends_at_the_best_end_of_scip
     assert found.cost == pytest.approx(best, abs=0.01 * rec.N)
 
 
-def test_shorter_horizons_are_tried_only_where_something_is_missing(lacking):
-    assert any("short horizons" in line for line in lacking[3])
+def test_fits_restart_only_where_something_is_missing(lacking):
+    assert any("restart" in line for line in lacking[3])
     again: list[str] = []
     nearby = fit(lacking[2].model, lacking[0], progress=again.append)  # it begins near and converges
-    assert any("short horizons" in line for line in again) and nearby.cost < lacking[2].cost + 5.0
+    assert any("restart" in line for line in again) and nearby.cost < lacking[2].cost + 5.0
     rec, plant = recorded([("coulomb", "hub")])
     lines: list[str] = []
     right = fit(paper() + fx.Coulomb("hub", level=0.015), rec, progress=lines.append)
-    assert right.status == "converged" and not any("again" in line for line in lines)
+    assert right.status == "converged" and not any("restart" in line for line in lines)
     np.testing.assert_allclose(list(right.noise.values()), NOISE, rtol=0.15)
     assert right["joint.spring.stiffness"].value == pytest.approx(plant["K"], rel=0.02)
+
+
+def test_restarts_find_no_less_than_the_law_that_is_contained_finds():
+    """LuGre friction has Coulomb's as a limit, so its least cost is no higher; one start may end above it."""
+    rec, _ = recorded(
+        {("stribeck", "hub"): 1.0, ("dead_zone", "input"): {"width": 0.2}, ("cubic_spring", "joint"): 1.0},
+        seed=13,
+    )
+    joint = paper(hub_inertia=0.003, stiffness=1.2, joint_damping=0.01)
+    short = {"first": "measured", "window_seconds": 2.0}
+    simple, richer = joint + fx.Coulomb("hub"), joint + fx.LuGre("hub")
+    found = fit(richer, rec, **short)
+    assert found.cost < fit(simple, rec, **short).cost
+    assert found.cost <= fit(richer, rec, restarts=0, **short).cost
+    with pytest.raises(InputError, match="restarts"):
+        fit(simple, rec, restarts=-1)
 
 
 def linear_run(damping: float, emf: float = 1.0) -> Recording:

@@ -220,7 +220,8 @@ def fit_structures(
     def end(job: tuple[int, Model]) -> Fit:
         k, start = job
         structure, recordings = asked[k]
-        how = {"first": "measured", "window_seconds": structure.window_seconds}
+        # Starts that the search has found take the place of restarts.
+        how = {"first": "measured", "window_seconds": structure.window_seconds, "restarts": 0}
         return fit(start, list(recordings), local=structure.local, **how)
 
     # Those of one structure share a program, which one of them compiles: others first.

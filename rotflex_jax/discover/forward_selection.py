@@ -83,6 +83,7 @@ def refit_and_validate(
     s, horizons = state.problem.supermodel, state.horizons
     assert beside.free_run
     grown = refit_candidates(state.problem, beside.hypothesis, starts)
+    state.say("  predictions are fitted, free runs follow")
     # A shape that predictions have found is worth a start of free runs.
     informed = [
         dataclasses.replace(y, others=(*y.others, h.mean_values(s)[s.parameter_indices(y.location)]))
@@ -91,6 +92,7 @@ def refit_and_validate(
     problem = horizons.free_run.problem
     runs = refit_candidates(problem, beside.free_run.hypothesis, informed)
     runs = refit_near_predictions(problem, runs, grown)
+    state.say("  free runs are fitted, validation follows")
     validated = [
         dataclasses.replace(
             horizons.validated(h, f, beside),

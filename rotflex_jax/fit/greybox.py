@@ -162,6 +162,7 @@ def fit(
     window_seconds: float | None = None,
     robust: float | None = None,
     max_steps: int = 60,
+    restarts: int = 8,
     minimiser: "Minimiser | None" = None,
     devices: Sequence[Any] | None = None,
     progress: Callable[[str], None] | None = None,
@@ -177,12 +178,13 @@ def fit(
     them less. The scale `s` of each channel is the standard deviation of its residuals, at every step of the
     fit.
 
-    Over a long run of a machine that the model does not know wholly the cost has many local minima:
-    friction that stops a little earlier shifts all that follows. Where a run of more than a few seconds
-    leaves errors far above the noise, or does not converge, the fit starts a second time with free runs of
-    2 s, then of 5 s and so on to the whole, and from a few places around the better end; the best of all
-    ends counts. Where a short run or prediction at the start misses most of the motion, or does not
-    converge, the second start is with short predictions, which are easy to match from far away.
+    Free runs of a machine that the model does not know wholly have many local minima of the cost: friction
+    that stops a little earlier shifts all that follows. Where the first start misses most of the motion, or
+    does not converge, a second one begins with short predictions, which are easy to match from far away.
+    Where errors of free runs are still far above the noise, the fit restarts: from the same parameters with
+    free runs of 0.2 s, then of longer ones up to what was asked for; after that from random parameters around
+    the best end, by turns near it and far from it, until three ends have the same cost. The end with the
+    least cost counts.
 
     A fit has converged where steps bring less than a small part of a standard deviation of the parameters;
     errors that go on for many samples make that many nats. Parameters stay within the physical range that
@@ -204,6 +206,7 @@ def fit(
             standard deviation follows from the median of the errors; `noise` and intervals are those of
             errors that are bent so. None for squares throughout.
         max_steps: Most iterations of each minimisation, of which there are several.
+        restarts: Most restarts of a free run.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
         devices: Those of this process that several recordings are shared out to; all of them if None, unless
@@ -228,6 +231,7 @@ def fit(
         process_noise = process_noise_of(m, process_noise)
     checks.one_of(first, "first", get_args(FirstState))
     max_steps, throw = checks.whole(max_steps, "max_steps", 1), checks.yes_or_no(throw, "throw")
+    restarts = checks.whole(restarts, "restarts", 0)
     if minimiser is not None and not hasattr(minimiser, "init"):
         raise InputError(
             f"Argument `minimiser` must be a solver of optimistix, but is {checks.shown(minimiser)}; leave "
@@ -251,7 +255,7 @@ def fit(
     if window_seconds is not None:
         checks.positive(window_seconds, "window_seconds", "s", "2.0, or None for whole recordings")
     check_signs(model, given)
-    problem = _problem(model, given, first, max_steps, minimiser, devices, say)
+    problem = _problem(model, given, first, max_steps, restarts, minimiser, devices, say)
     asked = None if process_noise is None else dict(process_noise)
     options = FitOptions(asked, local, first, window_seconds, max_steps)
     with double_precision():
@@ -282,7 +286,7 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
             f"The fit has parameters of their own for {len(next(iter(own)))} recordings, but "
             f"{len(recordings)} were given; give those that were fitted."
         )
-    problem = _problem(fitted.model, recordings, asked.first, asked.max_steps, None, None, lambda _: None)
+    problem = _problem(fitted.model, recordings, asked.first, asked.max_steps, 0, None, None, lambda _: None)
     if fitted.data and digest_of_recordings(recordings) != fitted.data:
         raise InputError(
             "Recordings, or settings of them such as n_init, differ from those of the fit, but a profile "
@@ -308,6 +312,7 @@ def _problem(
     recordings: Sequence[Recording],
     first: str,
     max_steps: int,
+    restarts: int,
     minimiser: "Minimiser | None",
     devices: Sequence[Any] | None,
     progress: Callable[[str], None] | None,
@@ -321,6 +326,7 @@ def _problem(
         RunLayout(m.structure, model.solver, states, mesh if len(recordings) > 1 else None),
         physical_ranges(m),
         max_steps,
+        restarts,
         minimiser,
         progress or (lambda _: None),
         None,

@@ -24,6 +24,7 @@ from rotflex_jax.mechanism import kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import Minimum, Progress, Rules, Status, minimise
+from rotflex_jax.optimise.restarts import FAR, NEAR, enough, misses_something, moved_by_chance
 from rotflex_jax.parameters import Transform
 
 if TYPE_CHECKING:
@@ -51,18 +52,13 @@ LEAST_SCALE = 0.1
 # A start is far where its run misses a channel by more than this share of the channel's standard deviation.
 FAR_START_ERROR = 0.7
 
-# Free runs that miss a channel by more than so many times its noise lack something.
-MISSING = 3.0
-
 # Horizons on the way to a long one: the first [s], how many times longer the next is, and the largest share
-# of the long one that is worth a stage.
-SHORTEST_HORIZON, NEXT_HORIZON, LONGEST_SHARE = 2.0, 2.5, 0.75
+# of the long one that is worth a stage. The first is longer where there would be more windows than this: each
+# has a first state that is eliminated from each step.
+SHORTEST_HORIZON, NEXT_HORIZON, LONGEST_SHARE, MOST_WINDOWS = 0.2, 10**0.5, 0.75, 200
 
 # An end is one where the slopes promise no more than this share of a nat for each coordinate.
 RUGGED = 0.5
-
-# Further starts around an end, and their distance as a share of each parameter.
-NEARBY_STARTS, NEARBY = 3, 0.3
 
 # Of two attempts whose costs differ by less, one that converged is better [nat].
 EQUAL_COST = 0.1
@@ -168,6 +164,7 @@ class GreyBoxProblem:
         layout: What runs are compiled for.
         ranges: Least and largest unconstrained value of each parameter.
         max_steps: Most iterations of a minimisation.
+        restarts: Most restarts.
         minimiser: Solver of optimistix, or None for the toolkit's own.
         say: Called with lines of progress.
         bend: Errors of each channel beyond which they count by their size; None where all count by their
@@ -179,6 +176,7 @@ class GreyBoxProblem:
     layout: RunLayout
     ranges: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]
     max_steps: int
+    restarts: int
     minimiser: "Minimiser | None"
     say: Callable[[str], None]
     bend: Float[np.ndarray, " C"] | None
@@ -339,8 +337,9 @@ class GreyBoxProblem:
         They have the same number of windows, so that all share one compiled program.
         """
         of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
-        longest = max(r.N * r.Ts for r in self.dataset.recordings)
-        horizon, found, length = min(seconds or longest, longest), [], SHORTEST_HORIZON
+        lengths = [r.N * r.Ts for r in self.dataset.recordings]
+        horizon, found = min(seconds or max(lengths), max(lengths)), []
+        length = max(SHORTEST_HORIZON, sum(lengths) / MOST_WINDOWS)
         while length < LONGEST_SHARE * horizon:
             found.append(of_seconds(length, found[0].number if found else 1))
             length *= NEXT_HORIZON
@@ -356,43 +355,57 @@ class GreyBoxProblem:
         *shorter, horizon = self.horizons(window_seconds)
         start, last = self.start(local, horizon), FitStage(horizon, process_noise)
         end = self.attempt(start, [last])
-        better = functools.partial(min, key=lambda attempt: attempt.rank)
-        if process_noise is None and shorter and (end.doubtful or self._misses_something(end)):
-            self.say("fit: again, from short horizons to long ones")
-            first = FitStage(shorter[0])
-            way = [first, *map(FitStage, shorter[1:]), last]
-            end = better(end, self.attempt(self._at_windows(start, first.windows), way))
-            end = self._from_nearby(end)
-        elif end.doubtful:
+        ends = [end]
+        if end.doubtful:
             self.say("fit: again, from short predictions")
             # Torques as large as those of the motion make the filter follow the data within a few samples.
             m = self.model.mechanism
             short = process_noise_ports(m, (0.03 * self.dataset.torque_scale) ** 2)
-            end = better(end, self.attempt(start, [FitStage(horizon, short), last]))
-        return end
+            ends.append(self.attempt(start, [FitStage(horizon, short), last]))
+        best = min(ends, key=lambda attempt: attempt.rank)
+        if process_noise is None and shorter and (best.doubtful or self._misses_something(best)):
+            return self._restarted(start, ends, [*map(FitStage, shorter), last])
+        return best
 
     def _misses_something(self, end: FitAttempt) -> bool:
-        """Whether errors are far beyond the noise, so that a long run may have its least cost elsewhere."""
+        """Whether errors are far beyond the noise, so that the least cost may be elsewhere."""
         scale = self.equations(end.point, end.stage, end.K).scale
-        return not np.all(scale < MISSING * self.dataset.noise)
+        return misses_something(scale, self.dataset.noise)
 
-    def _from_nearby(self, end: FitAttempt) -> FitAttempt:
-        """The best of some further starts around an end, where the slopes there say that it is none."""
-        bounded = self._limit(end.point, end.stage.windows)[: len(end.point.free)] < np.inf
-        free, random = list(end.point.free), np.random.default_rng(0)
-        for number in range(NEARBY_STARTS):
-            here = self.equations(end.point, end.stage, end.K)
-            if here.promised() < here.nats_that_count:
+    def _restarted(self, start: FitPoint, ends: list[FitAttempt], way: Sequence[FitStage]) -> FitAttempt:
+        """The best of some ends and of restarts, the first from the start, the others around the best end.
+
+        Args:
+            start: Where the fit has started.
+            ends: Where it has ended.
+            way: Horizons from the shortest to that of the fit.
+        """
+        best, random = min(ends, key=lambda attempt: attempt.rank), np.random.default_rng(0)
+        for number in range(self.restarts):
+            if number and self._settled(best, ends):
                 break
-            self.say(f"fit: again, from nearby, {number + 1} of {NEARBY_STARTS}")
-            z = end.point.z.copy()
-            size = np.where(bounded, 1.0, np.maximum(np.abs(z[free]), NEARBY))
-            z[free] += NEARBY * size * np.clip(random.standard_normal(len(free)), -2, 2)
-            near = dataclasses.replace(end.point, z=np.clip(z, *self.ranges))
-            near = self.attempt(near, [end.stage])
-            steps = end.steps + near.steps
-            end = dataclasses.replace(min(end, near, key=lambda attempt: attempt.rank), steps=steps)
-        return end
+            self.say(f"fit: restart {number + 1} of at most {self.restarts}, cost so far {best.cost:.1f}")
+            if number % 2:
+                again = self.attempt(self._moved_by_chance(best, NEAR, random), way[-1:])
+            else:
+                point = self._moved_by_chance(best, FAR, random) if number else start
+                again = self.attempt(self._at_windows(point, way[0].windows), way)
+            ends, best = [*ends, again], min(best, again, key=lambda attempt: attempt.rank)
+        return best
+
+    def _settled(self, best: FitAttempt, ends: Sequence[FitAttempt]) -> bool:
+        """Whether the best of some ends is hardly a local minimum: it explains the data, or others agree."""
+        if best.status == "converged" and not self._misses_something(best):
+            return True
+        tolerance = self.equations(best.point, best.stage, best.K).nats_that_count
+        return enough([end.cost for end in ends], tolerance)
+
+    def _moved_by_chance(self, end: FitAttempt, distance: float, random: np.random.Generator) -> FitPoint:
+        """The parameters of an end moved by chance, within their physical ranges."""
+        free, z = list(end.point.free), end.point.z.copy()
+        bounded = self._limit(end.point, end.stage.windows)[: len(free)] < np.inf
+        z[free] = moved_by_chance(z[free], bounded, distance, random)
+        return dataclasses.replace(end.point, z=np.clip(z, *self.ranges))
 
     def at_ends(self, point: FitPoint) -> dict[str, str]:
         """Parameters at the end of the range of a healthy machine, with a remark."""

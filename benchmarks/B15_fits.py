@@ -1,0 +1,131 @@
+"""B15: fits of measured machines from one start and with restarts.
+
+    python benchmarks/B15_fits.py
+    python benchmarks/B15_fits.py --only rigid_arm emps
+
+Each machine of B9 that has a hub or an axis gets one law of friction there, and an offset of the input for
+each recording. It is fitted to free runs over 2 s from measured first states, as a user would (`rf.fit`):
+with `restarts=0`, and with as many as by default. Three of the laws contain Coulomb's as a limit, so that
+their least cost is no higher than its: a fit of them that ends above a fit of Coulomb's law has ended at a
+local minimum. The cost is over all that B9 fits its final models to; test recordings have no other use.
+
+Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B15.json` after each
+direction.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+if str(HERE) not in sys.path:
+    sys.path.insert(0, str(HERE))
+
+import numpy as np
+
+import rotflex_jax as rf
+from B0_discovery import save
+from origin import begin
+from rotflex_jax.arena.measured import MACHINES, Way
+from rotflex_jax.effects import CATALOG
+from rotflex_jax.metrics import windowed_rmse
+from rotflex_jax.recording.recording import joined
+
+SIMPLE, LAWS = "coulomb", ("coulomb", "dahl", "stribeck", "lugre")
+OFFSET, SECONDS = "input.voltage_offset.offset", 2.0
+# A fit is above another one where its cost is higher by so much [nat].
+ABOVE = 1.0
+
+
+def fits(base: rf.Model, way: Way, law: str) -> list[dict[str, Any]]:
+    """A model with one law of friction, fitted without and with restarts."""
+    m = base.mechanism + CATALOG[law](at="hub" if "hub" in base.mechanism.port_vectors else "axis")
+    if OFFSET not in m.parameter_names:
+        m = m + CATALOG["voltage_offset"](at="input")
+    model, runs = rf.Model(m, base.solver), list(joined((*way.train, *way.validation)))
+    how: dict[str, Any] = {"local": [OFFSET], "first": "measured", "window_seconds": SECONDS}
+    rf.fit(model, runs, **how, restarts=1, max_steps=1)  # compiles what both need
+    rows = []
+    for options in ({"restarts": 0}, {}):
+        begun = time.perf_counter()
+        found = rf.fit(model, runs, **how, **options)
+        seconds = time.perf_counter() - begun
+        of_machine = found.model.with_values({OFFSET: 0.0})
+        simulated = [of_machine.simulate_windows(r, SECONDS) for r in way.test]
+        errors = windowed_rmse(way.test, [of_machine.measured(r) for r in way.test], simulated, SECONDS)
+        channels = of_machine.mechanism.channels
+        rows.append(
+            {
+                "cost": found.cost,
+                "status": found.status,
+                "rmse": found.noise,
+                "test_rmse": dict(zip(channels, np.asarray(errors).tolist(), strict=True)),
+                "seconds": seconds,
+            }
+        )
+    return rows
+
+
+def summary(rows: dict[str, Any]) -> dict[str, Any]:
+    """How many fits end above that of the law that theirs contains, and how errors and times compare.
+
+    The fit of the simple law is the one with restarts.
+    """
+    counts: dict[str, Any] = {"richer": 0, "above": [0, 0], "lower": 0, "fits": 0}
+    ratios, times = [], []
+    for laws in rows.values():
+        best = laws[SIMPLE][1]["cost"]
+        for law, (one, more) in laws.items():
+            counts["fits"] += 1
+            counts["lower"] += bool(more["cost"] < one["cost"] - ABOVE)
+            ratios.append(np.mean([np.log(more["rmse"][c] / one["rmse"][c]) for c in one["rmse"]]))
+            times.append((one["seconds"], more["seconds"]))
+            if law != SIMPLE:
+                counts["richer"] += 1
+                for k, found in enumerate((one, more)):
+                    counts["above"][k] += bool(found["cost"] > best + ABOVE)
+    return counts | {
+        "rmse_ratio": {"mean": float(np.exp(np.mean(ratios))), "least": float(np.exp(np.min(ratios)))},
+        "seconds": np.median(times, axis=0).tolist(),
+    }
+
+
+def arguments() -> argparse.Namespace:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", nargs="+", default=[], metavar="MACHINE", help="as rigid_arm")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "B15.json")
+    return parser.parse_args()
+
+
+def main() -> int:
+    """Fit every direction, save after each."""
+    a = arguments()
+    results: dict[str, Any] = {"benchmark": "B15", "rows": {}}
+    begin(results, __file__, sys.argv[1:])
+    for name, machine in MACHINES.items():
+        base = machine.model()
+        if base is None or (a.only and name not in a.only):
+            continue
+        base = rf.Model.of(base)
+        if not {"hub", "axis"} & set(base.mechanism.port_vectors):
+            continue
+        for way in machine.ways():
+            found = {law: fits(base, way, law) for law in LAWS}
+            results["rows"][f"{name}: {way.name}"] = found
+            results["summary"] = summary(results["rows"])
+            save(a.out, results)
+            costs = {law: [round(f["cost"]) for f in each] for law, each in found.items()}
+            print(f"{name}: {way.name}: {json.dumps(costs)}", flush=True)
+    print(json.dumps(results["summary"], indent=1))
+    print(f"saved: {a.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
