@@ -2,6 +2,7 @@
 
     python benchmarks/B15_fits.py
     python benchmarks/B15_fits.py --only rigid_arm emps
+    python benchmarks/B15_fits.py --only whole
 
 Each machine of B9 that has a hub or an axis gets one law of friction there, and an offset of the input for
 each recording. It is fitted to free runs over 2 s from measured first states, as a user would (`rf.fit`):
@@ -9,8 +10,10 @@ with `restarts=0`, and with as many as by default. Three of the laws contain Cou
 their least cost is no higher than its: a fit of them that ends above a fit of Coulomb's law has ended at a
 local minimum. The cost is over all that B9 fits its final models to; test recordings have no other use.
 
+`whole` are fits to whole runs of the rotary joint, of A and of both, with seven sets of effects.
+
 Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B15.json` after each
-direction.
+direction; what is not run again is kept.
 """
 
 from __future__ import annotations
@@ -71,6 +74,34 @@ def fits(base: rf.Model, way: Way, law: str) -> list[dict[str, Any]]:
     return rows
 
 
+# Effects at their ports that are fitted to whole runs.
+SETS = (
+    (("coulomb", "hub"),),
+    (("stribeck", "hub"),),
+    (("dahl", "hub"),),
+    (("lugre", "hub"),),
+    (("coulomb", "hub"), ("coulomb", "joint")),
+    (("coulomb", "hub"), ("backlash", "hub")),
+    (("lugre", "hub"), ("bouc_wen", "joint")),
+)
+
+
+def whole_runs() -> dict[str, Any]:
+    """Fits to whole runs of the rotary joint, without and with restarts."""
+    A, B = rf.data.load_dataset("rotflex")
+    rows: dict[str, Any] = {}
+    for name, runs in (("A", [A]), ("A and B", [A, B])):
+        for chosen in SETS:
+            m = rf.joints.quanser_2010()
+            for effect, port in chosen:
+                m = m + CATALOG[effect](at=port)
+            found = [rf.fit(m, runs, restarts=0), rf.fit(m, runs)]
+            key = f"{name}: {', '.join(f'{effect} at {port}' for effect, port in chosen)}"
+            rows[key] = [{"cost": f.cost, "status": f.status, "rmse": f.noise} for f in found]
+            print(key, [(round(f.cost), f.status) for f in found], flush=True)
+    return rows
+
+
 def summary(rows: dict[str, Any]) -> dict[str, Any]:
     """How many fits end above that of the law that theirs contains, and how errors and times compare.
 
@@ -98,7 +129,7 @@ def summary(rows: dict[str, Any]) -> dict[str, Any]:
 def arguments() -> argparse.Namespace:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="+", default=[], metavar="MACHINE", help="as rigid_arm")
+    parser.add_argument("--only", nargs="+", default=[], metavar="PART", help="as rigid_arm, or whole")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "B15.json")
     return parser.parse_args()
 
@@ -106,8 +137,13 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     """Fit every direction, save after each."""
     a = arguments()
-    results: dict[str, Any] = {"benchmark": "B15", "rows": {}}
+    results: dict[str, Any] = {"benchmark": "B15", "rows": {}, "whole": {}}
+    if a.out.is_file():
+        results = json.loads(a.out.read_text())
     begin(results, __file__, sys.argv[1:])
+    if not a.only or "whole" in a.only:
+        results["whole"] = whole_runs()
+        save(a.out, results)
     for name, machine in MACHINES.items():
         base = machine.model()
         if base is None or (a.only and name not in a.only):

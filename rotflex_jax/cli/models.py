@@ -41,8 +41,13 @@ def simulate(
     saved = Saved(model, Ts=recording.Ts, n_init=recording.n_init)
     fitted = None
     if train:
-        with terminal.progress("Fitting"):
-            fitted = rf.fit(model, train)
+        with terminal.progress("Fitting") as step:
+
+            def tell(line: str) -> None:
+                if " steps, " not in line:  # each would be a line where this is no terminal
+                    step(line)
+
+            fitted = rf.fit(model, train, progress=tell)
         model, first = fitted.model, train[0]
         saved = Saved(model, fitted.parameters, fitted.covariance, fitted.free_names, first.Ts, first.n_init)
     y, y_hat = model.measured(recording), model.simulate(recording)

@@ -283,12 +283,17 @@ class Explorer:
         for e, gate in zip(on.mechanism.effects, gates, strict=True):
             if not gate:
                 mechanism = mechanism.without(e.name, e.at)
-        fitted = fit(Model(mechanism, **self._solver), self._train, window_seconds=self._seconds)
+        how = {"window_seconds": self._seconds, "progress": self._meanwhile}
+        fitted = fit(Model(mechanism, **self._solver), self._train, **how)
         self._remember()
         self._base, self._factors = on.mechanism.with_values(fitted.model.mechanism.named_values), {}
         self._said = f"refitted: {fitted.ending}"
         self._silently(self._set_sliders)
         self._changed(None)
+
+    def _meanwhile(self, line: str) -> None:
+        """Says what a long fit is doing, in the place of the errors."""
+        self._text.value = card("Refitting", paragraph(line))
 
     def undo(self) -> None:
         """Takes the last change back; nothing where there is none."""
