@@ -288,6 +288,53 @@ for _number, _channel in enumerate(("first", "second")):
         NAMED[f"measured_{_channel}_{_name}"] = functools.partial(measured_ahead, _horizon, _number)
 
 
+# -- fits of measured machines ------------------------------------------------------------------------------
+
+FITTED_MACHINES = {
+    "rotflex": "rotary joint",
+    "emps": "EMPS",
+    "rigid_arm": "rigid arm",
+    "flexible_arm": "flexible arm",
+    "two_dof_link_1": "two-link machine, stage 1",
+    "two_dof_link_2": "two-link machine, stage 2",
+}
+
+
+def _ratio(pairs: list[list[dict[str, Any]]], errors: str) -> float:
+    """Errors of fits with restarts over those without: geometric mean over fits and channels."""
+    logs = [math.log(more[errors][c] / one[errors][c]) for one, more in pairs for c in one[errors]]
+    return math.exp(statistics.mean(logs))
+
+
+@named
+def restarted_fits() -> str:
+    """The table of fits without and with restarts."""
+    lines = [
+        "",
+        "| machine | fits | with a lower cost | training data | test data |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for machine, title in FITTED_MACHINES.items():
+        rows = results("B15.json")["rows"]
+        pairs = [
+            pair for key, laws in rows.items() if key.startswith(f"{machine}:") for pair in laws.values()
+        ]
+        lower = sum(more["cost"] < one["cost"] - 1.0 for one, more in pairs)
+        ratios = " | ".join(f"{_ratio(pairs, errors):.2f}" for errors in ("rmse", "test_rmse"))
+        lines.append(f"| {title} | {len(pairs)} | {lower} | {ratios} |")
+    return "\n".join([*lines, ""])
+
+
+def _whole_converged(which: int) -> str:
+    """How many fits to whole runs converge, of how many; 0 without restarts, 1 with."""
+    each = [pair[which]["status"] == "converged" for pair in results("B15.json")["whole"].values()]
+    return f"{sum(each)} of {len(each)}"
+
+
+NAMED["whole_converged_once"] = functools.partial(_whole_converged, 0)
+NAMED["whole_converged_restarted"] = functools.partial(_whole_converged, 1)
+
+
 # -- the arena ----------------------------------------------------------------------------------------------
 
 SEEN = (1000, 1001)
