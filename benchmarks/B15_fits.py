@@ -33,7 +33,7 @@ import numpy as np
 
 import rotflex_jax as rf
 from B0_discovery import save
-from origin import begin
+from origin import begin, part
 from rotflex_jax.arena.measured import MACHINES, Way
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.metrics import windowed_rmse
@@ -143,6 +143,7 @@ def main() -> int:
     begin(results, __file__, sys.argv[1:])
     if not a.only or "whole" in a.only:
         results["whole"] = whole_runs()
+        part(results, "whole")
         save(a.out, results)
     for name, machine in MACHINES.items():
         base = machine.model()
@@ -155,10 +156,11 @@ def main() -> int:
             found = {law: fits(base, way, law) for law in LAWS}
             results["rows"][f"{name}: {way.name}"] = found
             results["summary"] = summary(results["rows"])
+            part(results, "rows")
             save(a.out, results)
             costs = {law: [round(f["cost"]) for f in each] for law, each in found.items()}
             print(f"{name}: {way.name}: {json.dumps(costs)}", flush=True)
-    print(json.dumps(results["summary"], indent=1))
+    print(json.dumps(results.get("summary", {}), indent=1))
     print(f"saved: {a.out}")
     return 0
 

@@ -325,6 +325,14 @@ def restarted_fits() -> str:
     return "\n".join([*lines, ""])
 
 
+@named
+def restarts_take() -> str:
+    """Time of a fit with restarts over that without: median and largest."""
+    rows = results("B15.json")["rows"]
+    ratios = [more["seconds"] / one["seconds"] for laws in rows.values() for one, more in laws.values()]
+    return f"{statistics.median(ratios):.0f} times as long in the median and {max(ratios):.0f} times at most"
+
+
 def _whole_converged(which: int) -> str:
     """How many fits to whole runs converge, of how many; 0 without restarts, 1 with."""
     each = [pair[which]["status"] == "converged" for pair in results("B15.json")["whole"].values()]

@@ -1,4 +1,4 @@
-"""Where restarts of a fit lie, and when there are enough."""
+"""Where restarts of a fit begin, and when there are enough."""
 
 import numpy as np
 import pytest
@@ -28,6 +28,7 @@ def test_three_ends_with_the_least_cost_are_enough():
     assert enough([9.0, 1.4, 1.0, 1.5], 0.5)
     assert not enough([9.0, 1.4, 1.0, 1.5, 0.2], 0.5)  # a lower cost was found later
     assert not enough([np.inf, np.inf, 1.0], 0.5)
+    assert not enough([np.inf] * 3, 0.5)  # all have diverged
 
 
 def test_errors_far_above_the_noise_ask_for_restarts():

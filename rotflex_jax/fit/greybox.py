@@ -179,12 +179,12 @@ def fit(
     fit.
 
     Free runs of a machine that the model does not know wholly have many local minima of the cost: friction
-    that stops a little earlier shifts all that follows. Where the first start misses most of the motion, or
-    does not converge, a second one begins with short predictions, which are easy to match from far away.
-    Where errors of free runs are still far above the noise, the fit restarts: from the same parameters with
-    free runs of 0.2 s, then of longer ones up to what was asked for; after that from random parameters around
-    the best end, by turns near it and far from it, until three ends have the same cost. The end with the
-    least cost counts.
+    that stops a little earlier shifts all that follows. Where the first attempt starts far from the motion,
+    or does not converge, a second one begins with short predictions, which are easy to match from far away.
+    Where errors of free runs are then far above the noise, or no attempt has converged, the fit restarts:
+    from the same parameters with free runs of 0.2 s (longer where there would be more than 200 of them), then
+    of longer ones up to what was asked for; after that from random parameters around the best end, by turns
+    near it and far from it, until three ends have the same cost. The end with the least cost counts.
 
     A fit has converged where steps bring less than a small part of a standard deviation of the parameters;
     errors that go on for many samples make that many nats. Parameters stay within the physical range that
@@ -206,7 +206,8 @@ def fit(
             standard deviation follows from the median of the errors; `noise` and intervals are those of
             errors that are bent so. None for squares throughout.
         max_steps: Most iterations of each minimisation, of which there are several.
-        restarts: Most restarts of a free run.
+        restarts: Most restarts of a free run; 0 for none, several times as fast. Predictions and robust fits
+            make none.
         minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
         devices: Those of this process that several recordings are shared out to; all of them if None, unless
@@ -255,9 +256,10 @@ def fit(
     if window_seconds is not None:
         checks.positive(window_seconds, "window_seconds", "s", "2.0, or None for whole recordings")
     check_signs(model, given)
-    problem = _problem(model, given, first, max_steps, restarts, minimiser, devices, say)
+    # A robust fit only begins with squares, where large errors would ask for restarts in vain.
+    problem = _problem(model, given, first, max_steps, 0 if robust else restarts, minimiser, devices, say)
     asked = None if process_noise is None else dict(process_noise)
-    options = FitOptions(asked, local, first, window_seconds, max_steps)
+    options = FitOptions(asked, local, first, window_seconds, max_steps, problem.restarts)
     with double_precision():
         end = problem.solve([names.index(n) for n in local], process_noise, window_seconds)
         if robust is not None and np.isfinite(end.cost):
@@ -286,7 +288,9 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
             f"The fit has parameters of their own for {len(next(iter(own)))} recordings, but "
             f"{len(recordings)} were given; give those that were fitted."
         )
-    problem = _problem(fitted.model, recordings, asked.first, asked.max_steps, 0, None, None, lambda _: None)
+    problem = _problem(
+        fitted.model, recordings, asked.first, asked.max_steps, asked.restarts, None, None, lambda _: None
+    )
     if fitted.data and digest_of_recordings(recordings) != fitted.data:
         raise InputError(
             "Recordings, or settings of them such as n_init, differ from those of the fit, but a profile "
@@ -294,7 +298,7 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
         )
     if asked.bend is not None:
         problem = dataclasses.replace(problem, bend=np.array(asked.bend))
-    windows = problem.horizons(asked.window_seconds)[-1]
+    windows = problem.horizons(asked.window_seconds, asked.process_noise)[-1]
     point = problem.start([m.parameter_names.index(n) for n in asked.local], windows)
     transform, local_z = problem.transform, point.local_z.copy()
     for r in range(len(recordings)):

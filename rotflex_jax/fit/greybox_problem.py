@@ -331,16 +331,18 @@ class GreyBoxProblem:
         """The model of a recording."""
         return self.model.with_values(self.physical(point)[0][recording])
 
-    def horizons(self, seconds: float | None) -> list[Windows]:
-        """Windows of some seconds, or whole recordings, behind those of shorter horizons on the way there.
+    def horizons(self, seconds: float | None, process_noise: ProcessNoise) -> list[Windows]:
+        """Windows of some seconds, or whole recordings, behind those of shorter horizons for restarts.
 
-        They have the same number of windows, so that all share one compiled program.
+        They have the same number of windows, so that all share one compiled program. A solver of optimistix
+        would compile each anew; predictions, and fits without restarts, have no use for them.
         """
         of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
         lengths = [r.N * r.Ts for r in self.dataset.recordings]
         horizon, found = min(seconds or max(lengths), max(lengths)), []
         length = max(SHORTEST_HORIZON, sum(lengths) / MOST_WINDOWS)
-        while length < LONGEST_SHARE * horizon:
+        restarts = self.restarts and process_noise is None and self.minimiser is None
+        while restarts and length < LONGEST_SHARE * horizon:
             found.append(of_seconds(length, found[0].number if found else 1))
             length *= NEXT_HORIZON
         number = found[0].number if found else 1
@@ -352,56 +354,59 @@ class GreyBoxProblem:
         self, local: Sequence[int], process_noise: ProcessNoise, window_seconds: float | None
     ) -> FitAttempt:
         """The best end of the ways that are worth trying."""
-        *shorter, horizon = self.horizons(window_seconds)
+        *shorter, horizon = self.horizons(window_seconds, process_noise)
         start, last = self.start(local, horizon), FitStage(horizon, process_noise)
-        end = self.attempt(start, [last])
-        ends = [end]
-        if end.doubtful:
+        ends = [self.attempt(start, [last])]
+        if ends[0].doubtful:
             self.say("fit: again, from short predictions")
             # Torques as large as those of the motion make the filter follow the data within a few samples.
             m = self.model.mechanism
             short = process_noise_ports(m, (0.03 * self.dataset.torque_scale) ** 2)
             ends.append(self.attempt(start, [FitStage(horizon, short), last]))
+        if process_noise is None:
+            ends += self._restarts(start, ends, [*map(FitStage, shorter), last])
         best = min(ends, key=lambda attempt: attempt.rank)
-        if process_noise is None and shorter and (best.doubtful or self._misses_something(best)):
-            return self._restarted(start, ends, [*map(FitStage, shorter), last])
-        return best
+        return dataclasses.replace(best, steps=sum(end.steps for end in ends))
 
     def _misses_something(self, end: FitAttempt) -> bool:
         """Whether errors are far beyond the noise, so that the least cost may be elsewhere."""
         scale = self.equations(end.point, end.stage, end.K).scale
         return misses_something(scale, self.dataset.noise)
 
-    def _restarted(self, start: FitPoint, ends: list[FitAttempt], way: Sequence[FitStage]) -> FitAttempt:
-        """The best of some ends and of restarts, the first from the start, the others around the best end.
+    def _restarts(
+        self, start: FitPoint, ends: Sequence[FitAttempt], way: Sequence[FitStage]
+    ) -> list[FitAttempt]:
+        """Further ends: of a restart from the start, then of those around the best end so far.
 
         Args:
             start: Where the fit has started.
             ends: Where it has ended.
-            way: Horizons from the shortest to that of the fit.
+            way: Horizons from the shortest to that of the fit, if there are shorter ones.
         """
-        best, random = min(ends, key=lambda attempt: attempt.rank), np.random.default_rng(0)
+        more, random = list[FitAttempt](), np.random.default_rng(0)
         for number in range(self.restarts):
-            if number and self._settled(best, ends):
+            best = min((*ends, *more), key=lambda attempt: attempt.rank)
+            if self._settled(best, [*ends, *more]):
                 break
             self.say(f"fit: restart {number + 1} of at most {self.restarts}, cost so far {best.cost:.1f}")
-            if number % 2:
-                again = self.attempt(self._moved_by_chance(best, NEAR, random), way[-1:])
+            if number == 0 and len(way) > 1:
+                more.append(self.attempt(self._at_windows(start, way[0].windows), way))
+            elif number % 2:
+                more.append(self.attempt(self._moved_by_chance(best, NEAR, random), way[-1:]))
             else:
-                point = self._moved_by_chance(best, FAR, random) if number else start
-                again = self.attempt(self._at_windows(point, way[0].windows), way)
-            ends, best = [*ends, again], min(best, again, key=lambda attempt: attempt.rank)
-        return best
+                point = self._moved_by_chance(best, FAR, random)
+                more.append(self.attempt(self._at_windows(point, way[0].windows), way))
+        return more
 
     def _settled(self, best: FitAttempt, ends: Sequence[FitAttempt]) -> bool:
-        """Whether the best of some ends is hardly a local minimum: it explains the data, or others agree."""
+        """Whether the best of some ends explains the data, or so many agree that no other is expected."""
         if best.status == "converged" and not self._misses_something(best):
             return True
         tolerance = self.equations(best.point, best.stage, best.K).nats_that_count
         return enough([end.cost for end in ends], tolerance)
 
     def _moved_by_chance(self, end: FitAttempt, distance: float, random: np.random.Generator) -> FitPoint:
-        """The parameters of an end moved by chance, within their physical ranges."""
+        """The shared parameters of an end moved by chance, within their physical ranges."""
         free, z = list(end.point.free), end.point.z.copy()
         bounded = self._limit(end.point, end.stage.windows)[: len(free)] < np.inf
         z[free] = moved_by_chance(z[free], bounded, distance, random)

@@ -42,6 +42,7 @@ class FitOptions:
         first: Whether first states were fitted, or held at what the first samples show.
         window_seconds: Runs started again so often [s]; None for whole recordings.
         max_steps: Most iterations of each minimisation.
+        restarts: Most restarts.
         bend: Errors of each channel beyond which they counted by their size [unit of the channel]; None where
             all counted by their square.
     """
@@ -51,6 +52,7 @@ class FitOptions:
     first: str = "fitted"
     window_seconds: float | None = None
     max_steps: int = 60
+    restarts: int = 8
     bend: tuple[float, ...] | None = None
 
 
@@ -66,7 +68,7 @@ class Fit:
         noise: Standard deviation of the residual per channel [unit of the channel].
         covariance: Of the F free parameters [declared units], in the order of `free_names`.
         free_names: Full names of the free parameters.
-        steps: Iterations that led here.
+        steps: Iterations of all attempts together.
         history: Negative log-likelihood after each minimisation that led here, constants left out [nat].
         weakest: Direction of the free parameters (in shares of their values) that the data determine least.
         local: Parameter that each recording has for itself -> its estimates, in the order of the

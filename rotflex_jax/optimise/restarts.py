@@ -1,4 +1,4 @@
-"""Restarts of a fit whose cost has many local minima: when they are needed, where they lie, when they end."""
+"""Restarts of a fit with many local minima: whether they are needed, where they begin, when to end."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,9 @@ MISSING = 3.0
 # Standard deviations of the distance from the best end so far, as a share of each parameter. Near it a fit
 # leaves a local minimum for the next one, far from it another valley is found.
 NEAR, FAR = 0.3, 1.0
-# So many ends with the same cost are hardly at a local minimum.
+# Least size of an unconstrained coordinate that is near zero.
+LEAST_SIZE = 0.3
+# Where so many ends have the same cost, further restarts are unlikely to find a lower one.
 AGREEING_ENDS = 3
 
 
@@ -24,8 +26,9 @@ def moved_by_chance(
 ) -> Float[np.ndarray, " K"]:
     """Unconstrained parameters at a random distance from some.
 
-    A parameter with a bound is multiplied by exp(distance n), another one moves by distance n times its
-    size; n is a standard normal number, cut at 2.
+    The coordinate of a parameter with a bound moves by distance n, so that its distance from a single bound
+    is multiplied by exp(distance n). Another one moves by distance n times its size, `LEAST_SIZE` at least.
+    n is a standard normal number, cut at 2.
 
     Args:
         z: The parameters.
@@ -33,10 +36,11 @@ def moved_by_chance(
         distance: `NEAR` or `FAR`.
         random: Where n comes from.
     """
-    size = np.where(bounded, 1.0, np.maximum(np.abs(z), NEAR))
+    size = np.where(bounded, 1.0, np.maximum(np.abs(z), LEAST_SIZE))
     return z + distance * size * np.clip(random.standard_normal(len(z)), -2, 2)
 
 
 def enough(costs: Sequence[float], tolerance: float) -> bool:
     """Whether so many ends have the least cost, within a tolerance, that no further restart is needed."""
-    return sum(cost <= min(costs) + tolerance for cost in costs) >= AGREEING_ENDS
+    least = min(costs)
+    return bool(np.isfinite(least)) and sum(cost <= least + tolerance for cost in costs) >= AGREEING_ENDS
