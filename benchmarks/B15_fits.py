@@ -39,10 +39,8 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.recording.recording import joined
 
-SIMPLE, LAWS = "coulomb", ("coulomb", "dahl", "stribeck", "lugre")
+LAWS = ("coulomb", "dahl", "stribeck", "lugre")
 OFFSET, SECONDS = "input.voltage_offset.offset", 2.0
-# A fit is above another one where its cost is higher by so much [nat].
-ABOVE = 1.0
 
 
 def fits(base: rf.Model, way: Way, law: str) -> list[dict[str, Any]]:
@@ -102,30 +100,6 @@ def whole_runs() -> dict[str, Any]:
     return rows
 
 
-def summary(rows: dict[str, Any]) -> dict[str, Any]:
-    """How many fits end above that of the law that theirs contains, and how errors and times compare.
-
-    The fit of the simple law is the one with restarts.
-    """
-    counts: dict[str, Any] = {"richer": 0, "above": [0, 0], "lower": 0, "fits": 0}
-    ratios, times = [], []
-    for laws in rows.values():
-        best = laws[SIMPLE][1]["cost"]
-        for law, (one, more) in laws.items():
-            counts["fits"] += 1
-            counts["lower"] += bool(more["cost"] < one["cost"] - ABOVE)
-            ratios.append(np.mean([np.log(more["rmse"][c] / one["rmse"][c]) for c in one["rmse"]]))
-            times.append((one["seconds"], more["seconds"]))
-            if law != SIMPLE:
-                counts["richer"] += 1
-                for k, found in enumerate((one, more)):
-                    counts["above"][k] += bool(found["cost"] > best + ABOVE)
-    return counts | {
-        "rmse_ratio": {"mean": float(np.exp(np.mean(ratios))), "least": float(np.exp(np.min(ratios)))},
-        "seconds": np.median(times, axis=0).tolist(),
-    }
-
-
 def arguments() -> argparse.Namespace:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -155,12 +129,10 @@ def main() -> int:
         for way in machine.ways():
             found = {law: fits(base, way, law) for law in LAWS}
             results["rows"][f"{name}: {way.name}"] = found
-            results["summary"] = summary(results["rows"])
             part(results, "rows")
             save(a.out, results)
             costs = {law: [round(f["cost"]) for f in each] for law, each in found.items()}
             print(f"{name}: {way.name}: {json.dumps(costs)}", flush=True)
-    print(json.dumps(results.get("summary", {}), indent=1))
     print(f"saved: {a.out}")
     return 0
 

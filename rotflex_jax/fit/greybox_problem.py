@@ -368,11 +368,6 @@ class GreyBoxProblem:
         best = min(ends, key=lambda attempt: attempt.rank)
         return dataclasses.replace(best, steps=sum(end.steps for end in ends))
 
-    def _misses_something(self, end: FitAttempt) -> bool:
-        """Whether errors are far beyond the noise, so that the least cost may be elsewhere."""
-        scale = self.equations(end.point, end.stage, end.K).scale
-        return misses_something(scale, self.dataset.noise)
-
     def _restarts(
         self, start: FitPoint, ends: Sequence[FitAttempt], way: Sequence[FitStage]
     ) -> list[FitAttempt]:
@@ -400,10 +395,10 @@ class GreyBoxProblem:
 
     def _settled(self, best: FitAttempt, ends: Sequence[FitAttempt]) -> bool:
         """Whether the best of some ends explains the data, or so many agree that no other is expected."""
-        if best.status == "converged" and not self._misses_something(best):
+        here = self.equations(best.point, best.stage, best.K)
+        if best.status == "converged" and not misses_something(here.scale, self.dataset.noise):
             return True
-        tolerance = self.equations(best.point, best.stage, best.K).nats_that_count
-        return enough([end.cost for end in ends], tolerance)
+        return enough([end.cost for end in ends], here.nats_that_count)
 
     def _moved_by_chance(self, end: FitAttempt, distance: float, random: np.random.Generator) -> FitPoint:
         """The shared parameters of an end moved by chance, within their physical ranges."""
