@@ -162,6 +162,20 @@ def test_limits_on_voltage_and_slew_hold_exactly_and_change_nothing_needlessly()
     np.testing.assert_allclose(limits.playable(jump, Ts)[50:150], (below + above)[50:150] / 2, atol=1e-9)
 
 
+@pytest.mark.parametrize("before", [-1.0, -0.4, 0.0, 1.0])
+def test_one_input_follows_another_within_the_slew(before):
+    """Whatever it was before, up to the step from which 0 V is one step away, also at a reduced level."""
+    limits, rng = Limits(voltage=2.0, slew=150.0), np.random.default_rng(7)
+    start = before * 150.0 * Ts
+    u = limits.playable(4 * rng.standard_normal(60), Ts, start)
+    for level in (1.0, 0.4, 0.06):
+        assert np.max(np.abs(np.diff(level * u, prepend=start, append=0.0))) <= 150.0 * Ts * (1 + 1e-9)
+    np.testing.assert_allclose(limits.playable(u, Ts, start), u, atol=1e-12)
+    # Away from its beginning it is the input that follows 0 V.
+    other = limits.playable(4 * np.random.default_rng(7).standard_normal(60), Ts)
+    np.testing.assert_allclose(u[10:], other[10:], atol=1e-12)
+
+
 def test_each_sample_follows_the_two_it_is_said_to_follow():
     limits, rng = Limits(voltage=2.0, slew=150.0), np.random.default_rng(6)
     x = 1.5 * rng.standard_normal(300)

@@ -70,6 +70,8 @@ class SegmentChoice:
         n, o, q = self.r.layout.size, len(r.own), 2 * r.layout.n
         goes_on = bool(e.runs) and e.settings.continues
         self.history = e.runs[-1].u[-self.before :] if goes_on else np.zeros(self.before)
+        # The next voltage follows the last one.
+        self.start = float(e.runs[-1].u[-1]) if goes_on else 0.0
         self.pose = e.runs[-1].y[0] if goes_on else np.zeros(len(r.structure.channels))
         values, x0, self.dvalues, self.dx0, self.information, self.nominal = [], [], [], [], [], []
         drawn: list[list[tuple[np.ndarray, np.ndarray]]] = []
@@ -332,7 +334,7 @@ class SegmentChoice:
         """The segment that is expected to decide soonest, and why none would decide, if so."""
         e, Ts = self.e, self.r.Ts
         named = self._standard()
-        U = np.array([self.limits.playable(u, Ts) for *_, u in named])
+        U = np.array([self.limits.playable(u, Ts, self.start) for *_, u in named])
         U, ok = self.within_limits(U)
         if not ok.any():
             raise InputError(
@@ -355,7 +357,9 @@ class SegmentChoice:
             n = seconds[order[0]] / e.settings.segment_seconds
             n = float(np.clip(n, repeats[0], min(LOOK_AHEAD, left)))
             designs = self._improved(U[starts], n)
-            designs, ok = self.within_limits(np.array([self.limits.playable(u, Ts) for u in designs]))
+            designs, ok = self.within_limits(
+                np.array([self.limits.playable(u, Ts, self.start) for u in designs])
+            )
             ok &= self.loud(designs)
             if ok.any():
                 new, _ = self.evidence(designs[ok], repeats, drawn=True)
@@ -453,7 +457,8 @@ class SegmentChoice:
     def _value_and_slope(self, X: np.ndarray, n: float) -> tuple[np.ndarray, np.ndarray]:
         """Logarithm of the usefulness less penalties of peaks, and its slope along inputs per limit."""
         r, H, S, Ts = self.r, self.r.count, len(X), self.r.Ts
-        played = [self.limits.playable_with_sources(self.limits.voltage * x, Ts) for x in X]
+        voltage = self.limits.voltage
+        played = [self.limits.playable_with_sources(voltage * x, Ts, self.start) for x in X]
         U = np.array([u for u, _, _ in played])
         T, details = self.evidence(U, (n,), drawn=False, shift=True)
         T = T[0, :, :, 0]
@@ -503,7 +508,7 @@ class SegmentChoice:
         total = np.zeros((S, self.M))
         np.add.at(total, which, g)
         out = [
-            self.limits.voltage * (np.bincount(low, t, self.M) + np.bincount(high, t, self.M)) / 2
+            voltage * (np.bincount(low, t, self.M) + np.bincount(high, t, self.M)) / 2
             for t, (_, low, high) in zip(total, played, strict=True)
         ]
         return value, np.array(out)

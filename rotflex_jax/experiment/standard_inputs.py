@@ -50,20 +50,22 @@ class Limits:
         known = np.array([self.travel, self.deflection])[:channels] * (1 - self.margin)
         return np.concatenate([known, np.full(channels - len(known), np.inf)])
 
-    def playable(self, u: Float[np.ndarray, " N"], Ts: float) -> Float[np.ndarray, " N"]:
+    def playable(self, u: Float[np.ndarray, " N"], Ts: float, start: float = 0.0) -> Float[np.ndarray, " N"]:
         """The voltage made to keep the limits on voltage and slew rate; unchanged where it does so already.
 
         Clipped, then the mean of the largest signal below and the smallest above that change no faster
-        than allowed (the envelopes of Pasch and Hausdorff). It starts from 0 V and can end there.
+        than allowed (the envelopes of Pasch and Hausdorff). It can follow the voltage `start`, and 0 V can
+        follow it.
 
         Args:
             u: Voltage [V].
             Ts: Sampling period [s].
+            start: Voltage of the sample before, from which 0 V is one step away at most [V].
         """
-        return self.playable_with_sources(u, Ts)[0]
+        return self.playable_with_sources(u, Ts, start)[0]
 
     def playable_with_sources(
-        self, u: Float[np.ndarray, " N"], Ts: float
+        self, u: Float[np.ndarray, " N"], Ts: float, start: float = 0.0
     ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
         """`playable(u)`, and for each of its samples the two samples of `u` whose mean it follows."""
         N = len(u)
@@ -72,8 +74,8 @@ class Limits:
             k = np.arange(N)
             return inside, k, k
         step = self.slew * Ts * (1 - 1e-12)
-        ends = step * np.minimum(np.arange(1, N + 1), np.arange(N, 0, -1))
-        inside = np.clip(inside, -ends, ends)
+        begins, ends = step * np.arange(1, N + 1), step * np.arange(N, 0, -1)
+        inside = np.clip(inside, np.maximum(start - begins, -ends), np.minimum(start + begins, ends))
         low, low_source = _lower_envelope(inside, step)
         high, high_source = _lower_envelope(-inside, step)
         return (low - high) / 2, low_source, high_source
