@@ -143,6 +143,20 @@ REFUSED = {
     "discover {tmp}/degrees.csv": "--degrees",
     "discover {tmp}/degrees.csv --output theta_deg --output alpha": "pass --degrees",
     "discover {run} --input theta": "theta",
+    "check {run} --signal wind": "has no column 'wind'; it has t, voltage, theta, alpha: name the right one "
+    "with --signal",
+    "check {run} --signal wind --signal rain": "'wind', 'rain'; it has t, voltage, theta, alpha: name the "
+    "right ones with --signal",
+    "check {run} --signal wind=gust": "has no column 'gust'",
+    "check {run} --signal alpha": "as a signal and as input or output, but it can be only one; correct "
+    "--signal",
+    "check {run} --output theta --signal alpha --signal Alpha": "--signal must name columns, each once, but "
+    'is a list; for other names of signals give for instance "acceleration of the base [m/s^2]=column"',
+    "check {run} --signal alpha --signal wind=t": "'alpha' and 'wind=t', but either each signal has a name "
+    'or none; name that one too, for instance --signal "alpha=alpha"',
+    "check {run} --signal wind=t --signal wind=alpha": "the name 'wind' for 't' and for 'alpha'",
+    "check {run} --output theta --signal =alpha": "given the name ''",
+    "reproduce --out {tmp}/page --signal wind": "--signal was given",
     "discover {run} --accept everything": "everything",
     "discover {run} --json {tmp}/missing/r.json": "missing",
     "discover {run} --json {tmp}": "folder",
@@ -285,6 +299,70 @@ def test_check_tells_what_is_in_a_file_and_refuses_a_wrong_sign(run, recorded, t
     status, out, _ = run("check", room, "--accept", "absolute")
     assert status == 0 and "warning: Channel 'alpha' follows 'theta' one to one" in out
     assert "little for a search" not in out
+
+
+BASE = "acceleration of the base [m/s^2]"
+
+
+@pytest.fixture
+def pushed(tmp_path: Path) -> Path:
+    """A recording with more columns: what else acts on the machine."""
+    more = np.column_stack([DEMO, WAVE, 2 * WAVE, 3 * WAVE])
+    return write(tmp_path / "pushed.csv", more, (*NAMES, BASE, "i2", "a=b"))
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        ((), {}),
+        (("i2",), {"i2": 2}),
+        (("Acceleration of the Base", "I2"), {BASE: 1, "i2": 2}),
+        (("second motor [A]=i2", f"base = {BASE}"), {"second motor [A]": 2, "base": 1}),
+        (("third [N]=a=b",), {"third [N]": 3}),  # a column with this sign needs a name before it
+    ],
+)
+def test_signals_are_read_where_they_are_named(options, found, run, search, pushed) -> None:
+    given = [word for text in options for word in ("--signal", text)]
+    status, _, err = run("discover", pushed, "--split", 0.5, *given)
+    assert status == 0, err
+    ((_, *parts),) = search.calls
+    for (recording,), wave in zip(parts, (WAVE[:300], WAVE[300:]), strict=True):
+        assert list(recording.signals) == list(found)
+        for name, factor in found.items():
+            np.testing.assert_allclose(recording.signals[name], factor * wave, atol=1e-7)
+
+
+def test_check_lists_signals_beside_input_and_outputs(run, pushed) -> None:
+    status, out, err = run("check", pushed, "--signal", BASE, "--signal", "i2")
+    assert (status, err) == (0, "")
+    ends = [digits(float(end)) for end in (WAVE.min(), WAVE.max())]
+    (row,) = (line for line in out.splitlines() if line.startswith("acceleration of the base "))
+    assert row.removeprefix("acceleration of the base").split() == ["m/s²", *ends, "-"]
+    assert any(line.split()[:1] == ["i2"] for line in out.splitlines())
+
+
+def test_a_signal_that_drives_the_model_is_read_by_its_name(run, pushed, recorded, tmp_path) -> None:
+    """As outputs are, unless --signal says which column has it."""
+    pushing = rf.effects.MeasuredDisturbance(at=f"arm: {BASE}", gain=0.02)
+    model = Model(rf.joints.paper() + pushing)
+    file = model.save(tmp_path / "model.json")
+    recording, saved = rf.load(pushed, signals=BASE), tmp_path / "simulated.csv"
+    other = recording.with_signals({BASE: 2 * recording.signals[BASE]})
+    for given, expected in (((), recording), (("--signal", f"{BASE}=i2"), other)):
+        status, _, err = run("simulate", pushed, "--joint", file, "--save", saved, *given)
+        assert status == 0, err
+        table = np.loadtxt(saved, delimiter=",", skiprows=1)
+        np.testing.assert_allclose(table[:, -2:], model.simulate(expected), atol=1e-6)
+    for refused, words in (
+        (
+            (recorded,),
+            f"has no column {BASE!r}; it has t, voltage, theta, alpha: name the right one with --signal",
+        ),
+        ((pushed, "--signal", "i2"), f"--signal names 'i2'; name its column, --signal \"{BASE}=COLUMN\""),
+    ):
+        status, out, err = run("simulate", *refused, "--joint", file)
+        assert (status, out) == (2, "")
+        assert_one_sentence(err, words)
 
 
 class FakeSearch:

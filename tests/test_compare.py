@@ -187,7 +187,7 @@ def test_what_goes_wrong_is_a_row() -> None:
         raise ArithmeticError("the matrix\nhas no inverse")
 
     growing = np.array([[[1.5, 0.0]], [[0.0, 1.5]]])
-    unstable = DifferenceEquation(A=growing, B=np.ones((2, 1)), Ts=0.002)
+    unstable = DifferenceEquation(A=growing, B=np.ones((2, 1, 1)), Ts=0.002)
     table = rf.compare(
         recorded(),
         [
@@ -287,19 +287,21 @@ def test_discovered_finds_what_the_grey_box_lacks(monkeypatch) -> None:
 def test_least_squares_finds_the_equation_behind_clean_data() -> None:
     truth = DifferenceEquation(
         A=np.array([[[-0.8, 0.1], [1.6, 0.0]], [[0.0, -0.7], [0.2, 1.3]]]),
-        B=np.array([[0.1, 0.2], [0.0, -0.3]]),
+        B=np.array([[[0.1, 0.5], [0.2, 0.0]], [[0.0, -0.1], [-0.3, 0.4]]]),
         Ts=0.01,
     )
-    u = np.random.default_rng(0).normal(size=400)
-    blank = Recording(u=u, y=np.zeros((400, 2)), Ts=0.01, accept=("constant",))
+    u, wind = np.random.default_rng(0).normal(size=(2, 400))
+    blank = Recording(u=u, y=np.zeros((400, 2)), Ts=0.01, accept=("constant",), signals={"wind": wind})
     m = blank.n_init  # up to there the run is not the equation's own
-    record = Recording(u=u[m:], y=truth.simulate(blank)[m:], Ts=0.01)
+    record = Recording(u=u[m:], y=truth.simulate(blank)[m:], Ts=0.01, signals={"wind": wind[m:]})
     found = fit_difference_equation([record], 2)
     np.testing.assert_allclose(found.A, truth.A, atol=1e-10)
     np.testing.assert_allclose(found.B, truth.B, atol=1e-10)
     table = rf.compare(record, [ARX(orders=(1, 2))])
     assert table["arx"].note == "order 2"
     assert table["arx"].rmse["theta"] < 1e-9
+    with pytest.raises(rf.InputError, match="1 signals beside the input, but the recording has 0"):
+        found.simulate(record.with_signals({}))
 
 
 def test_an_equation_that_looks_back_too_far_is_refused() -> None:

@@ -127,6 +127,80 @@ def test_other_columns_may_hold_what_they_like(tmp_path: Path) -> None:
     assert_is_the_run(load(tmp_path / "run.csv"))
 
 
+PUSH = np.cos(np.arange(N) / 11)
+
+
+def test_signals_are_columns_too(tmp_path: Path) -> None:
+    table = np.column_stack([TABLE, PUSH, 2 * PUSH])
+    path = write_text(tmp_path / "run.csv", "t,voltage,theta,alpha,Base [m/s^2],i2", table=table)
+    for given, names in {
+        "Base [m/s^2]": ["Base [m/s^2]"],
+        "base": ["Base [m/s^2]"],
+        ("base", "i2"): ["Base [m/s^2]", "i2"],
+    }.items():
+        recording = load(path, signals=given)
+        assert_is_the_run(recording)
+        assert list(recording.signals) == names
+        for name, factor in zip(names, (1, 2), strict=False):
+            np.testing.assert_allclose(recording.signals[name], factor * PUSH, rtol=1e-14)
+    assert list(load(path, signals={"second motor [A]": "i2"}).signals) == ["second motor [A]"]
+    for none in (None, [], {}):
+        assert load(path, signals=none).signals == {}
+    # In the unit that they have, also where the outputs are in degrees.
+    frame = pd.DataFrame(COLUMNS | {"tilt [deg]": PUSH})
+    np.testing.assert_array_equal(load(frame, signals="tilt").signals["tilt [deg]"], PUSH)
+    # With the unit from the line of units below the header.
+    header = "t,voltage,theta,alpha,push\ns,V,rad,rad,N"
+    other = write_text(tmp_path / "units.csv", header, table=table[:, :5])
+    assert list(load(other, signals="push").signals) == ["push [N]"]
+
+
+@pytest.mark.parametrize(
+    ("signals", "phrase"),
+    [
+        (3, "`signals` must name columns, each once, but is 3"),
+        (["push", 3], "each once, but is a list"),
+        (["push", "Push"], "each once, but is"),
+        ({"a": "push", "b": "push"}, "each once, but is"),
+        ("wind", "has no column 'wind'; it has .*: name the right one with signals="),
+        (["wind", "rain"], "has no columns 'wind', 'rain'; .* with signals="),
+        ("theta", "'theta' was given as a signal and as input or output"),
+        ("voltage", "'voltage' was given as a signal and as input or output"),
+        ("gap", "column 'gap' is nan at row 3"),
+        ({"": "push"}, "given the name '', but it needs text"),
+    ],
+)
+def test_columns_that_are_no_signals_are_refused(signals: Any, phrase: str) -> None:
+    frame = pd.DataFrame(COLUMNS | {"push": PUSH, "gap": np.where(np.arange(N) == 3, np.nan, PUSH)})
+    with pytest.raises(InputError, match=phrase):
+        load(frame, signals=signals)
+
+
+def test_signals_are_held_where_times_are_uneven() -> None:
+    """As the input is, while outputs follow straight lines."""
+    uneven = T + np.where(np.arange(N) % 2, 0.4 * Ts, 0.0)  # odd samples come late
+    frame = pd.DataFrame(COLUMNS | {"t": uneven, "push": PUSH})
+    recording = load(frame, signals="push", resample=Ts)
+    late = recording.signals["push"]
+    np.testing.assert_array_equal(late, PUSH[np.arange(N) // 2 * 2][: recording.N])
+    np.testing.assert_array_equal(recording.u, U[np.arange(N) // 2 * 2][: recording.N])
+
+
+def test_signals_in_files_of_their_own(tmp_path: Path) -> None:
+    for name, values in COLUMNS.items():
+        if name != "t":
+            pd.DataFrame({"t": T, name: values}).to_csv(tmp_path / f"{name}.csv", index=False)
+    # Twice as slow, and a sample late.
+    pd.DataFrame({"t": T[::2] + Ts, "push": PUSH[::2]}).to_csv(tmp_path / "push.csv", index=False)
+    with pytest.raises(InputError, match=r"'push'.* have times of their own"):
+        load(tmp_path, signals="push")
+    recording = load(tmp_path, signals="push", resample=Ts)
+    assert recording.start == pytest.approx(Ts)
+    np.testing.assert_array_equal(recording.signals["push"], np.repeat(PUSH[::2], 2)[: recording.N])
+    np.testing.assert_allclose(recording.y, Y[1:][: recording.N], atol=1e-12)
+    assert load(tmp_path).signals == {}  # what is not named needs no common times
+
+
 def test_degrees_become_radians(tmp_path: Path) -> None:
     table = np.column_stack([T, U, np.rad2deg(Y)])
     assert_is_the_run(load(write_text(tmp_path / "run.csv", table=table), degrees=True))
@@ -197,3 +271,10 @@ def test_what_is_saved_is_loaded_again_bit_by_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.y, recording.y)
     assert (again.Ts, again.start) == (recording.Ts, recording.start)
     assert (tmp_path / "run.csv").read_text().startswith("t,voltage,theta,alpha\n86400.5,")
+    named = {"acceleration of the base, filtered [m/s^2]": PUSH, "second motor [A]": 2 * PUSH}
+    save_csv(recording.with_signals(named), tmp_path / "moving.csv")
+    again = load(tmp_path / "moving.csv", signals=list(named))
+    np.testing.assert_array_equal(again.y, recording.y)
+    assert list(again.signals) == list(named)
+    for name, values in named.items():
+        np.testing.assert_array_equal(again.signals[name], values)

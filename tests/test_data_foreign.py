@@ -41,6 +41,8 @@ def test_any_object_with_input_and_outputs():
     assert rf.load(run(), outputs={"theta": "y"}, units={"theta": "rad"}).channels == ("theta",)
     with pytest.raises(InputError, match="train has no sampling_time"):
         rf.load(run(sampling_time=None))
+    with pytest.raises(InputError, match="must name columns of a file or a table"):
+        rf.load(run(), signals="base")
     with pytest.raises(InputError, match="is nan at sample 0"):
         rf.load(run(y=np.full(300, np.nan)))
 

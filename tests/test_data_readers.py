@@ -15,15 +15,18 @@ from scipy.signal import csd, savgol_filter
 import rotflex_jax as rf
 from rotflex_jax.data.datasets import DATASETS, fetch, load_dataset
 from rotflex_jax.data.readers import (
+    ACCELERATION_SAMPLES,
     COUNT,
     GAUGE_FILTER_DAMPING,
     GAUGE_FILTER_FREQUENCY,
     GAUGE_RAD_PER_VOLT,
     SO101_JOINTS,
+    link_acceleration,
     load_bam_xl330,
     load_bam_xl330_released,
     load_so101,
     load_two_dof_link,
+    stages_together,
 )
 from rotflex_jax.data.registry import PublicDataset, PublicFile
 from rotflex_jax.errors import InputError
@@ -91,6 +94,88 @@ def test_a_deflection_that_is_not_measured_yet_is_left_out(tmp_path: Path) -> No
     assert (first.N, second.N) == (198, 298)
     assert first.start == pytest.approx(3.2)
     np.testing.assert_allclose(np.rad2deg(first.y[:, 1]), blank[100:298], atol=1e-8)
+
+
+def test_each_stage_has_the_acceleration_of_the_other_link(tmp_path: Path) -> None:
+    written = link_run(tmp_path)
+    for filtered in (False, True):
+        runs = load_two_dof_link(tmp_path / "run.mat", filtered=filtered)
+        for recording, run, stage in zip(runs, runs[::-1], (2, 1), strict=True):
+            ((name, values),) = recording.signals.items()
+            assert name == f"acceleration of link {stage} [rad/s^2]" and len(values) == recording.N
+            angle = run.y.sum(axis=1)
+            if not filtered:
+                both = written[f"th{stage}1"] + written[f"th{stage}2"]
+                np.testing.assert_allclose(np.rad2deg(angle), both[:-2], atol=1e-8)
+            second, third = (savgol_filter(angle, 71, 5, n, run.Ts) for n in (2, 3))
+            inside = slice(40, -40)
+            np.testing.assert_allclose(values[inside], (second + 0.001 * third)[inside], rtol=1e-6)
+
+
+def test_the_acceleration_of_a_link_is_that_in_the_middle_of_a_sample() -> None:
+    period, w = 0.002, 2 * np.pi * 3.0
+    t = period * np.arange(600)
+    middle = t + period / 2
+    # Polynomials of third order: exact everywhere, also where a deflection begins at sample 200.
+    alpha = np.where(t >= t[200], 1.0 + 4 * t**2 - t**3, 0.0)
+    found = link_acceleration(t**3 - 2 * t**2, alpha, 200, period)
+    expected = 6 * middle - 4 + np.where(t >= t[200], 8 - 6 * middle, 0.0)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    # A swing at 3 Hz, below the resonance of link 2: to 1 %, and not late.
+    found = link_acceleration(0.3 * np.sin(w * t), 0.1 * np.cos(w * t), 0, period)
+    expected = -(w**2) * (0.3 * np.sin(w * middle) + 0.1 * np.cos(w * middle))
+    inside = slice(ACCELERATION_SAMPLES, -ACCELERATION_SAMPLES)
+    assert np.max(np.abs(found - expected)[inside]) < 0.01 * np.max(np.abs(expected))
+
+
+def test_a_link_counts_as_its_servo_where_its_deflection_is_not_logged_yet(tmp_path: Path) -> None:
+    link_run(tmp_path)
+    tables = {k: v for k, v in scipy.io.loadmat(tmp_path / "run.mat").items() if k.startswith("data_")}
+    k = np.arange(300)
+    theta, alpha = 3e-3 * k**2, np.where(k < 100, 0.0, 50.0 - 1e-3 * k**2)  # [deg]
+    tables["data_th11"][:, 2], tables["data_th12"][:, 2] = theta, low_pass(alpha, 0.002)
+    scipy.io.savemat(tmp_path / "late.mat", tables)
+    first, second = load_two_dof_link(tmp_path / "late.mat")
+    assert (first.N, second.N) == (198, 298)
+    expected = np.deg2rad(np.where(k < 100, 6e-3, 4e-3)[:298]) / 0.002**2
+    np.testing.assert_allclose(second.signals["acceleration of link 1 [rad/s^2]"], expected, rtol=1e-3)
+    assert len(first.signals["acceleration of link 2 [rad/s^2]"]) == 198
+    tables["data_th12"][:, 2] = low_pass(np.where(k < 250, 0.0, 1.0), 0.002)
+    scipy.io.savemat(tmp_path / "later.mat", tables)
+    with pytest.raises(InputError, match=r"has 48 samples with the deflection of link 1, but .* needs 71"):
+        load_two_dof_link(tmp_path / "later.mat")
+
+
+def test_both_stages_are_one_recording_while_both_are_logged(tmp_path: Path) -> None:
+    written = link_run(tmp_path)
+    tables = {k: v for k, v in scipy.io.loadmat(tmp_path / "run.mat").items() if k.startswith("data_")}
+    tables["data_th12"][:, 2] = low_pass(np.where(np.arange(300) < 100, 0.0, 1.0 + np.arange(300)), 0.002)
+    scipy.io.savemat(tmp_path / "late.mat", tables)
+    first, second = load_two_dof_link(tmp_path / "late.mat")
+    both = stages_together(first, second)
+    assert both.channels == rf.joints.two_stage_link().channels
+    assert (both.N, both.start) == (198, pytest.approx(3.2))
+    np.testing.assert_array_equal(both.u, written["Im1"][1:-1][100:])
+    np.testing.assert_array_equal(both.signals["current of motor 2 [A]"], written["Im2"][1:-1][100:])
+    np.testing.assert_array_equal(both.y[:, :2], first.y)
+    np.testing.assert_array_equal(both.y[:, 2:], second.y[100:])
+    with pytest.raises(InputError, match="must be of one run, but end at"):
+        stages_together(first, second.slice(0, 200))
+
+
+def test_the_other_link_explains_what_a_link_does(measured: Measured) -> None:
+    """Link 2 follows its spring and the motion of link 1; the page says how much without and with it."""
+    for run in measured("two_dof_link")[1::2]:
+        theta, alpha = run.y.T
+        own = savgol_filter(theta + alpha, 71, 5, deriv=2, delta=run.Ts)
+        spring, damping = (savgol_filter(alpha, 71, 5, deriv=n, delta=run.Ts) for n in (0, 1))
+        carried = run.signals["acceleration of link 1 [rad/s^2]"]
+        left = []
+        for causes in ([spring, damping], [spring, damping, carried]):
+            A = np.column_stack([*causes, np.ones(run.N)])[500:-100]  # from 1 s on, with all deflections
+            b = own[500:-100]
+            left.append(np.var(b - A @ np.linalg.lstsq(A, b, rcond=None)[0]) / np.var(b))
+        assert left[0] > 0.6 and left[1] < 0.25
 
 
 def test_other_files_are_not_taken_for_a_link_run(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from spindle import PAIRS, SPINDLE, spun
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover import Discovery, search_state
+from rotflex_jax.discover import Discovery, forward_selection, search_state
 from rotflex_jax.discover.verdict import NEAR_FLOOR, Assessment, in_noise
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import check_apart, shared_samples
@@ -164,3 +164,26 @@ def test_other_numbers_make_no_more() -> None:
     others, found = made_by(lambda: searched(2011))
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
     assert others <= FITTED
+
+
+def test_dry_friction_is_tried_where_other_candidates_have_crowded_it_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A round that tries none and adds nothing is followed by one of dry friction at the motor."""
+    ranked = forward_selection.promising_at_both
+
+    def crowded(*given):
+        return [pair for pair in ranked(*given) if pair[0].location.effect not in ("coulomb", "lugre")]
+
+    monkeypatch.setattr(forward_selection, "promising_at_both", crowded)
+    candidates = [*PAIRS, (fx.LuGre, "shaft"), (fx.SensorCubic, SPINDLE.channels[0])]
+    parts = spun().split(0.7)
+    said: list[str] = []
+    found = rf.discover(SPINDLE, *parts, candidates=candidates, rounds=1, progress=said.append)
+    tried = [line for line in said if line.startswith("refitting ")]
+    assert any("coulomb at shaft" in line for line in tried[1:]), said
+    assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "shaft")]
+    # Not where the model has a law of it already, and not where nothing is left.
+    said.clear()
+    rf.discover(SPINDLE + fx.Coulomb("shaft"), *parts, candidates=candidates, rounds=1, progress=said.append)
+    assert not any("lugre at shaft" in line for line in said if line.startswith("refitting "))

@@ -111,9 +111,12 @@ def models() -> dict[str, Model]:
     """Every effect of the catalogue, some at a time, and every rule of the step."""
     start = paper(hub_damping=0.01, inductance=2e-4)
     present = {"inertia", "spring", "motor", "viscous"}
-    # A machine has one gear; a disturbance has the phase of its recording, and no code follows that.
-    loop = {"pid_servo", "current_meter", "duty_meter"}
-    todo = sorted(set(CATALOG) - present - loop - {"elastic_backlash", "periodic_disturbance"})
+    # A machine has one gear; a disturbance has the phase or the signal of its recording, which no code has.
+    loop, disturbances = (
+        {"pid_servo", "current_meter", "duty_meter"},
+        {"periodic_disturbance", "measured_disturbance"},
+    )
+    todo = sorted(set(CATALOG) - present - loop - {"elastic_backlash"} - disturbances)
     found = {}
     for k in range(4):
         m = start if k % 2 else paper()
@@ -125,9 +128,7 @@ def models() -> dict[str, Model]:
     full = hobby_servo("xl330", 0.007, integral=100, weight=0.4, sensors="theta+current+duty")
     found["a servo with its readings"] = Model(full)
     found["elastic teeth"] = Model(start + CATALOG["elastic_backlash"]("hub") + Coulomb("hub"))
-    assert {e.name for m in found.values() for e in m.mechanism.effects} == {*CATALOG} - {
-        "periodic_disturbance"
-    }
+    assert {e.name for m in found.values() for e in m.mechanism.effects} == {*CATALOG} - disturbances
     dry = paper() + Coulomb("hub", level=0.03) + Coulomb("joint", level=0.01) + Stribeck("arm")
     found["three contacts, two steps a sample"] = Model(dry, Exponential(substeps=2))
     found["fourth order"] = Model(paper() + CubicSpring("joint", stiffness=9.0), Exponential(order=4))

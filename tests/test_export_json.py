@@ -23,6 +23,8 @@ AWKWARD = (0.1 + 0.2, 1 / 3, np.pi * 1e-9, 5e-324, 1.7976931348623157e308)
 def place(cls) -> str:
     if issubclass(cls, Actuation):
         return "input"
+    if cls.acts_on == "signal":
+        return "hub: signal"
     return "alpha" if issubclass(cls, Sensing) else "hub"
 
 

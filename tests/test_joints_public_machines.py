@@ -30,7 +30,8 @@ def test_every_effect_speaks_of_forces_on_a_linear_axis():
             continue
         sizes = [{}, {"damping": 0.05}, {"damping": 0.05, "level": 0.0}] if cls.name == "lugre" else [{}]
         for own in sizes:
-            said = axis.units.sentence(cls(at="axis", **own).sentence())
+            at = "axis: signal" if cls.acts_on == "signal" else "axis"
+            said = axis.units.sentence(cls(at=at, **own).sentence())
             assert not re.search(r"N m\b|rad\b|torque|turn|degree|kg m\b", said), said
         for spec in cls.declared().values():
             assert not re.search(r"N m\b|rad|kg m", axis.units.unit(spec.unit)), spec.unit

@@ -457,6 +457,11 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("load, from a frame", "time_unit"): [([], "must be a word, but is a list"), ("h", "one of s, ms, us")],
     ("load, from a frame", "degrees"): [(np.zeros(2), "True or False"), ("yes", "is 'yes'")],
     ("load, from a frame", "arm_absolute"): [(np.zeros(2), "True or False"), (1, "is 1")],
+    ("load, from a frame", "signals"): [
+        (3, "must name columns, each once, but is 3"),
+        (np.zeros(2), "must name columns"),
+        ("voltage", "as a signal and as input or output"),
+    ],
     ("load, from a frame", "units"): [
         (True, "by the names of channels, but is True"),
         ({"theta": 3}, "is a dict"),
@@ -508,6 +513,13 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("Recording", "remarks"): [(3, "list of findings, but has 3"), ("ab", "has 'ab'"), ([1], "has 1")],
     ("Recording", "continues"): [(3, "the recording before this one, but is 3")],
     ("Recording", "constants"): [(3, "is 3"), ({"a": NAN}, "the value nan")],
+    ("Recording", "signals"): [
+        (3, "by its name, but is 3"),
+        ({"": U}, "the name ''"),
+        ({"a": U[1:]}, r"one value for each of the 200 samples, but has the shape \(199,\)"),
+        ({"a": U[:, None]}, r"the shape \(200, 1\)"),
+        ({"a": U * NAN}, "is nan"),
+    ],
     ("Recording", "channels"): [(3, "must be words"), ((1, 2), "must be words")],
     ("Recording", "units"): [((1, 2), "must be words")],
     ("Recording", "accept"): [(3, "but has 3")],

@@ -1,7 +1,12 @@
 """A recording: its defaults, its parts, and what it says about the quality of its data."""
 
+import dataclasses
 import pickle
+import re
+from base64 import b64decode
 from collections.abc import Callable
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -10,6 +15,7 @@ from rotflex_jax.data.excitation import noise, prbs, steps
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Finding, Recording
 from rotflex_jax.recording.quality import quantisation_step
+from rotflex_jax.recording.recording import digest_of_recordings, joined
 
 Ts = 0.002
 COUNT = 2 * np.pi / 4096
@@ -134,6 +140,103 @@ def test_decimation_keeps_the_impulse_of_the_input_and_the_measured_outputs() ->
     np.testing.assert_allclose(np.sum(slow.u) * slow.Ts, np.sum(u[:1000]) * Ts)
     with pytest.raises(InputError, match="whole number"):
         slow.decimate(0)
+
+
+BASE, MOTOR = "acceleration of the base [m/s^2]", "second motor [A]"
+
+
+def moving(N: int = 4000) -> Recording:
+    """A joint on a base that moves, beside a second motor."""
+    u, y = swinging(N)
+    return Recording(u=u, y=y, Ts=Ts, signals={BASE: np.arange(N), MOTOR: -np.arange(N)})
+
+
+def test_signals_are_cut_and_joined_with_the_recording() -> None:
+    whole = moving()
+    assert list(whole.signals) == [BASE, MOTOR] and Recording(u=whole.u, y=whole.y, Ts=Ts).signals == {}
+    part = whole.slice(1000, 3000)
+    np.testing.assert_array_equal(part.signals[BASE], np.arange(1000.0, 3000.0))
+    np.testing.assert_array_equal(part.continues.signals[MOTOR], -np.arange(1000.0))
+    (again,) = joined(whole.split(0.7)[::-1])
+    for name in whole.signals:
+        np.testing.assert_array_equal(again.signals[name], whole.signals[name])
+    # Means as of the input: of 0, 1, 2 and so on.
+    np.testing.assert_array_equal(whole.decimate(3).signals[MOTOR], -np.arange(1.0, 3999.0, 3.0))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(whole)).signals[BASE], whole.signals[BASE])
+
+
+def test_parts_with_other_signals_are_not_joined() -> None:
+    first, second = moving().split(0.5)
+    for other in ({}, {BASE: second.signals[BASE]}, {**second.signals, "third": second.u}):
+        parts = [first, second.with_signals(other)]
+        assert all(a is b for a, b in zip(joined(parts), parts, strict=True))
+
+
+def test_signals_are_exchanged_copied_and_cannot_be_changed() -> None:
+    recording, wind = moving(60), np.ones(60)
+    other = recording.with_signals({"wind [m/s]": wind})
+    wind[:] = 0.0
+    assert list(other.signals) == ["wind [m/s]"] and np.all(other.signals["wind [m/s]"] == 1.0)
+    assert list(recording.signals) == [BASE, MOTOR] and other.with_signals({}).signals == {}
+    with pytest.raises(ValueError, match="read-only"):
+        other.signals["wind [m/s]"][0] = 2.0
+    single = dataclasses.replace(recording, u=np.float32(recording.u), y=np.float32(recording.y))
+    assert single.signals[BASE].dtype == single.u.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("signals", "phrase"),
+    [
+        (3, "must give the samples of each signal by its name, but is 3"),
+        ([np.zeros(60)], "by its name, but is a list"),
+        ({3: np.zeros(60)}, "given the name 3, but it needs text"),
+        ({" ": np.zeros(60)}, "given the name ' ', but it needs text"),
+        ({"theta": np.zeros(60)}, "the name 'theta' of the input or of a channel"),
+        ({"voltage": np.zeros(60)}, "the name 'voltage' of the input or of a channel"),
+        ({BASE: np.zeros(59)}, r"one value for each of the 60 samples, but has the shape \(59,\)"),
+        ({BASE: np.zeros((60, 1))}, r"but has the shape \(60, 1\)"),
+        ({BASE: 0.0}, r"but has the shape \(\)"),
+        ({BASE: np.zeros(60, complex)}, "must hold real numbers, but holds complex128"),
+        ({BASE: np.where(np.arange(60) == 7, np.nan, 0.0)}, "is nan at sample 7, in 1 of 60"),
+    ],
+)
+def test_signals_that_are_none_are_refused(signals: Any, phrase: str) -> None:
+    u, y = swinging(60)
+    with pytest.raises(InputError, match=phrase):
+        Recording(u=u, y=y, Ts=Ts, signals=signals)
+
+
+def test_signals_are_shown_where_there_are_any() -> None:
+    recording = moving(60)
+    assert f"alpha [rad], beside {BASE} and {MOTOR})" in repr(recording)
+    assert "beside" not in repr(recording.with_signals({}))
+    page, without = recording._repr_html_(), recording.with_signals({})._repr_html_()
+    text = " ".join(ElementTree.fromstring(page.replace("\xa0", " ")).itertext())
+    assert "acceleration of the base m/s² 0.00 … 59.0 " in text and "second motor A −59.0 … 0.00 " in text
+    lines = [b64decode(re.findall('base64,([^"]*)', each)[0]).count(b"<polyline") for each in (page, without)]
+    assert lines == [5, 3]
+
+
+def test_digests_have_signals_where_there_are_any() -> None:
+    k = np.arange(60.0)
+    recording = Recording(
+        u=k % 7,
+        y=np.column_stack([k % 5, k % 3]),
+        Ts=0.25,
+        channels=("a", "b"),
+        units=("m", "V"),
+        resolution={"a": 0.5, "b": None},
+        constants={"hub.gain": 2.0},
+        start=1.5,
+        accept="saturated",
+    )
+    # As the version computed it that knew no signals (commit 963d166): results are stored with digests.
+    known = "78585956cc1d98473654666fc8d5e3fc6e0977b490719f7b049a6eb20187d96c"
+    assert digest_of_recordings([recording, *recording.split(0.5)]) == known
+    cases = [{}, {"p": k}, {"q": k}, {"p": -k}, {"p": k, "q": -k}, {"p": -k, "q": k}]
+    digests = [digest_of_recordings([recording.with_signals(case)]) for case in cases]
+    assert len(set(digests)) == len(cases)
+    assert digest_of_recordings([recording.with_signals({"q": -k, "p": k})]) == digests[4]
 
 
 def test_quantisation_is_named_with_its_step() -> None:

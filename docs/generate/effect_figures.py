@@ -87,6 +87,13 @@ def _force(ax: Axes, effect: Effect) -> None:
     _labels(ax, "speed [rad/s]", "torque on the port [N m]")
 
 
+def _over_signal(ax: Axes, effect: Effect) -> None:
+    assert isinstance(effect, fx.MeasuredDisturbance)
+    signal = np.linspace(-20.0, 20.0, 101)
+    ax.plot(signal, np.asarray(effect.force(0.0, 0.0, signal)), **LINE)
+    _labels(ax, "signal [its unit]", "torque on the port [N m]")
+
+
 def _loop(ax: Axes, effect: Effect) -> None:
     """Torque over position while the port swings to and fro, first wide, then narrow."""
     assert isinstance(effect, Memory)
@@ -315,4 +322,5 @@ DRAWINGS: dict[type, Draw] = {
     fx.Spring: _stamped("position [rad]", "stiffness"),
     fx.Viscous: _stamped("speed [rad/s]", "damping"),
     fx.LearnedTorque: _splines,
+    fx.MeasuredDisturbance: _over_signal,
 }

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import rotflex_jax as rf
+from rotflex_jax.data.readers import stages_together
 
 # Of what is learnt from, the rest is for validation.
 SHARE = 0.7
@@ -132,18 +133,29 @@ def by_itself(name: str, run: rf.Recording) -> Way:
     return Way(f"{name}, first half to its end", (train,), (decides,), (tests,))
 
 
-def _link(stage: int) -> Callable[[list[rf.Recording]], list[Way]]:
-    """Two runs of either stage, by LQR and by full state feedback: each by itself, and across.
+def _two_runs(runs: Sequence[rf.Recording]) -> list[Way]:
+    """Two runs of the serial link, by LQR and by full state feedback: each by itself, and across.
 
     They are fifteen years apart, with other friction and amplifiers: a run by itself says what a model can
     do, and across the runs the machine is another one too.
     """
+    named: dict[str, rf.Recording] = dict(zip(("lqr", "feedback"), runs, strict=True))
+    return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
+
+
+def _stage(stage: int, beside_the_other: bool) -> Callable[[list[rf.Recording]], list[Way]]:
+    """One stage of the serial link, with the acceleration of the other link as a signal or without it."""
 
     def ways(runs: list[rf.Recording]) -> list[Way]:
-        named: dict[str, rf.Recording] = dict(zip(("lqr", "feedback"), runs[stage - 1 :: 2], strict=True))
-        return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
+        own = runs[stage - 1 :: 2]
+        return _two_runs(own if beside_the_other else [r.with_signals({}) for r in own])
 
     return ways
+
+
+def _both_stages(runs: list[rf.Recording]) -> list[Way]:
+    """Both stages of the serial link as one machine."""
+    return _two_runs([stages_together(*runs[k : k + 2]) for k in (0, 2)])
 
 
 def _by_gain(runs: list[rf.Recording]) -> list[Way]:
@@ -182,8 +194,11 @@ MACHINES: dict[str, Machine] = {
         lambda r: crossed(dict(zip(("gain 6", "gain 8", "gains 1 and 3"), r[1:], strict=True))),
     ),
     "flexible_arm": Machine("rotary_arm", "rotary_arm", lambda r: [halves(r[0])], {"flexible": True}),
-    "two_dof_link_1": Machine("two_dof_link", "two_dof_link", _link(1), {"stage": 1}),
-    "two_dof_link_2": Machine("two_dof_link", "two_dof_link", _link(2), {"stage": 2}),
+    "two_dof_link_1": Machine("two_dof_link", "two_dof_link", _stage(1, False), {"stage": 1}),
+    "two_dof_link_2": Machine("two_dof_link", "two_dof_link", _stage(2, False), {"stage": 2}),
+    "two_dof_link_1_beside_2": Machine("two_dof_link", "two_dof_link", _stage(1, True), {"stage": 1}),
+    "two_dof_link_2_beside_1": Machine("two_dof_link", "two_dof_link", _stage(2, True), {"stage": 2}),
+    "two_stage_link": Machine("two_dof_link", "two_stage_link", _both_stages),
     # Position servos: no model of their firmware yet.
     "bam_xl330": Machine("bam_xl330", "bam_xl330", _by_gain),
     "so101": Machine("so101", "so101", _elbow),

@@ -46,6 +46,15 @@ OutputColumns = Annotated[
         help="Column of theta, and once more for that of alpha; or CHANNEL=COLUMN.",
     ),
 ]
+Signals = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--signal",
+        metavar="COLUMN",
+        help="Column of what else was measured that acts on the machine, such as the acceleration of its "
+        "base; or NAME [UNIT]=COLUMN; may be repeated.",
+    ),
+]
 Degrees = Annotated[bool, typer.Option("--degrees", help="Angles in the files are in degrees.")]
 SamplingPeriod = Annotated[
     float | None,

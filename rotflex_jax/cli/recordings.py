@@ -18,6 +18,7 @@ from rotflex_jax.cli.arguments import (
     OutputColumns,
     Resample,
     SamplingPeriod,
+    Signals,
     TimeColumn,
     TimeUnit,
 )
@@ -40,6 +41,7 @@ class Columns:
 
     input: InputColumn = None
     outputs: OutputColumns = None
+    signals: Signals = None
     degrees: Degrees = False
     Ts: SamplingPeriod = None
     time: TimeColumn = None
@@ -49,7 +51,7 @@ class Columns:
     time_unit: TimeUnit = None
     resample: Resample = None
     intersample: Intersample = "held"
-    mechanism: Any = None  # whose channels are read where the options name none
+    mechanism: Any = None  # whose channels and signals are read where the options name none
 
     def __post_init__(self) -> None:
         if self.Ts is not None and self.time is not None:
@@ -100,6 +102,14 @@ class Columns:
                 "such an input (--model FILE.py:NAME, for a current one with CurrentDrive), or "
                 "--accept units."
             )
+        driving = () if self.mechanism is None else self.mechanism.signals
+        lacking = next((name for name in driving if name not in recording.signals), None)
+        if lacking is not None:
+            raise InputError(
+                f"{recording.source}: the model is driven by the signal {lacking!r} beside its input, but "
+                f"--signal names {' and '.join(map(repr, recording.signals))}; name its column, --signal "
+                f'"{lacking}=COLUMN".'
+            )
         return recording
 
     def reading(self) -> dict[str, Any]:
@@ -113,6 +123,7 @@ class Columns:
         return {
             "input": self.input,
             "outputs": channels,
+            "signals": _signals(self.signals or (), () if self.mechanism is None else self.mechanism.signals),
             "units": units,
             "degrees": self.degrees,
             "Ts": self.Ts,
@@ -236,6 +247,31 @@ def _channels(outputs: Sequence[str], model: Sequence[str]) -> Sequence[str] | M
     return dict(zip(model, outputs, strict=True)) if named else outputs or None
 
 
+def _signals(texts: Sequence[str], model: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
+    """`base [m/s^2]=acc` names the signal too; where none is given, the model's are read by their names."""
+    if not texts:
+        return dict(zip(model, model, strict=True)) or None
+    named = [text for text in texts if "=" in text]
+    if not named:
+        return list(texts)
+    alone = [text for text in texts if "=" not in text]
+    if alone:
+        raise InputError(
+            f"--signal was given {alone[0]!r} and {named[0]!r}, but either each signal has a name or none; "
+            f'name that one too, for instance --signal "{alone[0]}={alone[0]}".'
+        )
+    columns: dict[str, str] = {}
+    for text in named:
+        name, column = (part.strip() for part in text.split("=", 1))
+        if name in columns:
+            raise InputError(
+                f"--signal was given the name {name!r} for {columns[name]!r} and for {column!r}, but each "
+                "signal needs a name of its own; change one."
+            )
+        columns[name] = column
+    return columns
+
+
 def as_options(sentence: str) -> str:
     """A sentence about arguments of `rotflex_jax.load`, in terms of the options of the command line."""
     sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
@@ -247,6 +283,8 @@ def as_options(sentence: str) -> str:
     sentence = re.sub(r"\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
     sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
     sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
+    sentence = re.sub(r"\bsignals=|Argument `signals`", "--signal", sentence)
+    sentence = re.sub(r"a mapping such as \{'([^']+)': '(\w+)'\}", r'for instance "\1=\2"', sentence)
     return re.sub(r"Argument `(\w+)`", lambda m: "--" + m[1].replace("_", "-"), sentence)
 
 

@@ -39,6 +39,10 @@ def reproduce(
         raise InputError(
             "--intersample was given, but the experiment of the paper holds its input; leave it out."
         )
+    if columns.signals:
+        raise InputError(
+            "--signal was given, but the experiment of the paper has its input alone; leave it out."
+        )
     share = given.check_split(split, held_out or [])
     given.check_writable(json_file=json_file, folder=out)
     mechanism = by_name.joint(joint)

@@ -240,10 +240,13 @@ def print_findings(recordings: Sequence[Any]) -> None:
 
 def print_recording(recording: Any) -> None:
     """What was measured: extent, ranges, steps of the sensors, and everything that was noticed."""
+    from rotflex_jax.recording.samples import name_and_unit  # long after `--help` was answered
+
     about = f"{recording.N} samples, {recording.duration:g} s at {1 / recording.Ts:g} Hz"
     message(f"{recording.source}: {about}" if recording.source else about)
     signals = [(recording.input_name, recording.input_unit, recording.u)]
     signals += zip(recording.channels, recording.units, recording.y.T, strict=True)
+    signals += [(*name_and_unit(name), x) for name, x in recording.signals.items()]
     rows = []
     for name, unit, x in signals:
         limits = [_readable(float(end), unit) for end in (x.min(), x.max())]

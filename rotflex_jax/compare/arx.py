@@ -26,12 +26,12 @@ class DifferenceEquation:
 
     Attributes:
         A: Coefficients of the outputs, oldest sample first.
-        B: Coefficients of the input, oldest sample first.
+        B: Coefficients of the m inputs, oldest sample first: the input, then the signals of the recording.
         Ts: Sampling period it holds for [s].
     """
 
     A: Float[np.ndarray, "C n C"]
-    B: Float[np.ndarray, "C n"]
+    B: Float[np.ndarray, "C n m"]
     Ts: float
 
     @property
@@ -41,11 +41,26 @@ class DifferenceEquation:
 
     def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """One step ahead; the first samples, which it starts from, as measured."""
-        n, y = self.order, recording.y.astype(float)
-        lags = lambda x: np.lib.stride_tricks.sliding_window_view(x, n, axis=0)[:-1]  # noqa: E731
-        past = np.swapaxes(lags(y), 1, 2).reshape(len(y) - n, -1)
-        ahead = past @ self.A.reshape(len(self.B), -1).T + lags(recording.u.astype(float)) @ self.B.T
+        n, C, y = self.order, len(self.B), recording.y.astype(float)
+        ahead = (
+            _lags(y, n) @ self.A.reshape(C, -1).T
+            + _lags(self._inputs(recording), n) @ self.B.reshape(C, -1).T
+        )
         return np.concatenate([y[:n], ahead])
+
+    def _inputs(self, recording: Recording) -> Float[np.ndarray, "N m"]:
+        """The inputs of a recording.
+
+        Raises:
+            InputError: It has not as many signals as the recordings that the equation was fitted to.
+        """
+        inputs = recording.inputs.astype(float)
+        if inputs.shape[1] != self.B.shape[2]:
+            raise InputError(
+                f"The equation has {self.B.shape[2] - 1} signals beside the input, but the recording has "
+                f"{inputs.shape[1] - 1}; give a recording with the same signals."
+            )
+        return inputs
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """Free run: the first `n_init` samples as measured, from there on its own outputs.
@@ -66,10 +81,10 @@ class DifferenceEquation:
             )
         out = np.zeros((N, len(self.B)))
         out[:m] = recording.y[:m]
-        lags = np.lib.stride_tricks.sliding_window_view(recording.u.astype(float), n)
+        lags = _lags(self._inputs(recording), n)
         # An unstable equation overflows; the evaluation of the run reports it.
         with np.errstate(all="ignore"):
-            driven = lags @ self.B.T  # row k - n drives sample k
+            driven = lags @ self.B.reshape(len(self.B), -1).T  # row k - n drives sample k
             A = self.A.reshape(len(self.B), -1)
             for k in range(m, N):
                 out[k] = driven[k - n] + A @ out[k - n : k].ravel()
@@ -78,7 +93,7 @@ class DifferenceEquation:
 
 @dataclasses.dataclass(frozen=True)
 class ARX:
-    """A linear difference equation, fitted by least squares to the next sample.
+    """A linear difference equation, fitted by least squares to the next sample, the signals among its inputs.
 
     Its order is the one with the best free run over the last part of the training recordings. Not
     for data with coarse sensors or noise at a high sampling rate: least squares takes the noise of
@@ -126,14 +141,17 @@ def fit_difference_equation(recordings: Sequence[Recording], order: int) -> Diff
     C = recordings[0].y.shape[1]
     rows, targets = [], []
     for r in recordings:
-        y, u = r.y.astype(float), r.u.astype(float)
-        lags = lambda x: np.lib.stride_tricks.sliding_window_view(x, order, axis=0)[:-1]  # noqa: E731
-        # (N - n, C, n) to (N - n, n C): oldest sample first, channels side by side.
-        past = np.swapaxes(lags(y), 1, 2).reshape(len(y) - order, -1)
-        rows.append(np.hstack([past, lags(u)]))
+        y = r.y.astype(float)
+        rows.append(np.hstack([_lags(y, order), _lags(r.inputs.astype(float), order)]))
         targets.append(y[order:])
     X, Y = np.vstack(rows), np.vstack(targets)
     size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-300)
     W = (np.linalg.lstsq(X / size, Y, rcond=None)[0] / size[:, None]).T
-    A, B = W[:, : order * C].reshape(C, order, C), W[:, order * C :]
+    A, B = W[:, : order * C].reshape(C, order, C), W[:, order * C :].reshape(C, order, -1)
     return DifferenceEquation(A, B, recordings[0].Ts)
+
+
+def _lags(x: Float[np.ndarray, "N c"], n: int) -> Float[np.ndarray, "M K"]:
+    """The n samples before each from the n-th on: oldest sample first, columns side by side."""
+    windows = np.lib.stride_tricks.sliding_window_view(x, n, axis=0)[:-1]
+    return np.swapaxes(windows, 1, 2).reshape(len(x) - n, -1)

@@ -17,6 +17,7 @@ from rotflex_jax.effects.base import Actuation
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_voltage, rest_state
+from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.mechanism.simulate import read_outputs
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.persistent_jit import persistent_jit
@@ -287,6 +288,7 @@ def run_loop(
 ) -> ClosedLoop:
     """`close_loop` along a motion that is planned already."""
     if isinstance(plant, Model | Mechanism):
+        check_input_alone(Model.of(plant).mechanism, "a closed loop")
         return _with_model(controller, Model.of(plant), motion, noise, checked_seed(seed))
     if not isinstance(plant, Plant):
         raise InputError(

@@ -18,6 +18,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout, effects_of, equations, rest_state
 from rotflex_jax.mechanism.linear import check_movable, process_covariance, state_names, zero_order_hold
+from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.mechanism.step import (
     advance_memories,
     friction_level,
@@ -347,6 +348,7 @@ def controller(
     limit = positive(limit, "limit", unit=model.mechanism.units.input, example="10.0")
     one_of(compensate, "compensate", get_args(Compensation))
     mechanism = model.mechanism
+    check_input_alone(mechanism, "a controller")
     for name, given in (("port", port), ("load", port if load is None else load)):
         one_of(given, name, mechanism.port_vectors)
     load = load or port

@@ -74,6 +74,34 @@ def named_outputs(outputs: Any) -> dict[str, str]:
     return chosen
 
 
+def named_signals(signals: Any, table: Table) -> dict[str, str]:
+    """Signal name to column name; of a column alone, the signal has the name, with the unit behind."""
+    if isinstance(signals, Mapping):
+        columns, names = list(signals.values()), list(signals)
+    else:
+        several = isinstance(signals, list | tuple)
+        columns, names = list(signals) if several else [] if signals is None else [signals], []
+    if all(isinstance(column, str) for column in columns):
+        found = [table.find(column) for column in columns]
+        chosen = dict(zip(names or [_with_unit(table, column) for column in found], found, strict=True))
+        if len(set(chosen.values())) == len(columns):
+            return chosen
+    raise InputError(
+        f"Argument `signals` must name columns, each once, but is {shown(signals)}; for other names of "
+        "signals give a mapping such as {'acceleration of the base [m/s^2]': 'column'}."
+    )
+
+
+def _with_unit(table: Table, column: str) -> str:
+    """Its name with its unit in brackets, where the file says one."""
+    name, unit = name_and_unit(column)[0], _unit(table, column)
+    return f"{name} [{unit}]" if unit else name
+
+
+def _unit(table: Table, column: str) -> str:
+    return name_and_unit(column)[1] or table.units.get(column, "").strip(" []()")
+
+
 def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) -> Real[np.ndarray, " N"]:
     """A column as finite numbers.
 
@@ -107,7 +135,7 @@ def _unit_source(name: str, unit: str) -> str:
 
 def input_unit(table: Table, name: str) -> str | None:
     """The unit of the input where the file says that it is another than volts."""
-    unit = name_and_unit(name)[1] or table.units.get(name, "").strip(" []()")
+    unit = _unit(table, name)
     if not unit and "current" in _words(table, name):
         return "A"
     return None if unit.lower() in ("", "v", "volt", "volts", "-", "–", "1") else unit

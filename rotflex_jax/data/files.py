@@ -26,6 +26,7 @@ from rotflex_jax.data.columns import (
     deflection,
     input_unit,
     named_outputs,
+    named_signals,
     time_stamps,
     timing,
     unused_sensors,
@@ -220,6 +221,7 @@ def load(
     arm_absolute: bool = False,
     time_unit: str | None = None,
     resample: float | str | None = None,
+    signals: str | Sequence[str] | Mapping[str, str] | None = None,
 ) -> Recording:
     """Reads a recording and checks it; nothing is repaired unless it is asked for by name.
 
@@ -249,7 +251,10 @@ def load(
         time_unit: of the time, "s", "ms" or "us"; what the header says, else seconds.
         resample: sampling period to have [s], or "auto" for the usual one, where times are uneven, or signals
             have times of their own: the
-            input is held, outputs follow straight lines, and a finding says what was done.
+            input and `signals` are held, outputs follow straight lines, and a finding says what was done.
+        signals: columns of what was measured of all else that acts on the machine, such as the acceleration
+            of what it stands on, see `Recording`; or a mapping of signal name to column. They are taken in
+            the unit that they have.
 
     Returns:
         The recording.
@@ -281,6 +286,11 @@ def load(
             "needs the times of the samples, and that period stands in their place; leave one of the two out."
         )
     if is_foreign(source):
+        if signals is not None:
+            raise InputError(
+                "Argument `signals` must name columns of a file or a table, but an object with `u` and `y` "
+                "was given; leave it out, and give the samples to with_signals() of what is loaded."
+            )
         names = list(outputs) if isinstance(outputs, Mapping) else outputs
         return from_foreign(source, names, units, Ts, accepted)
     table = read_table(source, sys.maxsize if "huge" in accepted else max_bytes, time)
@@ -294,15 +304,25 @@ def load(
             f"{table.label}: the column {u_name!r} was given as input and as output, but it can be "
             "only one; correct input= or outputs=."
         )
+    acting = named_signals(signals, table)
+    for name in acting.values():
+        if name in (u_name, *chosen.values()):
+            raise InputError(
+                f"{table.label}: the column {name!r} was given as a signal and as input or output, but it "
+                "can be only one; correct signals=."
+            )
     clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
-    names = [u_name, *chosen.values()]
+    names = [u_name, *acting.values(), *chosen.values()]
     own = list(dict.fromkeys(clock for name, clock in table.clocks.items() if name in names))
     if own and clock not in table.columns:  # the file says what times a signal has
         clock = own[0]
     apart = len(own) > 1 and any(not np.array_equal(table.columns[c], table.columns[own[0]]) for c in own)
     stamps = [] if Ts is not None and time is None else [(clock, "time=")]
-    table.check([(u_name, "input="), *((name, "outputs=") for name in chosen.values()), *stamps])
+    wanted = [(name, "outputs=") for name in chosen.values()]
+    wanted += [(name, "signals=") for name in acting.values()]
+    table.check([(u_name, "input="), *wanted, *stamps])
     u = column_of(table, u_name, "input=", {"mv": "volts"})
+    held = [u, *(column_of(table, name, "signals=", {}) for name in acting.values())]
     per_turn = counts_per_turn(counts, tuple(chosen), degrees)
     y = {}
     for channel, name in chosen.items():
@@ -318,6 +338,7 @@ def load(
             )
         else:
             y[channel] = values
+    for name, values in zip(names, [*held, *y.values()], strict=True):
         if len(values) != len(u) and not apart:
             raise InputError(
                 f"{table.label}: {u_name!r} has {len(u)} samples and {name!r} has "
@@ -325,7 +346,7 @@ def load(
             )
     if arm_absolute:
         y = deflection(y)
-    remarks = unused_sensors(table, tuple(y), {u_name, clock, *chosen.values()})
+    remarks = unused_sensors(table, tuple(y), {clock, *names})
     if apart:
         if resample is None:
             raise InputError(
@@ -337,14 +358,17 @@ def load(
         stamps_of = {
             c: time_stamps(table, c, time_unit, len(table.columns[c]), any_unit) for c in dict.fromkeys(own)
         }
-        signals = [
+        timed = [
             TimedSignal(
-                stamps_of[c := table.clocks[name]], x[:, None], k == 0, f"{table.label}: the time {c!r}"
+                stamps_of[c := table.clocks[name]],
+                x[:, None],
+                k < len(held),
+                f"{table.label}: the time {c!r}",
             )
-            for k, (name, x) in enumerate(zip(names, [u, *y.values()], strict=True))
+            for k, (name, x) in enumerate(zip(names, [*held, *y.values()], strict=True))
         ]
-        start, period, brought, told = resampled_apart(signals, resample, table.where, table.first)
-        u, together = brought[0][:, 0], np.column_stack(brought[1:])
+        start, period, brought, told = resampled_apart(timed, resample, table.where, table.first)
+        held, together = [x[:, 0] for x in brought[: len(held)]], np.column_stack(brought[len(held) :])
         remarks.append(told)
     elif resample is None:
         together = np.column_stack(list(y.values()))
@@ -353,12 +377,13 @@ def load(
         together = np.column_stack(list(y.values()))
         t = time_stamps(table, clock, time_unit, len(u), "units" in accepted)
         at = f"{table.label}: the time {clock!r}", table.where, table.first
-        start, period, u, together, told = resampled(t, u, together, resample, *at)
+        start, period, steps, together, told = resampled(t, np.column_stack(held), together, resample, *at)
+        held = list(steps.T)
         remarks.append(told)
     try:
         other = (units or {}).get(u_name) or input_unit(table, u_name)
         recording = Recording(
-            u=u,
+            u=held[0],
             input_name="voltage" if other is None else name_and_unit(u_name)[0],
             input_unit=other or "V",
             y=together,
@@ -369,6 +394,7 @@ def load(
             start=start,
             accept=accepted,
             remarks=remarks,
+            signals=dict(zip(acting, held[1:], strict=True)),
         )
     except InputError as error:
         raise InputError(f"{table.label}: {error}") from error
@@ -383,7 +409,7 @@ def load(
 
 
 def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
-    """Writes a recording as text that `load` reads: time, input, outputs.
+    """Writes a recording as text that `load` reads: time, input, outputs, and its signals under their names.
 
     Args:
         recording: what to write.
@@ -396,9 +422,10 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
         InputError: it cannot be written; an old file stays.
     """
     recording = single(recording, "recording")
-    header = ",".join(["t", recording.input_name, *recording.channels])
-    columns = np.column_stack([recording.t, recording.u, recording.y])
+    columns = np.column_stack([recording.t, recording.u, recording.y, *recording.signals.values()])
     # 17 digits carry a number exactly; the time is known to fewer.
     formats = ["%.15g"] + ["%.17g"] * (columns.shape[1] - 1)
-    np.savetxt(text := StringIO(), columns, fmt=formats, delimiter=",", header=header, comments="")
+    header = ["t", recording.input_name, *recording.channels, *recording.signals]
+    csv.writer(text := StringIO(), lineterminator="\n").writerow(header)
+    np.savetxt(text, columns, fmt=formats, delimiter=",")
     return write_file(path, text.getvalue())

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from jaxtyping import Float, Shaped
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.quality import Finding
-from rotflex_jax.recording.samples import LONGEST_STEP, finite, sampling_period
+from rotflex_jax.recording.samples import LONGEST_STEP, finite, name_and_unit, sampling_period
 
 
 @dataclass(frozen=True)
@@ -104,19 +103,6 @@ class Table:
             cure = "save a timetable, timeseries or Dataset with -v7, and of others the arrays"
             then += f"; objects that only MATLAB reads are left out, {objects}: {cure}"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
-
-
-_UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[(]\s*([^\[\]()]*[^\W\d][^\[\]()]*?|°)\s*[\])]")
-
-
-def name_and_unit(column: str) -> tuple[str, str]:
-    """The name of a column and the unit in brackets behind it.
-
-    >>> name_and_unit("Theta [deg]"), name_and_unit("log[0]"), name_and_unit("u")
-    (('Theta', 'deg'), ('log[0]', ''), ('u', ''))
-    """
-    found = _UNIT_BEHIND.fullmatch(column.strip())
-    return (found[1], found[2]) if found else (column.strip(), "")
 
 
 def distinct(names: Sequence[str], label: str) -> Sequence[str]:
@@ -375,13 +361,13 @@ LOST = 1.5
 
 def resampled(
     t: Float[np.ndarray, " N"],
-    u: Float[np.ndarray, " N"],
+    u: Float[np.ndarray, "N D"],
     y: Float[np.ndarray, "N C"],
     period: Any,
     label: str,
     where: str = "row",
     first: int = 1,
-) -> tuple[float, float, Float[np.ndarray, " M"], Float[np.ndarray, "M C"], Finding]:
+) -> tuple[float, float, Float[np.ndarray, "M D"], Float[np.ndarray, "M C"], Finding]:
     """Signals at even times: the input as it is held, the outputs on straight lines between their samples.
 
     Not a cure for a clock that is wrong where a converter samples evenly: there leave the time out and give
@@ -389,7 +375,7 @@ def resampled(
 
     Args:
         t: Times, which may repeat but not fall [s].
-        u: Input.
+        u: Input, and signals that are held as it is.
         y: Outputs.
         period: Sampling period to have [s], or "auto" for the median step.
         label: First words of an error.
@@ -404,13 +390,13 @@ def resampled(
         InputError: Times that fall or are too few, or a gap that no line should bridge.
 
     >>> t = np.array([0.0, 0.01, 0.021, 0.03, 0.04])
-    >>> _, Ts, u, y, said = resampled(t, np.arange(5.0), 10 * t[:, None], "auto", "run.csv")
-    >>> Ts, u, said.message
+    >>> _, Ts, u, y, said = resampled(t, np.arange(5.0)[:, None], 10 * t[:, None], "auto", "run.csv")
+    >>> Ts, u[:, 0], said.message
     (0.01, array([0., 1., 1., 3., 4.]), 'Resampled every 0.01 s from steps of 0.009 to 0.011 s.')
     """
-    both = [TimedSignal(t, u[:, None], True, label), TimedSignal(t, y, False, label)]
+    both = [TimedSignal(t, u, True, label), TimedSignal(t, y, False, label)]
     start, Ts, (held, lines), finding = resampled_apart(both, period, where, first)
-    return start, Ts, held[:, 0], lines, finding
+    return start, Ts, held, lines, finding
 
 
 class TimedSignal(NamedTuple):

@@ -264,7 +264,7 @@ class _Kinds:
             e, absent = s.mechanism.effects[c.effect], c.effect not in active.effects
             if c.threshold:
                 continue
-            at_port = e.acts_on == "port"
+            at_port = e.acts_at_port
             if not adds_to_step(e, active.mechanism.structure, solver) or (at_port and c.line is not None):
                 found.others.extend([c] * absent)
             elif at_port:
@@ -327,7 +327,7 @@ def candidate_sensitivities(
         every = s.with_family(current.gates, kinds.signals).effects
         effects, given = s.mechanism.effects, len(s.baseline.effects)
         # Of laws at ports those of the user's model alone, which all hypotheses share.
-        model = s.only(i for i in every if i < given or effects[i].acts_on != "port")
+        model = s.only(i for i in every if i < given or not effects[i].acts_at_port)
         listed = [p for c in kinds.signals if c.location in asked for p in Probe.of(asked[c.location])]
         count = sum(len(g) * (1 if c.line is None else MOST_LINES) for c in kinds.signals for g in c.probes)
         points = [predictor.restrict(_with_probes(current, [p]), model) for p in listed]

@@ -118,7 +118,7 @@ def calibrated(stage: Stage) -> Model:
     """The model of a stage with the offsets that belong to its recordings."""
     m = stage.model.mechanism
     for e in stage.estimates:
-        port, effect, parameter = e.name.split(".")
+        port, effect, parameter = e.name.rsplit(".", 2)
         if e.name not in m.parameter_names and effect in CATALOG:
             m = m + CATALOG[effect](at=port, **{parameter: e.value})
     return dataclasses.replace(stage.model, mechanism=m)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from rotflex_jax.discover.checkpoint import AddedEffect, beginning
 from rotflex_jax.discover.hypothesis import CandidateStart, generalisations, parameter_count
-from rotflex_jax.discover.pairs import find_pair, is_unexplained
+from rotflex_jax.discover.pairs import best_candidates, find_pair, is_unexplained
 from rotflex_jax.discover.score_test import Score, promising_at_both
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import (
@@ -19,9 +19,13 @@ from rotflex_jax.discover.selection import (
 from rotflex_jax.discover.stepwise import refit_candidates, refit_near_predictions
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.effects.base import DRY_FRICTION
+from rotflex_jax.effects.labels import law_of
 
 # Candidates of both rankings together that are refitted in a round, the best of each beside them, and rounds.
 REFITTED, ROUNDS = 4, 4
+# Laws of dry friction that are refitted where a round has tried none and adds nothing.
+FRICTION_LAWS = 2
 
 
 class Promising(NamedTuple):
@@ -64,6 +68,36 @@ def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
         [*(x.start for x, _ in chosen), *further],
         [*(y.start for _, y in chosen), *further],
     )
+
+
+def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool:
+    """Add dry friction at a motor where a round has tried none and added nothing; False if it is no better.
+
+    Every machine has some, but its slopes say little of it beside a model whose inertia or damping stands in
+    its place, or where another effect that is missing explains far more.
+
+    Args:
+        state: What was found so far.
+        promising: What the round has tried.
+    """
+    s, on = state.problem.supermodel, {*state.current.hypothesis.locations}
+    present = [*(e.name for e in s.baseline.effects), *(p.effect for p in on)]
+    tried = [start.location.effect for p in promising for start in p.starts]
+    if any(law_of(name) == DRY_FRICTION for name in (*present, *tried)):
+        return False
+    if not is_unexplained(state.horizons, state.current):
+        return False
+    chosen = []
+    for beside in [state.origin] if state.origin is state.current else [state.origin, state.current]:
+        tests = state.score_tests(beside)
+        order = best_candidates(*tests, len(s.candidates))
+        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and s.baseline.has_motor(p.port)]
+        first, second = ({x.location: x for x in test.listed} for test in tests)
+        laws = laws[:FRICTION_LAWS]
+        starts, runs_starts = ([by[p].start for p in laws] for by in (first, second))
+        if laws:
+            chosen.append(Promising(beside, [first[p] for p in laws], starts, runs_starts))
+    return bool(chosen) and add_best(state, chosen)
 
 
 def refit_and_validate(

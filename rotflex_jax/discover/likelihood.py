@@ -71,7 +71,7 @@ class LikelihoodProblem:
     def first_seconds(self, seconds: float) -> "LikelihoodProblem":
         """The same with the first seconds of each recording alone; nothing after them counts."""
         data = self.dataset.data
-        return self.counting(np.arange(data.u.shape[1]) * data.Ts[:, None] < seconds)
+        return self.counting(np.arange(data.seen.shape[1]) * data.Ts[:, None] < seconds)
 
     def of_recordings(self, chosen: Sequence[int]) -> "LikelihoodProblem":
         """The same with some recordings alone; the others stay in place, for the sake of compiled code."""

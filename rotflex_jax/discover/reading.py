@@ -61,7 +61,8 @@ def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
     if getattr(problem.predictor.solver, "between", "") != "held":
         return 0.0
     u = np.array(data.u)
-    for row, recording in zip(u, problem.dataset.recordings, strict=True):
+    voltages = u if u.ndim == 2 else u[..., 0]
+    for row, recording in zip(voltages, problem.dataset.recordings, strict=True):
         if np.mean(np.diff(recording.u) == 0) > MOST_REPEATED:
             return 0.0
         row[: recording.N] = held_equivalent(recording.u.astype(float))
@@ -144,7 +145,7 @@ def _with_opposite_sign(
         sign = np.where(np.array(r.channels) == channel, -1.0, 1.0)
         # What was accepted of a channel, such as a limit at zero, may be another fault of its negative.
         negated.append(dataclasses.replace(r, y=r.y * sign, accept=ACCEPTABLE))
-    length = problem.dataset.data.u.shape[1]
+    length = problem.dataset.data.seen.shape[1]
     dataset = prepare(model, negated, length=length, like=problem.dataset)
     windows = Windows.of_seconds(model, dataset, seconds, problem.windows.number)
     return dataclasses.replace(problem.of_dataset(dataset), windows=windows)

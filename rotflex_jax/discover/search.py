@@ -14,7 +14,13 @@ from rotflex_jax.discover.checkpoint import beginning, digest_of_search
 from rotflex_jax.discover.conclusion import with_proposal
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.evaluation import Evaluation
-from rotflex_jax.discover.forward_selection import ROUNDS, add_best, add_pair, score_candidates
+from rotflex_jax.discover.forward_selection import (
+    ROUNDS,
+    add_best,
+    add_dry_friction,
+    add_pair,
+    score_candidates,
+)
 from rotflex_jax.discover.in_place import take_better_laws, undecided_rivals
 from rotflex_jax.discover.likelihood import (
     LikelihoodProblem,
@@ -84,7 +90,8 @@ def discover(
             training recording validates what was fitted to the others.
         test: Recordings that have no say in anything; the errors on them are reported beside.
         candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
-            answer to those of the flexible joint (`mechanism.roles`).
+            answer to those of the flexible joint (`mechanism.roles`). Each of the `signals` that all recordings
+            have is tried as a torque at each of these ports.
         rounds: Most effects to add; two that are added together count as two.
         window_seconds: Length of short free runs [s].
         calibrate_seconds: The errors reported as calibrated allow each recording that no fit saw the offsets
@@ -105,12 +112,13 @@ def discover(
     model, rounds = Model.of(mechanism), checks.whole(rounds, "rounds", 0)
     checks.positive(window_seconds, "window_seconds")
     checks.number(calibrate_seconds, "calibrate_seconds", least=0, unit="s", example="2.0")
-    if candidates is not None:
-        candidates = checked_candidates(model.mechanism, candidates)
     # 1. Prepare: one super-model with every candidate built in, the recordings at both horizons.
     trained, held_back = listed(train, "train", SHORTEST_TO_FIT), _several(validation, "validation")
-    horizons = _prepare(model, trained, held_back, candidates, window_seconds)
     tested = _several(test, "test")
+    model = _with_signals(model, (*trained, *held_back, *tested))
+    if candidates is not None:
+        candidates = checked_candidates(model.mechanism, candidates)
+    horizons = _prepare(model, trained, held_back, candidates, window_seconds)
     reason = "errors are reported on data that had no say; give other recordings, or leave `test` out"
     check_apart((*trained, *held_back), tested, "to search and to test", reason)
     evaluation = Evaluation.of(model, horizons, tested, calibrate_seconds)
@@ -126,7 +134,9 @@ def discover(
             # 3. Score all candidates.
             promising = score_candidates(state)
             # 4. Refit the best and decide; where none is worth it alone, two together may be.
-            if not add_best(state, promising) and not add_pair(state, rounds):
+            if add_best(state, promising) or add_dry_friction(state, promising):
+                continue
+            if not add_pair(state, rounds):
                 break
         # 5. Leave out what is not needed, and see whether steps of one effect have passed by a pair.
         _make_ahead(state, evaluation)
@@ -136,6 +146,14 @@ def discover(
         evaluated = evaluate_models(state, evaluation)
         # 7. The verdict, and what to record next where it is open.
         return with_proposal(conclude(state, evaluated, started))
+
+
+def _with_signals(model: Model, recordings: Sequence[Recording]) -> Model:
+    """The model that measured signals may drive, those that all recordings have beside their input."""
+    first, *others = recordings
+    common = [name for name in first.signals if all(name in r.signals for r in others)]
+    known = dict.fromkeys((*model.mechanism.signals, *common))
+    return dataclasses.replace(model, mechanism=model.mechanism.with_signals(tuple(known)))
 
 
 def _kind_of_programs(horizons: Horizons) -> tuple[Any, ...]:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Shaped
 
 from rotflex_jax.checks import entries, shown
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.base import Effect, Scale
+from rotflex_jax.effects.base import SIGNAL_MARK, Effect, Scale
 from rotflex_jax.effects.labels import law_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.plausibility import motion
@@ -50,7 +50,7 @@ def stiffness_and_inertia(mechanism: Mechanism, port: str) -> tuple[float, float
 
 
 def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict[str, Scale]:
-    """Port, `input` or channel -> size of its signals.
+    """Port, port with a measured signal, `input` or channel -> size of what moves or drives it.
 
     Args:
         model: Its ports and outputs.
@@ -67,6 +67,9 @@ def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict
         position = max((float(np.max(np.abs(q - q.mean()))) for q, _ in known), default=0.1)
         stiffness, inertia = stiffness_and_inertia(mechanism, port)
         out[port] = Scale(voltage, max(speed, 1e-6), max(position, 1e-6), torque, stiffness, inertia)
+        for name in mechanism.signals:
+            size = float(np.sqrt(np.mean(np.concatenate([r.signals[name] for r in recordings]) ** 2)))
+            out[f"{port}{SIGNAL_MARK}{name}"] = dataclasses.replace(out[port], signal=max(size, 1e-12))
     whole = Scale(voltage, 1.0, 1.0, torque)
     for channel in mechanism.channels:
         y = np.concatenate([model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings])
@@ -214,7 +217,7 @@ class SuperModel:
         found: dict[str, list[Candidate]] = {}
         for c in candidates:
             effect = self.mechanism.effects[c.effect]
-            if c.effect in own or effect.acts_on != "port":
+            if c.effect in own or not effect.acts_at_port:
                 kind = "memory" if effect.state_part == "memory" else "signal"
             else:
                 kind = "contact" if effect.dry_contact else "torque"
@@ -289,9 +292,12 @@ class SuperModel:
         return self.known_gates[on]
 
     def clean(self, values: Float[np.ndarray, " P"], locations: Iterable[EffectLocation]) -> Mechanism:
-        """The user's mechanism with fitted parameters and the named effects, nothing else."""
+        """The user's mechanism with fitted parameters and the named effects, nothing else.
+
+        It has the signals that its effects take, and no others.
+        """
         named = dict(zip(self.mechanism.parameter_names, values.tolist(), strict=True))
-        mechanism = self.baseline
+        mechanism = self.baseline.with_signals(())
         for location in locations:
             mechanism = mechanism + self.mechanism.effects[self.effect_index(location)]
         return mechanism.with_values({n: named[n] for n in mechanism.parameter_names})

@@ -56,6 +56,7 @@ from rotflex_jax.effects.sensors import (
     SensorCubic,
     SensorGain,
 )
+from rotflex_jax.effects.signals import MeasuredDisturbance
 from rotflex_jax.effects.springs import CubicSpring, JointPlay, QuadraticSpring, Spring
 
 __all__ = [
@@ -101,6 +102,7 @@ __all__ = [
     "Cogging",
     "JointPlay",
     "LearnedTorque",
+    "MeasuredDisturbance",
     # gear
     "Backlash",
     "ElasticBacklash",

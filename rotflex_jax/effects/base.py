@@ -31,9 +31,11 @@ Period = float | Float[Array, ""]
 Probe = Mapping[str, float]
 """Parameter name -> value at which a score test tries an effect."""
 Drive = Literal["voltage", "motor", "current", "duty"]
-Domain = Literal["port", "input", "channel"]
+Domain = Literal["port", "input", "channel", "signal"]
 Beside = Literal["nothing", "other", "states"]
 StatePart = Literal["linear", "rotor", "memory"]
+SIGNAL_MARK = ": "
+"""Between a port and the signal that drives an effect there."""
 EffectType = TypeVar("EffectType", bound="Effect")
 
 
@@ -71,6 +73,7 @@ class Scale:
         torque: Root mean square torque the motor can be seen to give [N m].
         stiffness: Of the linear springs at the port [N m/rad].
         inertia: Inertia that a torque at the port accelerates [kg m^2].
+        signal: Root mean square of the signal that acts at the port, in its unit.
     """
 
     voltage: float
@@ -79,6 +82,7 @@ class Scale:
     torque: float
     stiffness: float = 0.0
     inertia: float = 0.0
+    signal: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +90,8 @@ class Effect(abc.ABC):
     """One physical mechanism at one port.
 
     Attributes:
-        at: Port it acts at; `input` for actuation, a channel's name for sensing.
+        at: Port it acts at; `input` for actuation, a channel's name for sensing; for what a measured signal
+            drives the port and the signal, `"arm: acceleration of link 1 [rad/s^2]"`.
 
     Raises:
         InputError: At the definition of a class with a `name` that lacks a method or declaration which its
@@ -118,7 +123,7 @@ class Effect(abc.ABC):
     # -- declared by each kind
     kind_label: ClassVar[str]
     kind_meaning: ClassVar[str]  # one sentence for the catalogue
-    # What `at` names: a port, the voltage, or an output.
+    # What `at` names: a port, the voltage, an output, or a port with a signal that acts there.
     acts_on: ClassVar[Domain] = "port"
     # Which part of the state holds its own states, `order` of them; None where it has none.
     state_part: ClassVar[StatePart | None] = None
@@ -199,8 +204,24 @@ class Effect(abc.ABC):
     @property
     def location(self) -> str:
         """Where it acts, in words."""
-        words = {"port": f"at {self.at}", "input": "on the voltage", "channel": f"at the sensor {self.at}"}
+        at = f"at {self.at}"
+        words = {"port": at, "signal": at, "input": "on the voltage", "channel": f"at the sensor {self.at}"}
         return words[self.acts_on]
+
+    @property
+    def port(self) -> str:
+        """The place where it acts, without the signal that drives it."""
+        return self.at.partition(SIGNAL_MARK)[0] if self.acts_on == "signal" else self.at
+
+    @property
+    def acts_at_port(self) -> bool:
+        """Whether it acts on the motion of a port, driven by a signal or not."""
+        return self.acts_on in ("port", "signal")
+
+    @property
+    def signal(self) -> str:
+        """The measured signal that drives it in the place of the voltage; empty for most."""
+        return self.at.partition(SIGNAL_MARK)[2] if self.acts_on == "signal" else ""
 
     @property
     def values(self) -> dict[str, Any]:
@@ -331,7 +352,7 @@ class Force(Effect):
 
     @abc.abstractmethod
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
-        """Torque [N m] on the port."""
+        """Torque [N m] on the port; of what a signal drives, its value stands in the place of the voltage."""
 
 
 class DryFriction(Effect):

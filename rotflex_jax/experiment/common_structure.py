@@ -15,7 +15,7 @@ from rotflex_jax.experiment.rival_set import RivalSet
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver
 from rotflex_jax.mechanism.gear import gear_steps
-from rotflex_jax.mechanism.mechanism import process_noise_of
+from rotflex_jax.mechanism.mechanism import check_input_alone, process_noise_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
 
@@ -51,6 +51,8 @@ def rival_set(
     uncertainty = checks.number(uncertainty, "uncertainty", above=0, example="0.05")
     items = _items(given)
     models = [g.model if isinstance(g, Fit) else Model.of(g) for _, g in items]
+    for m in models:
+        check_input_alone(m.mechanism, "a designed experiment")
     reduced = [_without_gates(m) for m in models]
     labels = _labels([name for name, _ in items], reduced)
     first = reduced[0].mechanism

@@ -33,7 +33,7 @@ from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, S
 from rotflex_jax.experiment.until_decided import models_of
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.mechanism import process_noise_of
+from rotflex_jax.mechanism.mechanism import check_input_alone, process_noise_of
 from rotflex_jax.models.model import Model
 
 Progress = Callable[[str], None]
@@ -163,6 +163,7 @@ def next_experiment(
             "give several models."
         )
     fitted = model.model if isinstance(model, Fit) else Model.of(model)
+    check_input_alone(fitted.mechanism, "a designed experiment")
     if not isinstance(limits, Limits):
         raise InputError(
             f"Argument `limits` must be Limits(voltage=...), but is {checks.shown(limits)}; give what the "

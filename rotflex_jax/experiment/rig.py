@@ -15,6 +15,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.result import voltage_file
 from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.mechanism import Mechanism, simulate
+from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
@@ -70,6 +71,7 @@ class SimulatedRig(Rig):
             checked_limits(limits),
             checks.positive(Ts, "Ts", "s", "0.002"),
         )
+        check_input_alone(self.model.mechanism, "a simulated rig")
         channels = self.model.mechanism.channels
         given = noise or {}
         self._sd = np.array(

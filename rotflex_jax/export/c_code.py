@@ -16,6 +16,7 @@ from rotflex_jax.export.program import SampleProgram, sample_program
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.linear import state_names
+from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
 from rotflex_jax.text.numbers import one_line
@@ -48,6 +49,7 @@ def to_c(model: Mechanism | Model, Ts: float, prefix: str = "rotflex") -> str:
         InputError: An effect that C code cannot express, by name; an invalid sampling period or prefix.
     """
     model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
+    check_input_alone(model.mechanism, "C code")
     if not (isinstance(prefix, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix)):
         raise InputError(
             f"The prefix {shown(prefix)} begins no name in C; give letters, digits and underscores."

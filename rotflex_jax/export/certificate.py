@@ -12,6 +12,7 @@ from rotflex_jax.checks import positive, shown, signal
 from rotflex_jax.effects.base import Effect, Memory
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, simulate
+from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.models.model import Model
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import one_line
@@ -121,6 +122,7 @@ class Subject:
             InputError: No model, no sampling period, no finite signal, effects that are on in part.
         """
         model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
+        check_input_alone(model.mechanism, "an exported model")
         model = _switched_on(model)
         unit = model.mechanism.units.input
         if u is None:

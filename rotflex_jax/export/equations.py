@@ -190,7 +190,7 @@ def _matrices(mechanism: Mechanism) -> dict[str, np.ndarray]:
 
 def _with_equations(mechanism: Mechanism) -> Iterator[Effect]:
     """Effects that are not in the matrices, in the order of the signal: voltage, ports, sensors."""
-    path = ("input", "port", "channel")
+    path = ("input", "signal", "port", "channel")
     stage = lambda e: (path.index(e.acts_on), getattr(e, "stage", 0))  # noqa: E731
     for effect in sorted(mechanism.effects, key=stage):
         if not effect.is_linear or effect.order or not effect.exact_step:

@@ -31,15 +31,15 @@ class LinearModel:
         D: Feedthrough; zero, since a voltage acts on speeds first.
         Ts: Sampling period [s]; None for continuous time.
         states: Names.
-        inputs: Names.
+        inputs: Names; the voltage, then the signals that drive the model beside it.
         outputs: Names.
         dropped: Effects that the linear model does not contain, one sentence each.
     """
 
     A: Float[np.ndarray, "n n"]
-    B: Float[np.ndarray, "n 1"]
+    B: Float[np.ndarray, "n i"]
     C: Float[np.ndarray, "C n"]
-    D: Float[np.ndarray, "C 1"]
+    D: Float[np.ndarray, "C i"]
     Ts: float | None
     states: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -119,12 +119,13 @@ def state_space(
             L, z = x[:start], x[start:]
             dL = eq.A @ L + eq.B * u[0]
             if smooth:
-                dL = dL + eq.ports @ torques(mechanism, L, z, u[0], gates)
+                dL = dL + eq.ports @ torques(mechanism, L, z, u if mechanism.takes_signals else u[0], gates)
             return jnp.concatenate([dL, memory_rates(mechanism, L, z, u[0], gates)]) if z.shape[0] else dL
 
         x = rest_state(mechanism.structure, np.float64)
         x[: 2 * layout.n] = np.concatenate(point)
-        u = jnp.asarray([float(voltage)])
+        inputs = ("voltage", *(mechanism.signals if mechanism.takes_signals else ()))
+        u = jnp.asarray([float(voltage), *[0.0] * (len(inputs) - 1)])
         x = _steady_memories(slope, jnp.asarray(x), u, start)
         A, B = (np.asarray(m) for m in jax.jacfwd(slope, argnums=(0, 1))(x, u))
         C = np.asarray(jax.jacfwd(lambda s: read_outputs(mechanism, gates, s))(x))
@@ -135,10 +136,10 @@ def state_space(
         A=A[np.ix_(rows, rows)],
         B=B[rows],
         C=C[:, rows],
-        D=np.zeros((len(C), 1)),
+        D=np.zeros((len(C), len(inputs))),
         Ts=None,
         states=tuple(names[i] for i in rows),
-        inputs=("voltage",),
+        inputs=inputs,
         outputs=mechanism.channels,
         dropped=tuple(_dropped(model)),
     )

@@ -492,7 +492,7 @@ def _slopes(
     states, C, N = Layout.of(m.structure).size, len(m.channels), recording.N
     with double_precision():
         data = StackedRecordings(
-            jnp.asarray(recording.u.astype(float)[None]),
+            jnp.asarray(model.inputs(recording)[None]),
             jnp.zeros((1, N, C)),
             jnp.ones((1, N)),
             jnp.asarray(np.array([float(recording.Ts)])),

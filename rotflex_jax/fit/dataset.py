@@ -25,16 +25,21 @@ class StackedRecordings(NamedTuple):
     """Recordings side by side, shorter ones padded with samples that are not `seen`.
 
     Attributes:
-        u: Inputs.
+        u: Inputs; with the signals of the model's mechanism beside them where it has any.
         y: Outputs, with the channels that the model has.
         seen: One where a sample counts, zero where it is padding.
         Ts: Sampling periods [s].
     """
 
-    u: Float[Any, "R N"]
+    u: Float[Any, "R N *c"]
     y: Float[Any, "R N C"]
     seen: Float[Any, "R N"]
     Ts: Float[Any, " R"]
+
+    @property
+    def voltage(self) -> Float[Any, "R N"]:
+        """Inputs without other signals."""
+        return self.u if self.u.ndim == 2 else self.u[..., 0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,9 +165,11 @@ def stack(recordings: Sequence[Recording], model: Model, length: int | None = No
         raise InputError("No recording was given, but at least one is needed; pass a Recording.")
     N = max(length or 0, *(r.N for r in recordings))
     R, C = len(recordings), len(model.mechanism.channels)
-    data = StackedRecordings(np.zeros((R, N)), np.zeros((R, N, C)), np.zeros((R, N)), np.ones(R))
+    inputs = [model.inputs(r) for r in recordings]
+    u = np.zeros((R, N, *inputs[0].shape[1:]))
+    data = StackedRecordings(u, np.zeros((R, N, C)), np.zeros((R, N)), np.ones(R))
     for i, r in enumerate(recordings):
-        data.u[i, : r.N], data.y[i, : r.N], data.seen[i, : r.N] = r.u, model.measured(r), 1.0
+        data.u[i, : r.N], data.y[i, : r.N], data.seen[i, : r.N] = inputs[i], model.measured(r), 1.0
         data.Ts[i] = r.Ts
     return data
 
@@ -220,7 +227,7 @@ def torque_scale(m: Mechanism, data: StackedRecordings) -> float:
     """Torque [N m] that the motor gives at the root mean square voltage."""
     n = len(m.coordinates)
     push = np.linalg.solve(inverse_mass(m), linearise(m).B[n : 2 * n])
-    level = float(np.sqrt(np.sum(data.u**2 * data.seen) / np.sum(data.seen)))
+    level = float(np.sqrt(np.sum(data.voltage**2 * data.seen) / np.sum(data.seen)))
     return max(float(np.max(np.abs(push))) * level, 1e-6)
 
 
@@ -241,7 +248,7 @@ class Windows:
     @classmethod
     def whole(cls, dataset: Dataset, number: int = 1) -> "Windows":
         """One window per recording; `number` is W, so that runs with more windows share compiled code."""
-        R, N = dataset.data.u.shape
+        R, N = dataset.data.seen.shape
         first = np.repeat(dataset.first_states[:, None], number, axis=1)
         return cls(np.zeros((R, N), np.int32), (1,) * R, first)
 
@@ -257,7 +264,7 @@ class Windows:
         """
         starts = [window_starts(r, seconds)[0] for r in dataset.recordings]
         counts = tuple(map(len, starts))
-        R, N = dataset.data.u.shape
+        R, N = dataset.data.seen.shape
         index = np.zeros((R, N), np.int32)
         first = np.repeat(dataset.first_states[:, None], max(number, *counts), axis=1)
         for r, (recording, begins) in enumerate(zip(dataset.recordings, starts, strict=True)):

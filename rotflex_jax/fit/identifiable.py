@@ -294,13 +294,17 @@ def _structural_at_random(model: Model, sensors: Sensors, recording: Recording |
     Ts = recording.Ts if recording is not None else RANDOM_PERIOD
     N = recording.N if recording is not None else RANDOM_SAMPLES
     unit = 0.3 if m.units.input == "rad" else 1.0
-    size = float(np.sqrt(np.mean(np.square(recording.u)))) if recording is not None else unit
+    if recording is not None:
+        sizes = np.atleast_1d(np.sqrt(np.mean(np.square(model.inputs(recording)), axis=0)))
+    else:
+        sizes = np.r_[unit, np.ones(len(m.signals))]
     draws = []
     for k, times in enumerate(INPUT_SIZES):
         values = m.values.copy()
         away = np.exp(rng.uniform(-FACTOR, FACTOR, len(free)))
         values[index] = _nonzero(m)[index] * away
-        u = times * size * excitation.noise(N, Ts, seed=k)
+        columns = [excitation.noise(N, Ts, seed=k + len(INPUT_SIZES) * c) for c in range(len(sizes))]
+        u = times * (sizes[0] * columns[0] if len(sizes) == 1 else sizes * np.column_stack(columns))
         draws.append((values, Runs(model, sensors, values, u, Ts, least_share=0.0).scaled()))
     C = len(sensors.here)
 
@@ -431,7 +435,7 @@ def _with_recording(
     m, free = model.mechanism, found.free
     K, C = len(free), len(sensors.here)
     start = model.states_at(recording, np.array([0]))[0][: 2 * len(m.coordinates)]
-    u, Ts = recording.u.astype(float), float(recording.Ts)
+    u, Ts = model.inputs(recording), float(recording.Ts)
     y, J = Runs(model, sensors, m.values, u, Ts, start).slopes()
     if not np.isfinite(J).all():
         raise InputError(

@@ -2,7 +2,14 @@
 
 from rotflex_jax.joints.flexible_link import flexible_link
 from rotflex_jax.joints.mjcf import load_mjcf
-from rotflex_jax.joints.public_machines import emps, rotary_arm, silverbox, single_inertia, two_dof_link
+from rotflex_jax.joints.public_machines import (
+    emps,
+    rotary_arm,
+    silverbox,
+    single_inertia,
+    two_dof_link,
+    two_stage_link,
+)
 from rotflex_jax.joints.rotary_flexible import (
     SPRINGS,
     SpringType,
@@ -28,6 +35,7 @@ __all__ = [
     "silverbox",
     "rotary_arm",
     "two_dof_link",
+    "two_stage_link",
     "position_servo",
     "servo",
     "sts3215",

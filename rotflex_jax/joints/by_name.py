@@ -132,13 +132,23 @@ def imported(place: str) -> ModuleType:
 
 
 def effect(text: str) -> Any:
-    """The effect meant by `coulomb@hub`, or by `coulomb@hub:level=0.03`."""
+    """The effect meant by `coulomb@hub`, or by `coulomb@hub:level=0.03`.
+
+    A signal stands behind its port, before the values: `measured_disturbance@arm: wind [N]:gain=0.1`.
+    """
     from rotflex_jax.effects import CATALOG
+    from rotflex_jax.effects.base import SIGNAL_MARK
 
     place, _, values = text.partition(":")
     name, separator, port = place.partition("@")
     kind = CATALOG[choose(name, CATALOG, "effect")]
     ports = list(kind.ports)
+    if kind.acts_on == "signal" and SIGNAL_MARK in text:
+        port, _, behind = text.partition("@")[2].partition(SIGNAL_MARK)
+        signal, colon, values = behind.rpartition(":")
+        if not colon or "=" not in values:
+            signal, values = behind, ""
+        port += SIGNAL_MARK + signal
     if not separator and len(ports) > 1:
         raise InputError(
             f"The effect {name} was given no port, but can act at {', '.join(ports)}; give for "

@@ -4,7 +4,8 @@ import dataclasses
 import math
 from types import MappingProxyType
 
-from rotflex_jax.effects import CurrentDrive, Inertia, Motor, Spring, Viscous
+from rotflex_jax.effects import CurrentDrive, Inertia, MeasuredDisturbance, Motor, Spring, Viscous
+from rotflex_jax.effects.base import SIGNAL_MARK, Effect
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.rotary_flexible import PORTS, flexible_joint
 from rotflex_jax.mechanism import Mechanism
@@ -206,7 +207,7 @@ TWO_DOF_LINK = MappingProxyType(
 
 
 def two_dof_link(stage: int = 1) -> Mechanism:
-    """One stage of the serial flexible link, the other left out: a flexible joint driven by a current.
+    """One stage of the serial flexible link by itself: a flexible joint driven by a current.
 
         hub_inertia theta'' + arm_inertia (theta'' + alpha'') = torque_per_current i - hub_damping theta'
         arm_inertia (theta'' + alpha'') = -stiffness alpha - joint_damping alpha'
@@ -215,7 +216,8 @@ def two_dof_link(stage: int = 1) -> Mechanism:
     motion shows the frequency of the link and hardly how much of the inertia is behind it, and a fit may
     give all of it to the hub. The others are free and start at the laboratory's constants. Of these the
     damping of the hubs is above what the recordings show, and the dry friction of the gears is missing.
-    Stage 2 stands on the end of link 1, whose motion this model does not know: expect more error there.
+    Stage 2 stands on the end of link 1, whose motion this model does not know; recordings have its
+    acceleration as a signal (`effects.MeasuredDisturbance`). `two_stage_link` is both stages in one.
 
     Args:
         stage: 1, which carries stage 2, or 2.
@@ -246,5 +248,65 @@ def two_dof_link(stage: int = 1) -> Mechanism:
         ),
         outputs={"theta": "hub", "alpha": "joint"},
         trusted=("hub.current_drive.gain", "arm.inertia.inertia"),
+        units=Units(input="A"),
+    )
+
+
+SECOND_CURRENT = "current of motor 2 [A]"
+"""Signal that drives the second stage of `two_stage_link`."""
+
+
+def two_stage_link() -> Mechanism:
+    """Both stages of the serial flexible link in one mechanism: two currents, four coordinates, four outputs.
+
+        theta1, alpha1    angle of hub 1, deflection of link 1
+        theta2, alpha2    the same of stage 2, relative to the end of link 1
+
+    With the angles `beta1 = theta1 + alpha1` and `beta2 = beta1 + theta2 + alpha2` of the links, twice the
+    kinetic energy is
+
+        J11 theta1'^2 + J12 beta1'^2 + J21 theta2'^2 + J22 beta2'^2 + m (L beta1' + l beta2')^2
+
+    with the centre of mass of link 2 at `l`, half its length, on the end of link 1 of length `L = 2 l`, for
+    small angles between the links. `m l^2` is the inertia at the port `mass2` of position `2 beta1 + beta2`.
+
+    The first current is the input, the second one a signal of the recording. The torques per current and the
+    inertia of arm 1 are trusted. Start values are the laboratory's constants of each stage by itself: of
+    link 2 three quarters are at `mass2`, as of a uniform beam, and arm 1 has so much less that its sum stays.
+
+    Source: Constants of the laboratory in lqr_full_10deg.mat; Quanser, 2-DOF serial flexible link, reference
+        manual, 2011.
+
+    >>> two_stage_link().channels
+    ('theta1', 'alpha1', 'theta2', 'alpha2')
+    """
+    first, second = TWO_DOF_LINK[1], TWO_DOF_LINK[2]
+    ports = {
+        "hub1": (1, 0, 0, 0),
+        "joint1": (0, 1, 0, 0),
+        "arm1": (1, 1, 0, 0),
+        "hub2": (0, 0, 1, 0),
+        "joint2": (0, 0, 0, 1),
+        "arm2": (1, 1, 1, 1),
+        "mass2": (3, 3, 1, 1),
+    }
+    at_mass = 0.75 * second["arm_inertia"]
+    arms = {1: first["arm_inertia"] - 4 * at_mass, 2: second["arm_inertia"] - at_mass}
+    effects: list[Effect] = [CurrentDrive(at="hub1", gain=first["torque_per_current"])]
+    for stage, constants in ((1, first), (2, second)):
+        effects += [
+            Inertia(at=f"hub{stage}", inertia=constants["hub_inertia"]),
+            Inertia(at=f"arm{stage}", inertia=arms[stage]),
+            Spring(at=f"joint{stage}", stiffness=constants["stiffness"]),
+            Viscous(at=f"hub{stage}", coefficient=constants["hub_damping"]),
+            Viscous(at=f"joint{stage}", coefficient=constants["joint_damping"]),
+        ]
+    driven = MeasuredDisturbance(at=f"hub2{SIGNAL_MARK}{SECOND_CURRENT}", gain=second["torque_per_current"])
+    return Mechanism(
+        coordinates=("theta1", "alpha1", "theta2", "alpha2"),
+        ports=ports,
+        effects=(*effects, Inertia(at="mass2", inertia=at_mass), driven),
+        outputs={"theta1": "hub1", "alpha1": "joint1", "theta2": "hub2", "alpha2": "joint2"},
+        trusted=("hub1.current_drive.gain", "arm1.inertia.inertia", f"{driven.at}.{driven.name}.gain"),
         units=Units(input="A"),
     )

@@ -17,7 +17,7 @@ from rotflex_jax.checks import whole
 from rotflex_jax.effects.base import Actuation
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
-from rotflex_jax.mechanism.mechanism import Mechanism, check_mechanism
+from rotflex_jax.mechanism.mechanism import Mechanism, check_input_alone, check_mechanism
 from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
 from rotflex_jax.mechanism.simulate import FreeStep, Solver, read_outputs
 from rotflex_jax.mechanism.step import Exponential
@@ -76,6 +76,7 @@ def output_model(model: Mechanism | Modelled, channel: str) -> OutputModel:
     else:
         check_mechanism(getattr(model, "mechanism", model))
         mechanism, solver, given = model.mechanism, model.solver, model.gates
+    check_input_alone(mechanism, "a Volterra kernel")
     if channel not in mechanism.channels:
         raise InputError(
             f"Kernels of {channel!r} were requested, but the mechanism has the outputs "

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from rotflex_jax.effects.base import Force, Scalar
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
-from rotflex_jax.mechanism.assembly import motor_voltage
+from rotflex_jax.mechanism.assembly import motor_inputs
 from rotflex_jax.mechanism.scan import state_jacobians
 from rotflex_jax.mechanism.simulate import read_outputs
 from rotflex_jax.parameters import parameter
@@ -328,7 +328,7 @@ def linearise_along(
 
     def one(S: Any, u: Any, y: Any, seen: Any, Ts: Any, decay: Any) -> LinearTimeVaryingModel:
         constants = (step.solver.prepare(step.structure, values, gates, Ts), decay)
-        v = step.solver.inputs(motor_voltage(mechanism, gates, u, Ts))
+        v = motor_inputs(step.solver, mechanism, gates, u, Ts)
         A = jnp.swapaxes(state_jacobians(step, S, v, constants), 1, 2)
         s_next = step(S.T, jnp.moveaxis(v, 0, -1), constants).T
         outputs = lambda s: read_outputs(mechanism, gates, s[: -step.torques])  # noqa: E731

@@ -99,7 +99,7 @@ class Layout:
         own = {part: sum(e.order for e in structure.effects if e.state_part == part) for part in STATE_PARTS}
         rotor = 2 * n + own["linear"]
         linear = rotor + own["rotor"]
-        used = {e.at for e in structure.effects if e.torque_at_port}
+        used = {e.port for e in structure.effects if e.torque_at_port}
         dry = {e.at for e in structure.effects if e.dry_contact}
         names = tuple(p for p in structure.port_vectors if p in dry)
         names += tuple(p for p in structure.port_vectors if p in used - dry)
@@ -398,12 +398,25 @@ def voltage_within_samples(
 
 
 def motor_inputs(
-    solver: Any, mechanism: Mechanism, gates: Float[Array, " E"], u: Float[Array, " N"], Ts: Period
+    solver: Any, mechanism: Mechanism, gates: Float[Array, " E"], u: Float[Array, "N *c"], Ts: Period
 ) -> Float[Array, "N *h"]:
-    """What the steps of a solver take at each sample: the voltage of the motor, held, smooth or switched."""
+    """What the steps of a solver take at each sample: the voltage of the motor, held, smooth or switched.
+
+    The signals of the mechanism follow where its effects take them.
+    """
+    voltage, signals = split_input(u)
     if getattr(solver, "between", "held") == "switched":
-        return voltage_within_samples(mechanism, gates, u, Ts)
-    return solver.inputs(motor_voltage(mechanism, gates, u, Ts))
+        v = voltage_within_samples(mechanism, gates, voltage, Ts)
+    else:
+        v = solver.inputs(motor_voltage(mechanism, gates, voltage, Ts))
+    if signals is None or not mechanism.takes_signals:
+        return v
+    return jnp.concatenate([v.reshape(len(v), -1), signals], axis=1)
+
+
+def split_input(u: Float[Array, "N *c"]) -> tuple[Float[Array, " N"], Float[Array, "N S"] | None]:
+    """The voltage, and the signals beside it; None where the input has none."""
+    return (u, None) if u.ndim == 1 else (u[:, 0], u[:, 1:])
 
 
 def rest_state(structure: Mechanism, dtype: DTypeLike) -> Float[np.ndarray, " n"]:

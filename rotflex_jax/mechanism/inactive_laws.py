@@ -38,7 +38,7 @@ from rotflex_jax.effects.base import (
     Scalar,
     Sensing,
 )
-from rotflex_jax.mechanism.assembly import effects_of, motor_voltage
+from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, split_input
 from rotflex_jax.mechanism.gear import gear_steps
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
@@ -130,8 +130,9 @@ class RunResponses(NamedTuple):
     Attributes:
         run: States and the Jacobians of the steps.
         ideal: Readings of ideal sensors.
-        voltage: What drives each step [V], each substep of it where it changes within the sample.
-        to_voltage: Change of the state after a step per volt.
+        voltage: What drives each step [V], each substep of it where it changes within the sample; then the
+            signals that drive effects of the model.
+        to_voltage: Change of the state after a step per unit of each of these.
         to_reading: The same per unit that a sensor reads more.
         readings: Change of the readings per unit of each state.
         torques: Evaluations of torques at the ports; None where no port is asked for.
@@ -164,7 +165,9 @@ def adds_to_step(effect: Effect, structure: Mechanism, solver: Solver) -> bool:
     if isinstance(effect, Memory):  # its state is advanced once, between both evaluations of the step
         rigid = not effects_of(structure, Gear)
         return rigid and solver.order == 2 and effect.driven_by == "voltage" and not _has_load(structure)
-    return isinstance(effect, Force) or (isinstance(effect, DryFriction) and not effect.loaded)
+    if isinstance(effect, Force):
+        return not effect.signal
+    return isinstance(effect, DryFriction) and not effect.loaded
 
 
 def _has_load(structure: Mechanism) -> bool:
@@ -487,7 +490,8 @@ def signal_sensitivities(
     N, x, ideal = len(responses.ideal), responses.run.X.T, responses.ideal.T
 
     def voltage(values: Array, gates: Array) -> Array:
-        v = motor_voltage(structure.with_values(values), gates, samples.u, samples.Ts)
+        u, _ = split_input(samples.u)
+        v = motor_voltage(structure.with_values(values), gates, u, samples.Ts)
         return solver.inputs(v).reshape(N, -1)
 
     def reading(values: Array, gates: Array) -> Array:
@@ -498,7 +502,8 @@ def signal_sensitivities(
         return jax.vmap(one, out_axes=-1)(values, gates, dvalues, dgates)
 
     dv, dy = slopes(voltage), slopes(reading)
-    response = jnp.concatenate([responses.to_voltage, responses.to_reading], axis=1)
+    to_voltage = responses.to_voltage[:, : dv.shape[1]]  # signals beside it follow
+    response = jnp.concatenate([to_voltage, responses.to_reading], axis=1)
     (later,) = _recursion(responses, [(response, jnp.concatenate([dv, dy], axis=1))])
     return jnp.moveaxis(later + dy, -1, 0)
 

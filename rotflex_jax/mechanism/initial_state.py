@@ -108,7 +108,7 @@ def initial_states(
     mechanism: Mechanism,
     solver: Solver,
     gates: Float[np.ndarray, " E"],
-    u: Float[np.ndarray, "W N"],
+    u: Float[np.ndarray, "W N *c"],
     y: Float[np.ndarray, "W N C"],
     Ts: float,
     hidden: Float[np.ndarray, "W h"] | None = None,
@@ -122,7 +122,7 @@ def initial_states(
         mechanism: Model.
         solver: Integration rule.
         gates: One factor per effect.
-        u: Voltage [V].
+        u: Voltage [V], and the signals of the mechanism beside it.
         y: Measured outputs.
         Ts: Sampling period [s].
         hidden: The states after positions and speeds; at rest if None.

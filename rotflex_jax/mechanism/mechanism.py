@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Real
 
 from rotflex_jax import checks
 from rotflex_jax.checks import number, shown, shown as describe
-from rotflex_jax.effects.base import Effect, Linear, Memory
+from rotflex_jax.effects.base import SIGNAL_MARK, Effect, Linear, Memory
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.quantity import TURNING, Quantity, Units
@@ -191,6 +191,8 @@ class Mechanism:
         outputs: Channel -> port (its position) or (port, "speed").
         trusted: Full names `port.effect.parameter` of constants that fits hold.
         units: Units of its ports; rotary by default.
+        signals: Names of the measured signals that may drive its effects beside the input; those that its
+            effects name are added.
 
     Raises:
         InputError: A port, output or trusted name that does not exist, or two equal effects at a port.
@@ -205,6 +207,7 @@ class Mechanism:
     outputs: Any = ()
     trusted: Any = frozenset()
     units: Units = TURNING
+    signals: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - frozen class
@@ -213,6 +216,8 @@ class Mechanism:
         put("effects", effects(self.effects))
         put("outputs", outputs(self.outputs))
         put("trusted", frozenset(checks.names(self.trusted, "trusted")))
+        known = (*checks.names(self.signals, "signals"), *(e.signal for e in self.effects if e.signal))
+        put("signals", tuple(dict.fromkeys(known)))
         check(self)
         put("trusted", self.trusted | set(self.followers))  # a fit moves what they follow
         for name in sorted(self.trusted):
@@ -244,6 +249,11 @@ class Mechanism:
     def channels(self) -> tuple[str, ...]:
         """Names of the outputs, in order."""
         return tuple(channel for channel, _ in self.outputs)
+
+    @property
+    def takes_signals(self) -> bool:
+        """Whether an effect is driven by a measured signal beside the input."""
+        return any(e.signal for e in self.effects)
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -285,11 +295,13 @@ class Mechanism:
         """Where an effect can act here: the ports, the voltage (`input`), or the outputs."""
         if effect.acts_on == "input":
             return ("input",)
+        if effect.acts_on == "signal":
+            return tuple(f"{port}{SIGNAL_MARK}{s}" for s in self.signals for port in self.port_vectors)
         return self.channels if effect.acts_on == "channel" else tuple(self.port_vectors)
 
     def vector(self, effect: Effect) -> tuple[float, ...]:
         """Vector of the port at which an effect acts, of a sensor of the port that it measures."""
-        port = dict(self.outputs)[effect.at][0] if effect.acts_on == "channel" else effect.at
+        port = dict(self.outputs)[effect.at][0] if effect.acts_on == "channel" else effect.port
         return self.port_vectors[port]
 
     def quantity(self, channel: str) -> Quantity:
@@ -327,6 +339,10 @@ class Mechanism:
     def has_inertia(self, port: str) -> bool:
         """Whether an inertia is entered at the port."""
         return any((e.name, e.at) == ("inertia", port) for e in self.effects)
+
+    def with_signals(self, names: Sequence[str]) -> "Mechanism":
+        """The mechanism with these signals, and those that its effects take, to drive effects."""
+        return dataclasses.replace(self, signals=tuple(names))
 
     # -- parameters --------------------------------------------------------------------------------
 
@@ -486,4 +502,14 @@ def check_mechanism(given: Any) -> None:
         raise InputError(
             f"A mechanism or a model is needed, but {shown(given)} was given; give for instance "
             "rotflex_jax.joints.paper()."
+        )
+
+
+def check_input_alone(mechanism: Mechanism, what: str) -> None:
+    """Raise `InputError` where a measured signal drives an effect beside the input, which `what` has not."""
+    driven = next((e for e in mechanism.effects if e.signal), None)
+    if driven is not None:
+        raise InputError(
+            f"The model is driven by {driven.signal!r} beside its input, but {what} has the input alone; "
+            f"leave that effect out, mechanism.without({driven.name!r}, {driven.at!r})."
         )

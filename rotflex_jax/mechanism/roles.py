@@ -8,7 +8,7 @@ needs no list of machines and a machine none of effects.
 
 from collections.abc import Callable
 
-from rotflex_jax.effects.base import CATALOG, Effect
+from rotflex_jax.effects.base import CATALOG, SIGNAL_MARK, Effect
 from rotflex_jax.mechanism.mechanism import Mechanism
 
 PORTS, SENSORS = ("hub", "arm", "joint"), ("theta", "alpha")
@@ -72,6 +72,9 @@ def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
         "port": lambda port: port_roles(mechanism, port),
         "input": lambda voltage: {voltage},
         "channel": lambda channel: {sensor_role(mechanism, channel)},
+        "signal": lambda place: {
+            f"{role}{SIGNAL_MARK}signal" for role in port_roles(mechanism, place.partition(SIGNAL_MARK)[0])
+        },
     }
     roles = {place: read[cls.acts_on](place) for place in mechanism.locations(cls)}
     wanted = set(cls.searched)

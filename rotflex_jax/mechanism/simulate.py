@@ -161,7 +161,7 @@ def prepared_run(
     solver: Solver,
     values: Real[Array, " P"],
     gates: Float[Array, " E"],
-    u: Float[Array, " N"],
+    u: Float[Array, "N *c"],
     Ts: Float[Array, ""],
 ) -> tuple[Mechanism, Any, Any]:
     """The mechanism with its parameter values, the solver's input at each sample, the solver's constants."""
@@ -176,7 +176,7 @@ def free_run(
     values: Real[Array, " P"],
     gates: Float[Array, " E"],
     x0: Float[Array, " n"],
-    u: Float[Array, " N"],
+    u: Float[Array, "N *c"],
     Ts: Float[Array, ""],
 ) -> tuple[Float[Array, "N n"], Float[Array, "N C"]]:
     """Simulated states and outputs from the first state and the voltage alone.
@@ -187,7 +187,7 @@ def free_run(
         values: Parameter values.
         gates: One factor per effect, 1 where it is on.
         x0: First state.
-        u: Voltage [V], held over each sample.
+        u: Voltage [V], held over each sample, and the signals of the mechanism beside it.
         Ts: Sampling period [s].
     """
     mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
@@ -201,7 +201,7 @@ def predictor_run(
     values: Real[Array, " P"],
     gates: Float[Array, " E"],
     x0: Float[Array, "*W n"],
-    u: Float[Array, " N"],
+    u: Float[Array, "N *c"],
     y: Float[Array, "N C"],
     seen: Float[Array, " N"],
     K: Float[Array, "n C"],
@@ -216,7 +216,7 @@ def predictor_run(
         values: Parameter values.
         gates: One factor per effect.
         x0: First state.
-        u: Voltage [V].
+        u: Voltage [V], and the signals of the mechanism beside it.
         y: Measured outputs.
         seen: One where a sample may correct the state, zero where it may not.
         K: Gain; zero for a free run.
@@ -235,7 +235,7 @@ def first_predictions(
     values: Real[Array, " P"],
     gates: Float[Array, " E"],
     x0: Float[Array, "W n"],
-    u: Float[Array, " N"],
+    u: Float[Array, "N *c"],
     y: Float[Array, "N C"],
     seen: Float[Array, " N"],
     K: Float[Array, "n C"],
@@ -303,7 +303,7 @@ def first_state(
 
 def simulate(
     mechanism: Mechanism,
-    u: Real[ArrayLike, " N"] | Sequence[float],
+    u: Real[ArrayLike, "N *c"] | Sequence[float],
     Ts: float,
     x0: Real[ArrayLike, " m"] | Sequence[float] | None = None,
     solver: Solver | None = None,
@@ -312,7 +312,8 @@ def simulate(
 
     Args:
         mechanism: Model.
-        u: Voltage [V], held over each sample.
+        u: Voltage [V] (N,), held over each sample; (N, 1 + S) with the signals that drive the mechanism
+            beside it, in the order of `mechanism.signals`.
         Ts: Sampling period [s].
         x0: First state, or only its positions and speeds.
         solver: Integration rule; `Exponential()` if None.
@@ -325,7 +326,7 @@ def simulate(
 
 def simulate_states(
     mechanism: Mechanism,
-    u: Real[ArrayLike, " N"] | Sequence[float],
+    u: Real[ArrayLike, "N *c"] | Sequence[float],
     Ts: float,
     x0: Real[ArrayLike, " m"] | Sequence[float] | None = None,
     solver: Solver | None = None,
@@ -337,7 +338,7 @@ def simulate_states(
 def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typed in the two callers
     check_mechanism(mechanism)
     check_movable(mechanism)
-    u, Ts = signal(u), positive(Ts, "Ts", example="0.002")
+    u, Ts = _input(mechanism, u), positive(Ts, "Ts", example="0.002")
     if not (solver is None or isinstance(solver, Solver)):
         raise InputError(
             f"Argument `solver` must be Exponential(...) or SmoothRK4(...), but is {shown(solver)}; "
@@ -348,3 +349,18 @@ def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typ
         gates = np.ones(len(mechanism.effects), u.dtype)
         values, period = mechanism.values.astype(u.dtype), np.asarray(Ts, u.dtype)
         return np.asarray(run(mechanism.structure, solver or Exponential(), values, gates, start, u, period))
+
+
+def _input(mechanism: Mechanism, u: Any) -> Float[np.ndarray, "N *c"]:
+    """The voltage, with the signals beside it where the mechanism takes them; checked."""
+    names = mechanism.signals
+    if not names:
+        return signal(u)
+    if np.shape(u)[1:] == (1 + len(names),):
+        return np.stack([signal(column, "u") for column in np.transpose(u)], axis=1)
+    if mechanism.takes_signals:
+        raise InputError(
+            f"The mechanism is driven by {', '.join(map(repr, names))} beside the voltage, but `u` has the "
+            f"shape {np.shape(u)}; give {1 + len(names)} columns, or simulate a recording with these signals."
+        )
+    return signal(u)

@@ -25,6 +25,7 @@ from rotflex_jax.mechanism.step import (
     port_motion,
     torques,
     transmitted_torques,
+    voltage_of,
 )
 
 
@@ -85,9 +86,9 @@ class SmoothRK4:
         return SmoothConstants(values, gates, Ts / self.substeps, eq, load_rows(mechanism, gates))
 
     def advance(
-        self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*S"], c: SmoothConstants
+        self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*cS"], c: SmoothConstants
     ) -> Float[Array, "n *S"]:
-        """State one sample later under the held voltage `v` [V]."""
+        """State one sample later under the held voltage `v` [V], which signals follow as in `Exponential`."""
         mechanism = structure.with_values(c.values)
 
         def step(_: Any, s: Array) -> Array:
@@ -101,8 +102,8 @@ class SmoothRK4:
 
     def _flow(self, mechanism: Mechanism, x: Array, v: Array, c: SmoothConstants) -> Array:
         layout, eq = Layout.of(mechanism.structure), c.equations
-        L, z = x[: layout.linear], x[layout.linear :]
-        dL = matvec(eq.A, L) + scaled_vector(eq.B, v)
+        L, z, voltage = x[: layout.linear], x[layout.linear :], voltage_of(mechanism, v)
+        dL = matvec(eq.A, L) + scaled_vector(eq.B, voltage)
         if not layout.torque_ports:
             return dL
         total = torques(mechanism, L, z, v, c.gates)
@@ -116,4 +117,4 @@ class SmoothRK4:
             smooth = jnp.tanh(speed[k] / self.width)
             total = total.at[k].add(-c.gates[i] * jnp.where(smooth > 0, up, down) * smooth)
         dL = dL + matvec(eq.ports, total)
-        return jnp.concatenate([dL, memory_rates(mechanism, L, z, v, c.gates)]) if z.shape[0] else dL
+        return jnp.concatenate([dL, memory_rates(mechanism, L, z, voltage, c.gates)]) if z.shape[0] else dL

@@ -57,6 +57,16 @@ def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "
     return position, speed
 
 
+def voltage_of(mechanism: Mechanism, v: Float[Array, "*cS"]) -> Float[Array, "*S"]:
+    """The voltage in what drives a step, which the signals follow where the mechanism takes them."""
+    return v[0] if mechanism.takes_signals else v
+
+
+def driver_of(mechanism: Mechanism, e: Force, v: Float[Array, "*cS"]) -> Float[Array, "*S"]:
+    """What a force receives last: its signal, or the voltage."""
+    return v[1 + mechanism.signals.index(e.signal)] if e.signal else voltage_of(mechanism, v)
+
+
 def motor_torque(
     mechanism: Mechanism,
     at: str,
@@ -163,7 +173,7 @@ def transmitted_torques(
     rows: LoadRows | None,
     x: Float[Array, "m *S"],
     z: Float[Array, "z *S"],
-    v: Float[Array, "*S"],
+    v: Float[Array, "*cS"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "k *S"] | None:
     """Torques [N m] through the friction ports; None where none is asked for.
@@ -173,17 +183,19 @@ def transmitted_torques(
         rows: From `load_rows`.
         x: State, of which the linear part is read.
         z: Memories.
-        v: Voltage [V].
+        v: Voltage [V], and signals.
         gates: One factor per effect.
     """
     if rows is None:
         return None
-    load = matvec(rows.state, x[: rows.state.shape[1]]) + scaled_vector(rows.voltage, v)
+    voltage = voltage_of(mechanism, v)
+    load = matvec(rows.state, x[: rows.state.shape[1]]) + scaled_vector(rows.voltage, voltage)
     if not has_smooth_torques(mechanism):
         return load
     layout = Layout.of(mechanism.structure)
     motors = [
-        motor_correction(mechanism, port, x, z, v, gates) for port in layout.torque_ports[: layout.contacts]
+        motor_correction(mechanism, port, x, z, voltage, gates)
+        for port in layout.torque_ports[: layout.contacts]
     ]
     load = load + matvec(rows.torques, torques(mechanism, x, z, v, gates))
     return load + expand_axes(rows.motors, load) * jnp.stack(motors)
@@ -308,7 +320,7 @@ def torques(
     mechanism: Mechanism,
     x: Float[Array, "m *S"],
     z: Float[Array, "z *S"],
-    v: Float[Array, "*S"],
+    v: Float[Array, "*cS"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "p *S"]:
     """Torques of forces and memories at the torque ports.
@@ -317,7 +329,7 @@ def torques(
         mechanism: With (traced) parameter values.
         x: State, of which the linear part is read.
         z: Memories.
-        v: Voltage [V].
+        v: Voltage [V]; with the signals (1 + S, *S) where effects of the mechanism take them.
         gates: One factor per effect.
     """
     layout = Layout.of(mechanism.structure)
@@ -328,11 +340,11 @@ def torques(
         [jnp.zeros(x.shape[1:], x.dtype)] * len(position),
     )
     for i, e in effects_of(mechanism, Force):
-        k = layout.torque_ports.index(e.at)
-        total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], v)
+        k = layout.torque_ports.index(e.port)
+        total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], driver_of(mechanism, e, v))
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = memory_drive(mechanism, e, x, z, v, gates)
+        drive = memory_drive(mechanism, e, x, z, voltage_of(mechanism, v), gates)
         total[k] = total[k] + gate[i] * _force(e, memory[m], position[k], speed[k], drive)
     return computed_once(jnp.stack(total))
 
@@ -464,18 +476,24 @@ class Exponential:
             structure: The mechanism without parameter values.
             x: State.
             v: Voltage held over the sample (*S) [V], over each substep (substeps, *S), or its mean and first
-                moment (2, *S); from `assembly.motor_inputs`.
+                moment (2, *S); signals follow where the mechanism takes them; from `assembly.motor_inputs`.
             c: From `prepare`.
         """
         mechanism = structure.with_values(c.values)
         cut = gear_steps(structure)
+        if structure.takes_signals:
+            rows = len(v) - len(structure.signals)
+            signals = v[rows:]
+            here = lambda k: jnp.concatenate([v[:rows][k][None], signals])  # noqa: E731
+        else:
+            here = lambda k: v if self.between == "held" else v[k]  # noqa: E731
         if c.tilt is not None:  # the voltage is switched
-            body = lambda _, state: _step(mechanism, state, v[0], c, self)  # noqa: E731
+            body = lambda _, state: _step(mechanism, state, here(0), c, self)  # noqa: E731
             end = body(0, x) if cut == 1 else jax.lax.fori_loop(0, cut, body, x)
             return end + scaled_vector(c.tilt, v[1])
         if self.substeps * cut == 1:
-            return _step(mechanism, x, v if self.between == "held" else v[0], c, self)
-        at = lambda k: v if self.between == "held" else v[k // cut]  # noqa: E731
+            return _step(mechanism, x, here(0), c, self)
+        at = lambda k: here(k // cut if self.between == "smooth" else 0)  # noqa: E731
         body = lambda k, state: _step(mechanism, state, at(k), c, self)  # noqa: E731
         return jax.lax.fori_loop(0, self.substeps * cut, body, x)
 
@@ -500,7 +518,8 @@ def _advance_smooth(
     """The step under one set of equations; `extra`, zero for memories, is added to the state at its end."""
     layout = Layout.of(mechanism.structure)
     z = x[layout.linear :]
-    start = matvec(c.E, x[: layout.linear]) + scaled_vector(c.input, v)
+    voltage = voltage_of(mechanism, v)
+    start = matvec(c.E, x[: layout.linear]) + scaled_vector(c.input, voltage)
     start = start if extra is None else start + extra
     if not layout.torque_ports:
         return start
@@ -510,7 +529,7 @@ def _advance_smooth(
     guess = start + matvec(c.hold, f0)
     brake = _predicted_friction(mechanism, x, guess, z, v, c) if layout.contacts else None
     end = guess if brake is None else guess + matvec(c.hold, brake)
-    z1 = advance_memories(mechanism, z, (x + end) / 2, v, c.gates, c.h)
+    z1 = advance_memories(mechanism, z, (x + end) / 2, voltage, c.gates, c.h)
     if solver.order == 2:
         final = guess + matvec(c.ramp, torques(mechanism, end, z1, v, c.gates) - f0)
     else:
@@ -533,9 +552,10 @@ def _with_rows_of_memories(c: Constants, number: int) -> Constants:
 def _fourth_order(mechanism, x, z, z1, v, f0, brake, end, c):  # noqa: ANN001, ANN202 - as in `_advance_smooth`
     """Correction of the state for torques that change from `f0`, ETDRK4; `end` is the state without it."""
     held = (lambda f: f) if brake is None else lambda f: f + brake
-    half = matvec(c.half_E, x[: c.half_E.shape[1]]) + scaled_vector(c.half_input, v)
+    voltage = voltage_of(mechanism, v)
+    half = matvec(c.half_E, x[: c.half_E.shape[1]]) + scaled_vector(c.half_input, voltage)
     a = half + matvec(c.half_hold, held(f0))
-    zh = advance_memories(mechanism, z, (x + a) / 2, v, c.gates, c.h / 2)
+    zh = advance_memories(mechanism, z, (x + a) / 2, voltage, c.gates, c.h / 2)
     fa = torques(mechanism, a, zh, v, c.gates)
     b = half + matvec(c.half_hold, held(fa))
     fb = torques(mechanism, b, zh, v, c.gates)

@@ -54,9 +54,9 @@ def program_length(number: int, least: int = 1024) -> int:
     return -(-number // step) * step if step > 1 else max(least, 2 ** (number - 1).bit_length())
 
 
-def _filled(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
-    """A voltage held beyond its end, up to a length that other recordings share."""
-    return np.pad(u, (0, program_length(len(u)) - len(u)), "edge")
+def _filled(u: Float[np.ndarray, "N *c"]) -> Float[np.ndarray, "M *c"]:
+    """An input held beyond its end, up to a length that other recordings share."""
+    return np.pad(u, [(0, program_length(len(u)) - len(u)), *[(0, 0)] * (u.ndim - 1)], "edge")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,6 +163,21 @@ class Model:
             )
         return np.stack([recording.channel(c) for c in self.mechanism.channels], axis=1)
 
+    def inputs(self, recording: Recording) -> Float[np.ndarray, "N *c"]:
+        """The input of a recording (N,); with the signals that the mechanism has beside it (N, 1 + S).
+
+        Raises:
+            InputError: The recording lacks one of these signals.
+        """
+        u, names = recording.u.astype(float), self.mechanism.signals
+        if missing := [name for name in names if name not in recording.signals]:
+            has = ", ".join(map(repr, recording.signals)) or "none"
+            raise InputError(
+                f"The model is driven by the signal {missing[0]!r} beside the input, but the signals of the "
+                f"recording are {has}; add it, recording.with_signals({{...}})."
+            )
+        return np.column_stack([u, *(recording.signals[n] for n in names)]) if names else u
+
     def parameters_and_gates(self) -> tuple[Float[Array, " P"], Float[Array, " E"]]:
         """Parameter values and gates, in the precision of the context."""
         return jnp.asarray(self.mechanism.values), jnp.asarray(self._switches())
@@ -171,14 +186,15 @@ class Model:
         return np.ones(len(self.mechanism.effects)) if self.gates is None else np.array(self.gates)
 
     def _behind_actuation(self, recording: Recording) -> tuple[np.ndarray, "Model"]:
-        """The voltage (N,) [V] that reaches the motor, and the model without its actuation."""
-        u, acting, here = recording.u.astype(float), effects_of(self.mechanism, Actuation), self.at(recording)
+        """The input of the model without its actuation, and that model: the voltage [V] is the motor's."""
+        v, acting, here = self.inputs(recording), effects_of(self.mechanism, Actuation), self.at(recording)
         if not acting:
-            return u, here
-        gates = self._switches()
+            return v, here
+        gates, u = self._switches(), recording.u.astype(float)
         with double_precision():
             given = map(jnp.asarray, (here.mechanism.values, gates, _filled(u), float(recording.Ts)))
-            v = np.asarray(_motor_voltage(self.mechanism.structure, *given))[: len(u)]
+            at_motor = np.asarray(_motor_voltage(self.mechanism.structure, *given))[: len(u)]
+        v = at_motor if v.ndim == 1 else np.column_stack([at_motor, v[:, 1:]])
         gates[[i for i, _ in acting]] = 0.0
         return v, dataclasses.replace(here, gates=tuple(gates.tolist()))
 
@@ -188,7 +204,7 @@ class Model:
         In a part of that recording no delay, lag or drift starts again.
         """
         v, inner = self._behind_actuation(recording)
-        return inner, dataclasses.replace(recording, u=v, accept=ACCEPTABLE)
+        return inner, dataclasses.replace(recording, u=v if v.ndim == 1 else v[:, 0], accept=ACCEPTABLE)
 
     def _starts(
         self, u: np.ndarray, y: np.ndarray, Ts: float, hidden: np.ndarray | None = None
@@ -201,7 +217,7 @@ class Model:
         States that no sensor measures come from a free run over the recording that this one continues; they
         are at rest where it continues none.
         """
-        u, y = recording.u.astype(float), self.measured(recording).astype(float)
+        u, y = self.inputs(recording), self.measured(recording).astype(float)
         m, moving, before = recording.n_init, 2 * len(self.mechanism.coordinates), recording.continues
         hidden = None
         if before is not None and len(rest_state(self.mechanism.structure, np.float64)) > moving:
@@ -217,7 +233,7 @@ class Model:
                 self.solver,
                 *self.at(recording).parameters_and_gates(),
                 jnp.asarray(start),
-                jnp.asarray(_filled(recording.u.astype(float))),
+                jnp.asarray(_filled(self.inputs(recording))),
                 jnp.asarray(float(recording.Ts)),
             )
             return np.asarray(run[0])[: recording.N], np.asarray(run[1])[: recording.N]
@@ -323,7 +339,7 @@ class Model:
         """
         y, m = self.measured(recording).astype(float), self.mechanism
         u, here, process_noise = (
-            recording.u.astype(float),
+            self.inputs(recording),
             self.at(recording),
             process_noise_of(m, process_noise),
         )

@@ -20,14 +20,16 @@ from rotflex_jax.recording.samples import (
     initial_samples,
     known_constants,
     known_resolution,
+    known_signals,
     labels,
+    name_and_unit,
     real_numbers,
     sampling_period,
 )
+from rotflex_jax.text import svg
 from rotflex_jax.text.colours import FINAL
 from rotflex_jax.text.markup import bullets, card, paragraph, picture, table
 from rotflex_jax.text.numbers import plain_number, readable
-from rotflex_jax.text.svg import Panel, signals
 
 
 def _known_remarks(given: Any) -> tuple[Finding, ...]:
@@ -48,7 +50,7 @@ def _known_remarks(given: Any) -> tuple[Finding, ...]:
 class Recording:
     """One experiment: the input, the outputs and the sampling period, uniformly sampled.
 
-    `u[k]` is held over `[k Ts, (k + 1) Ts)`; `y[k]` is measured at its start.
+    `u[k]` and `signals[name][k]` are held over `[k Ts, (k + 1) Ts)`; `y[k]` is measured at its start.
 
     Not for data sampled unevenly: resample them first, with a method you can defend.
 
@@ -73,6 +75,9 @@ class Recording:
         constants: what is known of the machine in this recording and may be otherwise in another, such as the
             gain that a servo was set to: full name of a parameter to its value. A model simulates this
             recording with it, and a fit holds it; what a model has not is no concern of it.
+        signals: what was measured of all else that acts on the machine beside the input, such as the
+            acceleration of what it stands on (a measured disturbance): name with the unit in brackets to
+            samples (N,), which are held as the input is.
 
     Raises:
         InputError: the data are not what they must be.
@@ -101,6 +106,7 @@ class Recording:
     continues: "Recording | None"
     constants: Mapping[str, float]
     remarks: tuple[Finding, ...]
+    signals: Mapping[str, Float[np.ndarray, " N"]]
 
     def __init__(
         self,
@@ -119,6 +125,7 @@ class Recording:
         continues: "Recording | None" = None,
         constants: Mapping[str, float] | None = None,
         remarks: Sequence[Finding] = (),
+        signals: Mapping[str, Any] | None = None,
     ) -> None:
         u, y = aligned(real_numbers(u, "Argument `u`"), real_numbers(y, "Argument `y`"))
         Ts = sampling_period(Ts)
@@ -154,6 +161,7 @@ class Recording:
             "continues": continues,
             "constants": known_constants(constants),
             "remarks": _known_remarks(remarks),
+            "signals": known_signals(signals, u, (input_name, *names)),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -183,6 +191,11 @@ class Recording:
         """Time from the first sample to the end of the last [s]."""
         return self.N * self.Ts
 
+    @property
+    def inputs(self) -> Float[np.ndarray, "N m"]:
+        """The input, and beside it the signals, in columns."""
+        return np.column_stack([self.u, *self.signals.values()])
+
     def channel(self, name: str) -> Float[np.ndarray, " N"]:
         """One output by name."""
         if not isinstance(name, str) or name not in self.channels:
@@ -206,6 +219,7 @@ class Recording:
             self,
             u=self.u[i:j],
             y=self.y[i:j],
+            signals={name: x[i:j] for name, x in self.signals.items()},
             start=self.start + i * self.Ts,
             n_init=min(self.n_init, max(1, (j - i) // 4)),
             accept=quality.ACCEPTABLE,
@@ -242,7 +256,7 @@ class Recording:
         return self.slice(0, round(wanted)), self.slice(round(wanted), self.N)
 
     def decimate(self, k: int) -> "Recording":
-        """Every k-th sample: the mean of the input over k samples, the output as it was measured.
+        """Every k-th sample: the mean of input and signals over k samples, the output as it was measured.
 
         The mean keeps the impulse of the held input, to first order in `k Ts`. The output is not
         filtered: a filter would have to be part of the model, and angles have next to no content
@@ -259,14 +273,32 @@ class Recording:
             )
         k = int(factor)
         groups = self.N // k
+        u, *acting = (
+            x[: groups * k].reshape(groups, k).mean(axis=1) for x in (self.u, *self.signals.values())
+        )
         return replace(
             self,
-            u=self.u[: groups * k].reshape(groups, k).mean(axis=1),
+            u=u,
             y=self.y[: groups * k : k],
+            signals=dict(zip(self.signals, acting, strict=True)),
             Ts=self.Ts * k,
             n_init=max(1, min(round(self.n_init / k), groups // 4)),
             accept=quality.ACCEPTABLE,
         )
+
+    def with_signals(self, signals: Mapping[str, Any]) -> "Recording":
+        """The recording with these signals in the place of its own.
+
+        What it continues keeps its own: give signals to the whole recording before it is cut.
+
+        Args:
+            signals: as in `Recording`.
+
+        >>> recording = Recording(u=np.sin(np.arange(100.0)), y=np.cos(np.arange(100.0)), Ts=0.01)
+        >>> recording.with_signals({"second motor [A]": np.zeros(100)})
+        Recording(100 samples, 1 s at 100 Hz, voltage [V] to theta [rad], beside second motor [A])
+        """
+        return replace(self, signals=signals)
 
     def _repr_html_(self) -> str:
         """What was measured: extent, ranges, steps of the sensors, findings, and the signals over time."""
@@ -274,6 +306,7 @@ class Recording:
         outputs = zip(self.channels, self.units, self.y.T, strict=True)
         columns = [(self.input_name, self.input_unit, self.u, None)]
         columns += [(name, unit, values, self.resolution.get(name)) for name, unit, values in outputs]
+        columns += [(*name_and_unit(name), values, None) for name, values in self.signals.items()]
         for name, unit, values, step in columns:
             factor, read = readable(1.0, unit)
             low, high = factor * float(np.min(values)), factor * float(np.max(values))
@@ -281,12 +314,13 @@ class Recording:
             std = plain_number(factor * float(np.std(values)))
             rows.append((name, read, f"{plain_number(low)} … {plain_number(high)}", std, quantum))
             lines = [(factor * np.asarray(values, float), FINAL, "")]
-            panels.append(Panel(f"{name} [{read}]", lines))
+            label = f"{name} [{read}]"  # beside an axis there is room for so much; the table says it all
+            panels.append(svg.Panel(label if len(label) <= 15 else f"{label[:14]}…", lines))
         rate = f"{self.N} samples, {self.duration:g} s at {1 / self.Ts:g} Hz"
         return card(
             f"Recording{f': {self.source}' if self.source else ''}",
             paragraph(f"{rate}; models may see the first {self.n_init} samples"),
-            picture(signals(self.t, panels, "time [s]"), "The input and the outputs over time."),
+            picture(svg.signals(self.t, panels, "time [s]"), "What was measured over time."),
             table(("signal", "unit", "range", "standard deviation", "sensor step"), rows, words=2),
             bullets(finding.message for finding in self.findings),
         )
@@ -294,9 +328,10 @@ class Recording:
     def __repr__(self) -> str:
         pairs = zip(self.channels, self.units, strict=True)
         outputs = ", ".join(f"{name} [{unit}]" for name, unit in pairs)
+        beside = f", beside {' and '.join(self.signals)}" if self.signals else ""
         return (
             f"Recording({self.N} samples, {self.duration:.6g} s at {1 / self.Ts:.6g} Hz, "
-            f"{self.input_name} [{self.input_unit}] to {outputs}"
+            f"{self.input_name} [{self.input_unit}] to {outputs}{beside}"
             f"{f', {self.source}' if self.source else ''})"
         )
 
@@ -313,8 +348,9 @@ def content(recording: Recording) -> tuple[bytes, ...]:
     r = recording
     labels = (r.Ts, r.channels, r.units, r.input_name, r.input_unit)
     labels = (*labels, r.n_init, r.start, r.accept, sorted(r.resolution.items()))
-    labels = (*labels, sorted(r.constants.items()))
-    own = (repr(labels).encode(), *(np.ascontiguousarray(a).tobytes() for a in (r.u, r.y)))
+    labels = (*labels, sorted(r.constants.items()), *sorted(r.signals))
+    arrays = (r.u, r.y, *(r.signals[name] for name in sorted(r.signals)))
+    own = (repr(labels).encode(), *(np.ascontiguousarray(a).tobytes() for a in arrays))
     # States that no sensor measures start where a run over the recording before ends.
     return own if r.continues is None else (*own, *content(r.continues))
 
@@ -411,7 +447,8 @@ def joined(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
             continue
         a = found[before]
         u, y = (np.concatenate(pair) for pair in ((a.u, r.u), (a.y, r.y)))
-        found[before] = replace(a, u=u, y=y, accept=quality.ACCEPTABLE)
+        acting = {name: np.concatenate([x, r.signals[name]]) for name, x in a.signals.items()}
+        found[before] = replace(a, u=u, y=y, signals=acting, accept=quality.ACCEPTABLE)
         del found[here]
     return tuple(found)
 
@@ -419,7 +456,9 @@ def joined(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
 def _goes_on(a: Recording, b: Recording) -> bool:
     """Whether a part of a run knows that it begins where another one ends, on the same machine."""
     before = b.continues
-    if before is None or any(getattr(a, n) != getattr(b, n) for n in _OF_ONE_MACHINE):
+    if before is None or a.signals.keys() != b.signals.keys():
+        return False
+    if any(getattr(a, n) != getattr(b, n) for n in _OF_ONE_MACHINE):
         return False
     n = min(a.N, before.N)  # `a` may be joined already, and longer than what `b` knows
     ends = math.isclose(a.start + a.N * a.Ts, b.start, abs_tol=0.5 * a.Ts)

@@ -2,6 +2,7 @@
 
 import math
 import numbers
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -266,4 +267,61 @@ def known_constants(given: Mapping[str, float] | None) -> Mapping[str, float]:
                 "constants={'hub.position_servo.gain': 400.0}."
             )
         found[name] = float(value)
+    return found
+
+
+_UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[(]\s*([^\[\]()]*[^\W\d][^\[\]()]*?|°)\s*[\])]")
+
+
+def name_and_unit(name: str) -> tuple[str, str]:
+    """The name of a column or a signal and the unit in brackets behind it.
+
+    >>> name_and_unit("Theta [deg]"), name_and_unit("log[0]"), name_and_unit("u")
+    (('Theta', 'deg'), ('log[0]', ''), ('u', ''))
+    """
+    found = _UNIT_BEHIND.fullmatch(name.strip())
+    return (found[1], found[2]) if found else (name.strip(), "")
+
+
+def known_signals(
+    given: Mapping[str, Any] | None, u: Float[np.ndarray, " N"], taken: Sequence[str]
+) -> Mapping[str, Float[np.ndarray, " N"]]:
+    """Signal name -> a value for each sample of the input, in its precision, copied and read only.
+
+    Args:
+        given: What was given.
+        u: Input.
+        taken: Names of the input and of the outputs.
+
+    Raises:
+        InputError: no mapping, a name that is none, or samples that are not those of the input.
+
+    >>> known_signals({"base": [0.1, 0.2]}, np.zeros(3), ())
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: Signal 'base' must have one value for each of the 3 samples, but has the \
+shape (2,); give each signal an array of its own that is cut to these samples.
+    """
+    if not (given is None or isinstance(given, Mapping)):
+        raise InputError(
+            f"Argument `signals` must give the samples of each signal by its name, but is {shown(given)}; "
+            "write for instance signals={'acceleration of the base [m/s^2]': samples}."
+        )
+    found = {}
+    for name, values in (given or {}).items():
+        if not isinstance(name, str) or not name.strip() or name in taken:
+            what = " of the input or of a channel" if name in taken else ""
+            raise InputError(
+                f"A signal was given the name {shown(name)}{what}, but it needs text of its own, with the "
+                "unit in brackets behind; write for instance 'acceleration of the base [m/s^2]'."
+            )
+        x = real_numbers(values, f"Signal {name!r}")
+        if x.shape != u.shape:
+            raise InputError(
+                f"Signal {name!r} must have one value for each of the {len(u)} samples, but has the shape "
+                f"{x.shape}; give each signal an array of its own that is cut to these samples."
+            )
+        found[name] = np.array(x, dtype=u.dtype)
+        finite(found[name], f"Signal {name!r}")
+        found[name].setflags(write=False)
     return found

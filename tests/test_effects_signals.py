@@ -1,0 +1,221 @@
+"""Measured disturbances: signals beside the input that drive a machine, from the step to the search."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete
+
+import rotflex_jax as rf
+from rotflex_jax.effects import Coulomb, CubicSpring, Gravity, MeasuredDisturbance, SensorGain, Viscous
+from rotflex_jax.errors import InputError
+from rotflex_jax.experiment.rig import SimulatedRig
+from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.export import to_c
+from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, simulate
+from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import specifications
+from rotflex_jax.recording import Recording
+
+BASE = "acceleration of the base [rad/s^2]"
+OTHER = "current of motor 2 [A]"
+TS = 0.004
+
+
+def coloured(samples: int, size: float, seed: int, width: int = 15) -> np.ndarray:
+    """Noise that neighbouring samples share, of a standard deviation."""
+    x = np.convolve(np.random.default_rng(seed).normal(size=samples + width), np.hanning(width), "same")
+    return size * x[:samples] / np.std(x)
+
+
+def moving_base(u: np.ndarray, a: np.ndarray, friction: float = 0.0) -> np.ndarray:
+    """A flexible joint on a base that turns with the acceleration `a`, in angles against the ground.
+
+    Written in other coordinates than the package's: `phi` of the hub and `psi` of the arm are absolute, the
+    base turns by `b`, and every torque between the parts depends on differences. Held inputs, scipy's
+    integrator.
+    """
+    Jh, Ja, k, d, dh, gain = 0.002, 0.006, 1.6, 0.004, 0.02, 0.05
+    y, x = np.zeros((len(u), 2)), np.zeros(6)  # phi, psi, b and their speeds
+    for i in range(len(u)):
+        y[i] = x[0] - x[2], x[1] - x[0]
+
+        def slope(_: float, s: np.ndarray, i: int = i) -> list[float]:
+            spring = k * (s[1] - s[0]) + d * (s[4] - s[3])
+            speed = s[3] - s[5]
+            hub = gain * u[i] - dh * speed - friction * np.tanh(speed / 1e-3)
+            return [s[3], s[4], s[5], (hub + spring) / Jh, -spring / Ja, a[i]]
+
+        x = solve_ivp(slope, (0, TS), x, rtol=1e-9, atol=1e-11, max_step=TS / 4).y[:, -1]
+    return y
+
+
+def joint(*effects: object) -> Mechanism:
+    """The joint of `moving_base`, standing still."""
+    motor = rf.effects.Motor(at="hub", torque_constant=0.05, back_emf=0.0, resistance=1.0, gear_ratio=1.0)
+    plain = rf.joints.flexible_joint(
+        hub_inertia=0.002,
+        arm_inertia=0.006,
+        stiffness=1.6,
+        joint_damping=0.004,
+        hub_damping=0.02,
+        motor=motor,
+    )
+    return dataclasses.replace(plain, effects=(*plain.effects, *effects))
+
+
+def on_moving_base(hub: float = -0.002, arm: float = -0.006) -> tuple[MeasuredDisturbance, ...]:
+    return tuple(
+        MeasuredDisturbance(at=f"{port}: {BASE}", gain=gain) for port, gain in (("hub", hub), ("arm", arm))
+    )
+
+
+def test_a_joint_on_a_moving_base_is_one_with_a_disturbance_at_each_inertia():
+    u, a = coloured(300, 3.0, 1), coloured(300, 20.0, 2)
+    y = simulate(joint(*on_moving_base()), np.column_stack([u, a]), TS)
+    np.testing.assert_allclose(y, moving_base(u, a), atol=3e-8)
+    assert np.max(np.abs(simulate(joint(), u, TS) - y)) > 0.05
+
+
+@pytest.mark.parametrize(
+    "solver", [Exponential(), Exponential(order=4), Exponential(substeps=3), SmoothRK4(substeps=4)]
+)
+def test_every_rule_holds_the_signal_as_it_holds_the_input(solver):
+    """A matrix exponential with two inputs says the same of a linear machine."""
+    m = joint(MeasuredDisturbance(at=f"joint: {OTHER}", gain=0.3))
+    M, D, K = np.array([[0.008, 0.006], [0.006, 0.006]]), np.diag([0.02, 0.004]), np.diag([0.0, 1.6])
+    inverse, zero, one = np.linalg.inv(M), np.zeros((2, 2)), np.eye(2)
+    A = np.block([[zero, one], [-inverse @ K, -inverse @ D]])
+    B = np.vstack([zero, inverse @ np.array([[0.05, 0.0], [0.0, 0.3]])])
+    E, F, *_ = cont2discrete((A, B, np.eye(4), np.zeros((4, 2))), TS, "zoh")
+    w, x, expected = np.column_stack([coloured(400, 3.0, 3), coloured(400, 0.1, 4)]), np.zeros(4), []
+    for here in w:
+        expected.append(x[:2])
+        x = E @ x + F @ here
+    np.testing.assert_allclose(simulate(m, w, TS, solver=solver), expected, atol=2e-7)
+
+
+def test_friction_holds_against_a_signal():
+    """Below the level of friction the hub rests, however the torque of the signal varies; above it moves."""
+    m = joint(MeasuredDisturbance(at=f"hub: {OTHER}", gain=1.0), Coulomb(at="hub", level=0.05))
+    w = np.zeros((500, 2))
+    w[:, 1] = 0.049 * np.sin(np.arange(500) / 20)
+    assert np.max(np.abs(simulate(m, w, TS)[:, 0])) < 1e-12
+    w[:, 1] *= 1.2
+    assert np.max(np.abs(simulate(m, w, TS)[:, 0])) > 1e-3
+
+
+def test_two_signals_at_one_port_are_two_effects():
+    both = joint(
+        MeasuredDisturbance(at=f"arm: {BASE}", gain=-0.006),
+        MeasuredDisturbance(at=f"arm: {OTHER}", gain=0.02),
+    )
+    assert both.signals == (BASE, OTHER)
+    w = np.column_stack([coloured(100, s, k) for k, s in enumerate((3.0, 20.0, 1.0))])
+    each = [simulate(joint(e), w[:, [0, c]], TS) for c, e in ((1, both.effects[-2]), (2, both.effects[-1]))]
+    alone = simulate(joint(), w[:, 0], TS)
+    np.testing.assert_allclose(simulate(both, w, TS), each[0] + each[1] - alone, atol=1e-12)
+
+
+def test_the_gain_has_the_unit_of_its_signal():
+    units = {
+        BASE: "N m/(rad/s^2)",
+        OTHER: "N m/A",
+        "share of something": "N m",
+    }
+    for name, unit in units.items():
+        e = MeasuredDisturbance(at=f"arm: {name}", gain=0.1)
+        assert specifications(e)["gain"].unit == unit
+    assert "0.1 N m per A" in MeasuredDisturbance(at=f"arm: {OTHER}", gain=0.1).sentence()
+
+
+@pytest.fixture(scope="module")
+def measured() -> Recording:
+    """A joint with dry friction on a moving base, with noise: scipy's run, 6 s at 250 Hz."""
+    N = 1500
+    u, a = coloured(N, 3.0, 11, 40), coloured(N, 25.0, 12, 40)
+    y = moving_base(u, a, friction=0.02) + np.random.default_rng(13).normal(scale=2e-4, size=(N, 2))
+    return Recording(u=u, y=y, Ts=TS, input_name="current", input_unit="A", signals={BASE: a})
+
+
+def test_a_fit_finds_the_inertias_of_the_parts(measured):
+    start = joint(*on_moving_base(0.0, 0.0), Coulomb(at="hub", level=0.005)).trust("arm.inertia.inertia")
+    fit = rf.fit(start, measured)
+    assert fit.status == "converged"
+    for name, true in ((f"hub: {BASE}", -0.002), (f"arm: {BASE}", -0.006)):
+        e = fit[f"{name}.measured_disturbance.gain"]
+        assert abs(e.value - true) < max(3 * e.std, 0.02 * abs(true)), e
+    assert np.max(np.std(fit.model.simulate(measured) - measured.y, axis=0)) < 4e-4
+
+
+def test_a_fit_needs_the_signal_in_every_recording(measured):
+    model = joint(*on_moving_base())
+    with pytest.raises(
+        InputError, match=r"driven by the signal 'acceleration of the base .* are none; add it"
+    ):
+        rf.fit(model, dataclasses.replace(measured, signals={}))
+    with pytest.raises(InputError, match=r"the shape \(1500,\); give 2 columns"):
+        simulate(model, measured.u, TS)
+
+
+CANDIDATES = [
+    (MeasuredDisturbance, f"arm: {BASE}"),
+    (MeasuredDisturbance, f"joint: {BASE}"),
+    (Viscous, "arm"),
+    (CubicSpring, "joint"),
+    (Gravity, "arm"),
+    (SensorGain, "alpha"),
+]
+
+
+def test_a_search_names_the_signal_that_acts_and_no_other_one(measured):
+    """The moving base is named where its acceleration is the signal; a signal of something else is not."""
+    model = joint(Coulomb(at="hub", level=0.01)).trust("arm.inertia.inertia")
+    train, validation = measured.split(0.6)
+    found = rf.discover(model, train, validation, candidates=CANDIDATES, rounds=1)
+    assert [(r.effect, r.port) for r in found.rounds] == [("measured_disturbance", f"arm: {BASE}")]
+    assert found.model.mechanism.signals == (BASE,)
+    whole = moving_base(measured.u, np.zeros(measured.N), friction=0.02)
+    still = dataclasses.replace(
+        measured, y=whole + np.random.default_rng(14).normal(scale=2e-4, size=whole.shape)
+    )
+    nothing = rf.discover(model, *still.split(0.6), candidates=CANDIDATES, rounds=1)
+    assert not nothing.rounds
+    assert nothing.model.mechanism.signals == ()
+
+
+def test_what_knows_the_input_alone_says_so():
+    model = joint(*on_moving_base())
+    for ask in (
+        lambda: to_c(model, TS),
+        lambda: SimulatedRig(model, Limits(voltage=5.0), TS),
+        lambda: rf.next_experiment(model, "delay@input", "lag@input", limits=Limits(voltage=5.0), Ts=TS),
+    ):
+        with pytest.raises(InputError, match=r"driven by 'acceleration of the base .* has the input alone"):
+            ask()
+
+
+def test_a_place_names_a_port_and_a_signal():
+    with pytest.raises(InputError, match="needs a port and the name of a signal"):
+        MeasuredDisturbance(at="arm")
+    with pytest.raises(InputError, match=f"'elbow: {OTHER.split('[')[0]}"):
+        joint(MeasuredDisturbance(at=f"elbow: {OTHER}"))
+
+
+def test_a_model_comes_back_from_its_file_with_its_signals(tmp_path):
+    model = Model(joint(*on_moving_base()))
+    back = Model.load(model.save(tmp_path / "model.json"))
+    assert back == model
+    assert back.mechanism.signals == (BASE,)
+
+
+def test_stages_of_the_serial_link_in_one():
+    """Link 2 alone on a link 1 that is held: the joint of stage 2; and both links respond to each other."""
+    both = rf.joints.two_stage_link()
+    assert both.signals == (OTHER,)
+    held = both.with_values({"joint1.spring.stiffness": 1e7, "hub1.inertia.inertia": 1e4})
+    w = np.column_stack([np.zeros(800), coloured(800, 0.5, 5)])
+    alone = simulate(rf.joints.two_dof_link(2), w[:, 1], 0.002)
+    np.testing.assert_allclose(simulate(held, w, 0.002)[:, 2:], alone, atol=2e-4 * np.ptp(alone))
+    assert np.ptp(simulate(both, w, 0.002)[:, 1]) > 1e-4
