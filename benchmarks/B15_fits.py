@@ -124,7 +124,8 @@ def main() -> int:
         if base is None or (a.only and name not in a.only):
             continue
         base = rf.Model.of(base)
-        if not {"hub", "axis"} & set(base.mechanism.port_vectors):
+        # The same runs with a signal, which these models do not take, are no further fits.
+        if machine.with_signals or not {"hub", "axis"} & set(base.mechanism.port_vectors):
             continue
         for way in machine.ways():
             found = {law: fits(base, way, law) for law in LAWS}

@@ -289,6 +289,7 @@ def test_least_squares_finds_the_equation_behind_clean_data() -> None:
         A=np.array([[[-0.8, 0.1], [1.6, 0.0]], [[0.0, -0.7], [0.2, 1.3]]]),
         B=np.array([[[0.1, 0.5], [0.2, 0.0]], [[0.0, -0.1], [-0.3, 0.4]]]),
         Ts=0.01,
+        signals=("wind",),
     )
     u, wind = np.random.default_rng(0).normal(size=(2, 400))
     blank = Recording(u=u, y=np.zeros((400, 2)), Ts=0.01, accept=("constant",), signals={"wind": wind})
@@ -300,7 +301,7 @@ def test_least_squares_finds_the_equation_behind_clean_data() -> None:
     table = rf.compare(record, [ARX(orders=(1, 2))])
     assert table["arx"].note == "order 2"
     assert table["arx"].rmse["theta"] < 1e-9
-    with pytest.raises(rf.InputError, match="1 signals beside the input, but the recording has 0"):
+    with pytest.raises(rf.InputError, match="takes the signal 'wind' beside the input"):
         found.simulate(record.with_signals({}))
 
 

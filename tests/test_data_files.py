@@ -167,7 +167,7 @@ def test_signals_are_columns_too(tmp_path: Path) -> None:
         ("theta", "'theta' was given as a signal and as input or output"),
         ("voltage", "'voltage' was given as a signal and as input or output"),
         ("gap", "column 'gap' is nan at row 3"),
-        ({"": "push"}, "given the name '', but it needs text"),
+        ({"": "push"}, "given the name '', but it needs one line of text"),
     ],
 )
 def test_columns_that_are_no_signals_are_refused(signals: Any, phrase: str) -> None:

@@ -1,5 +1,6 @@
 """The serial flexible link, the position servo and the six hobby servos: their files become Recordings."""
 
+import dataclasses
 import gzip
 import json
 from collections.abc import Callable
@@ -159,8 +160,11 @@ def test_both_stages_are_one_recording_while_both_are_logged(tmp_path: Path) -> 
     np.testing.assert_array_equal(both.signals["current of motor 2 [A]"], written["Im2"][1:-1][100:])
     np.testing.assert_array_equal(both.y[:, :2], first.y)
     np.testing.assert_array_equal(both.y[:, 2:], second.y[100:])
-    with pytest.raises(InputError, match="must be of one run, but end at"):
-        stages_together(first, second.slice(0, 200))
+    assert both.signals.keys() == set(rf.joints.two_stage_link().signals)
+    elsewhere = dataclasses.replace(second, source="other.mat, stage 2")
+    for wrong in ((first, second.slice(0, 200)), (second, first), (first, elsewhere)):
+        with pytest.raises(InputError, match="Stages 1 and 2 of one run are needed"):
+            stages_together(*wrong)
 
 
 def test_the_other_link_explains_what_a_link_does(measured: Measured) -> None:

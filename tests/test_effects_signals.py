@@ -15,7 +15,6 @@ from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.export import to_c
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, simulate
 from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import specifications
 from rotflex_jax.recording import Recording
 
 BASE = "acceleration of the base [rad/s^2]"
@@ -118,25 +117,36 @@ def test_two_signals_at_one_port_are_two_effects():
     np.testing.assert_allclose(simulate(both, w, TS), each[0] + each[1] - alone, atol=1e-12)
 
 
-def test_the_gain_has_the_unit_of_its_signal():
-    units = {
-        BASE: "N m/(rad/s^2)",
-        OTHER: "N m/A",
-        "share of something": "N m",
-    }
-    for name, unit in units.items():
-        e = MeasuredDisturbance(at=f"arm: {name}", gain=0.1)
-        assert specifications(e)["gain"].unit == unit
-    assert "0.1 N m per A" in MeasuredDisturbance(at=f"arm: {OTHER}", gain=0.1).sentence()
+@pytest.mark.parametrize(
+    ("signal", "name", "per"),
+    [
+        (BASE, "acceleration of the base", "rad/s^2"),
+        (OTHER, "current of motor 2", "A"),
+        ("torque of motor 2 (N m)", "torque of motor 2", "N m"),
+        ("noise [V/Hz^0.5]", "noise", "V/Hz^0.5"),
+        ("log[0]", "log[0]", ""),
+    ],
+)
+def test_the_gain_has_the_unit_of_its_signal_on_any_machine(signal, name, per):
+    divided = "" if not per else f"/{per}" if per == "A" else f"/({per})"
+    for machine, port, unit in ((joint(), "arm", "N m"), (rf.joints.emps(), "axis", "N")):
+        e = MeasuredDisturbance(at=f"{port}: {signal}", gain=0.1)
+        assert (machine + e).parameter_specifications[-1].unit == unit + divided
+        size = f"0.1 {unit} per {per}" if per else f"0.1 {unit}"
+        assert machine.sentence(e) == f"the {name} acts at the {port} ({size})"
+
+
+def spun_base(N: int = 100, seed: int = 15) -> Recording:
+    """A joint with dry friction on a moving base, with noise: scipy's run at 250 Hz."""
+    u, a = coloured(N, 3.0, seed, 40), coloured(N, 25.0, seed + 1, 40)
+    y = moving_base(u, a, friction=0.02) + np.random.default_rng(seed + 2).normal(scale=2e-4, size=(N, 2))
+    return Recording(u=u, y=y, Ts=TS, input_name="current", input_unit="A", signals={BASE: a})
 
 
 @pytest.fixture(scope="module")
 def measured() -> Recording:
-    """A joint with dry friction on a moving base, with noise: scipy's run, 6 s at 250 Hz."""
-    N = 1500
-    u, a = coloured(N, 3.0, 11, 40), coloured(N, 25.0, 12, 40)
-    y = moving_base(u, a, friction=0.02) + np.random.default_rng(13).normal(scale=2e-4, size=(N, 2))
-    return Recording(u=u, y=y, Ts=TS, input_name="current", input_unit="A", signals={BASE: a})
+    """6 s of it."""
+    return spun_base(1500, 11)
 
 
 def test_a_fit_finds_the_inertias_of_the_parts(measured):
@@ -185,6 +195,19 @@ def test_a_search_names_the_signal_that_acts_and_no_other_one(measured):
     assert nothing.model.mechanism.signals == ()
 
 
+def test_recordings_with_a_say_decide_which_signals_are_tried(measured):
+    model = joint(Coulomb(at="hub", level=0.02))
+    train, validation = measured.split(0.6)
+    with pytest.raises(InputError, match=r"have the signal 'acceleration of the base .* to test lacks it"):
+        rf.discover(model, train, validation, test=spun_base().with_signals({}), candidates=CANDIDATES)
+    found = rf.discover(
+        model, train, dataclasses.replace(validation, signals={}), candidates=CANDIDATES[2:3], rounds=0
+    )
+    assert any("Not all recordings have the signal 'acceleration of the base" in note for note in found.notes)
+    with pytest.raises(InputError, match="the recordings have no signal in common"):
+        rf.discover(model, train, dataclasses.replace(validation, signals={}), candidates=CANDIDATES)
+
+
 def test_what_knows_the_input_alone_says_so():
     model = joint(*on_moving_base())
     for ask in (
@@ -203,11 +226,29 @@ def test_a_place_names_a_port_and_a_signal():
         joint(MeasuredDisturbance(at=f"elbow: {OTHER}"))
 
 
-def test_a_model_comes_back_from_its_file_with_its_signals(tmp_path):
-    model = Model(joint(*on_moving_base()))
+def test_a_model_comes_back_from_its_file_with_the_order_of_its_signals(tmp_path):
+    plain = dataclasses.replace(joint(), signals=(OTHER, BASE))
+    model = Model(plain + MeasuredDisturbance(at=f"arm: {BASE}") + MeasuredDisturbance(at=f"hub: {OTHER}"))
     back = Model.load(model.save(tmp_path / "model.json"))
     assert back == model
-    assert back.mechanism.signals == (BASE,)
+    assert back.mechanism.signals == (OTHER, BASE)
+
+
+def test_a_signal_goes_with_the_last_effect_that_takes_it():
+    both = joint(*on_moving_base())
+    one = both.without("measured_disturbance", f"arm: {BASE}")
+    assert one.signals == (BASE,)
+    assert one.without("measured_disturbance", f"hub: {BASE}") == joint()
+
+
+def test_a_fit_does_not_take_a_signal_for_a_wrong_sign():
+    """What the base does outweighs the input and runs against it."""
+    u = coloured(1500, 0.2, 11, 300)
+    w = np.column_stack([u, 50 * u])
+    model = joint(*on_moving_base())
+    y = simulate(model, w, TS) + np.random.default_rng(0).normal(scale=1e-5, size=(1500, 2))
+    recording = Recording(u=u, y=y, Ts=TS, input_name="current", input_unit="A", signals={BASE: w[:, 1]})
+    assert rf.fit(model, recording).status == "converged"
 
 
 def test_stages_of_the_serial_link_in_one():

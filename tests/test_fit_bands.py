@@ -16,6 +16,7 @@ from rotflex_jax.discover.probabilities import Probabilities, SetProbability
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import Inertia, Motor
 from rotflex_jax.fit import Fit
+from rotflex_jax.fit.bands import _fast_bristles
 from rotflex_jax.fit.result import FitOptions
 
 N, TS, NOISE = 300, 0.01, 0.02
@@ -222,6 +223,16 @@ def test_a_run_whose_slopes_grow_without_limit_has_no_bands():
     assert np.ptp(rf.prediction_bands(dataclasses.replace(fit, model=held), calm).upper) < 1.0
     with pytest.raises(rf.InputError, match="negative damping, and to first order nothing is known"):
         rf.prediction_bands(dataclasses.replace(fit, model=loose), calm)
+
+
+def test_bristles_that_swing_within_a_sample_are_named_where_slopes_grow():
+    """Of 1000 N m/rad against 0.01 kg m^2: 316 rad/s, 3.2 rad a sample, and 0.1 rad in samples of 0.3 ms."""
+    stiff = axis() + rf.effects.Viscous("hub") + rf.effects.Dahl("hub", level=0.1, presliding=1e-4)
+    fit = dataclasses.replace(with_std(fitted(), 0.1), model=rf.Model(stiff))
+    with pytest.raises(rf.InputError, match="the Dahl friction at the hub swings within a sample"):
+        rf.prediction_bands(fit, recording(8))
+    assert _fast_bristles(stiff, TS) and not _fast_bristles(stiff, TS / 30)
+    assert not _fast_bristles(axis() + rf.effects.Coulomb("hub", level=0.1), TS)
 
 
 def test_bands_are_of_one_recording():

@@ -189,8 +189,8 @@ def test_signals_are_exchanged_copied_and_cannot_be_changed() -> None:
     [
         (3, "must give the samples of each signal by its name, but is 3"),
         ([np.zeros(60)], "by its name, but is a list"),
-        ({3: np.zeros(60)}, "given the name 3, but it needs text"),
-        ({" ": np.zeros(60)}, "given the name ' ', but it needs text"),
+        ({3: np.zeros(60)}, "given the name 3, but it needs one line of text"),
+        ({" ": np.zeros(60)}, "given the name ' ', but it needs one line of text"),
         ({"theta": np.zeros(60)}, "the name 'theta' of the input or of a channel"),
         ({"voltage": np.zeros(60)}, "the name 'voltage' of the input or of a channel"),
         ({BASE: np.zeros(59)}, r"one value for each of the 60 samples, but has the shape \(59,\)"),

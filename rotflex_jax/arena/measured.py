@@ -49,6 +49,7 @@ class Machine:
         unit: that errors are told in.
         factor: errors in that unit per unit of the channel.
         solver: integration rule, where it is not the usual one.
+        with_signals: whether its recordings have signals beside the input.
     """
 
     dataset: str
@@ -58,6 +59,7 @@ class Machine:
     unit: str = "deg"
     factor: float = math.degrees(1.0)
     solver: rf.Exponential | None = None
+    with_signals: bool = False
 
     def model(self) -> rf.Model | None:
         """The textbook model; None where there is none yet."""
@@ -196,9 +198,13 @@ MACHINES: dict[str, Machine] = {
     "flexible_arm": Machine("rotary_arm", "rotary_arm", lambda r: [halves(r[0])], {"flexible": True}),
     "two_dof_link_1": Machine("two_dof_link", "two_dof_link", _stage(1, False), {"stage": 1}),
     "two_dof_link_2": Machine("two_dof_link", "two_dof_link", _stage(2, False), {"stage": 2}),
-    "two_dof_link_1_beside_2": Machine("two_dof_link", "two_dof_link", _stage(1, True), {"stage": 1}),
-    "two_dof_link_2_beside_1": Machine("two_dof_link", "two_dof_link", _stage(2, True), {"stage": 2}),
-    "two_stage_link": Machine("two_dof_link", "two_stage_link", _both_stages),
+    "two_dof_link_1_beside_2": Machine(
+        "two_dof_link", "two_dof_link", _stage(1, True), {"stage": 1}, with_signals=True
+    ),
+    "two_dof_link_2_beside_1": Machine(
+        "two_dof_link", "two_dof_link", _stage(2, True), {"stage": 2}, with_signals=True
+    ),
+    "two_stage_link": Machine("two_dof_link", "two_stage_link", _both_stages, with_signals=True),
     # Position servos: no model of their firmware yet.
     "bam_xl330": Machine("bam_xl330", "bam_xl330", _by_gain),
     "so101": Machine("so101", "so101", _elbow),

@@ -268,13 +268,14 @@ def unit_of(recording: Any, channel: str) -> str:
 
 
 def save_simulation(file: Path, recording: Any, simulated: Mapping[str, Real[np.ndarray, " N"]]) -> None:
-    """Write time, input, measured and simulated outputs as CSV, in the units of the recording.
+    """Write time, input and signals, measured and simulated outputs as CSV, in the units of the recording.
 
     Raises:
         InputError: The file cannot be written; an old one stays.
     """
-    names = ["t", recording.input_name, *recording.channels, *(f"{c}_simulated" for c in simulated)]
-    columns = np.column_stack([recording.t, recording.u, recording.y, *simulated.values()])
+    inputs = [recording.input_name, *recording.signals]
+    names = ["t", *inputs, *recording.channels, *(f"{c}_simulated" for c in simulated)]
+    columns = np.column_stack([recording.t, recording.inputs, recording.y, *simulated.values()])
     csv.writer(head := StringIO(), lineterminator="").writerow(spreadsheet_cell(one_line(n)) for n in names)
     header = head.getvalue()
     np.savetxt(text := StringIO(), columns, delimiter=",", header=header, comments="", fmt="%.9g")

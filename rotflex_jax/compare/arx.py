@@ -26,13 +26,15 @@ class DifferenceEquation:
 
     Attributes:
         A: Coefficients of the outputs, oldest sample first.
-        B: Coefficients of the m inputs, oldest sample first: the input, then the signals of the recording.
+        B: Coefficients of the m inputs, oldest sample first: the input, then the signals.
         Ts: Sampling period it holds for [s].
+        signals: Names of the signals that it takes beside the input.
     """
 
     A: Float[np.ndarray, "C n C"]
     B: Float[np.ndarray, "C n m"]
     Ts: float
+    signals: tuple[str, ...] = ()
 
     @property
     def order(self) -> int:
@@ -52,15 +54,14 @@ class DifferenceEquation:
         """The inputs of a recording.
 
         Raises:
-            InputError: It has not as many signals as the recordings that the equation was fitted to.
+            InputError: It lacks a signal.
         """
-        inputs = recording.inputs.astype(float)
-        if inputs.shape[1] != self.B.shape[2]:
+        if missing := [name for name in self.signals if name not in recording.signals]:
             raise InputError(
-                f"The equation has {self.B.shape[2] - 1} signals beside the input, but the recording has "
-                f"{inputs.shape[1] - 1}; give a recording with the same signals."
+                f"The equation takes the signal {missing[0]!r} beside the input, but the recording lacks it; "
+                "give a recording that has it."
             )
-        return inputs
+        return _columns(recording, self.signals)
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """Free run: the first `n_init` samples as measured, from there on its own outputs.
@@ -93,7 +94,9 @@ class DifferenceEquation:
 
 @dataclasses.dataclass(frozen=True)
 class ARX:
-    """A linear difference equation, fitted by least squares to the next sample, the signals among its inputs.
+    """A linear difference equation, fitted by least squares to the next sample.
+
+    Signals that all recordings have are further inputs.
 
     Its order is the one with the best free run over the last part of the training recordings. Not
     for data with coarse sensors or noise at a high sampling rate: least squares takes the noise of
@@ -139,16 +142,22 @@ def fit_difference_equation(recordings: Sequence[Recording], order: int) -> Diff
         order: Past samples that the equation uses.
     """
     C = recordings[0].y.shape[1]
+    signals = tuple(name for name in recordings[0].signals if all(name in r.signals for r in recordings))
     rows, targets = [], []
     for r in recordings:
         y = r.y.astype(float)
-        rows.append(np.hstack([_lags(y, order), _lags(r.inputs.astype(float), order)]))
+        rows.append(np.hstack([_lags(y, order), _lags(_columns(r, signals), order)]))
         targets.append(y[order:])
     X, Y = np.vstack(rows), np.vstack(targets)
     size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-300)
     W = (np.linalg.lstsq(X / size, Y, rcond=None)[0] / size[:, None]).T
     A, B = W[:, : order * C].reshape(C, order, C), W[:, order * C :].reshape(C, order, -1)
-    return DifferenceEquation(A, B, recordings[0].Ts)
+    return DifferenceEquation(A, B, recordings[0].Ts, signals)
+
+
+def _columns(recording: Recording, signals: Sequence[str]) -> Float[np.ndarray, "N m"]:
+    """The input and some signals of a recording."""
+    return np.column_stack([recording.u, *(recording.signals[name] for name in signals)]).astype(float)
 
 
 def _lags(x: Float[np.ndarray, "N c"], n: int) -> Float[np.ndarray, "M K"]:

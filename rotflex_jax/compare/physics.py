@@ -41,7 +41,7 @@ class LinearPart:
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Leave out every effect that is not linear, then fit as the grey box."""
         mechanism = model.mechanism
-        nonlinear = [e for e in mechanism.effects if not e.is_linear]
+        nonlinear = [e for e in mechanism.effects if not e.is_linear and not e.signal]
         for e in nonlinear:
             mechanism = mechanism.without(e.name, e.at)
         left_out = ", ".join(f"{e.name} at {e.at}" for e in nonlinear)

@@ -294,13 +294,15 @@ def stages_together(first: Recording, second: Recording) -> Recording:
         A recording with the channels theta1, alpha1, theta2, alpha2 for `joints.two_stage_link`.
 
     Raises:
-        InputError: They are not of one run.
+        InputError: They are not stages 1 and 2 of one run.
     """
     ends = [r.start + r.N * r.Ts for r in (first, second)]
-    if first.Ts != second.Ts or abs(ends[0] - ends[1]) > first.Ts / 2:
+    files, stages = zip(*(r.source.split(", ")[:2] for r in (first, second)), strict=True)
+    same = first.Ts == second.Ts and abs(ends[0] - ends[1]) <= first.Ts / 2 and files[0] == files[1]
+    if not same or stages != ("stage 1", "stage 2"):
         raise InputError(
-            f"The stages must be of one run, but end at {ends[0]:g} and {ends[1]:g} s; give both recordings "
-            "that load_two_dof_link returned."
+            f"Stages 1 and 2 of one run are needed, but {first.source!r} to {ends[0]:g} s and "
+            f"{second.source!r} to {ends[1]:g} s were given; give both of one file, stage 1 first."
         )
     N = min(first.N, second.N)
     first, second = (r.slice(r.N - N, r.N) for r in (first, second))

@@ -97,6 +97,9 @@ def with_proposal(found: Found) -> Found:
     """The result with the standard input that best distinguishes the first two that look alike, if any."""
     if found.verdict != Verdict.AMBIGUOUS:
         return found
+    if found.final.model.mechanism.takes_signals:
+        note = "No next experiment is proposed: inputs are designed for machines without further signals."
+        return dataclasses.replace(found, notes=(*found.notes, note))
     try:
         return dataclasses.replace(found, proposal=proposed(found, seconds=PROPOSAL_SECONDS, improve=False))
     except InputError as error:  # no reason to lose what was found

@@ -87,11 +87,13 @@ def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool
         return False
     if not is_unexplained(state.horizons, state.current):
         return False
+    motors = {port for port in s.baseline.port_vectors if s.baseline.has_motor(port)}
+    driven = motors | {e.port for e in s.baseline.effects if e.signal}
     chosen = []
     for beside in [state.origin] if state.origin is state.current else [state.origin, state.current]:
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
-        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and s.baseline.has_motor(p.port)]
+        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven]
         first, second = ({x.location: x for x in test.listed} for test in tests)
         laws = laws[:FRICTION_LAWS]
         starts, runs_starts = ([by[p].start for p in laws] for by in (first, second))

@@ -90,8 +90,8 @@ def discover(
             training recording validates what was fitted to the others.
         test: Recordings that have no say in anything; the errors on them are reported beside.
         candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
-            answer to those of the flexible joint (`mechanism.roles`). Each of the `signals` that all recordings
-            have is tried as a torque at each of these ports.
+            answer to those of the flexible joint (`mechanism.roles`). Each of the `signals` that all
+            recordings have is tried as a torque at each of these ports.
         rounds: Most effects to add; two that are added together count as two.
         window_seconds: Length of short free runs [s].
         calibrate_seconds: The errors reported as calibrated allow each recording that no fit saw the offsets
@@ -115,7 +115,7 @@ def discover(
     # 1. Prepare: one super-model with every candidate built in, the recordings at both horizons.
     trained, held_back = listed(train, "train", SHORTEST_TO_FIT), _several(validation, "validation")
     tested = _several(test, "test")
-    model = _with_signals(model, (*trained, *held_back, *tested))
+    model, left_out = _with_signals(model, (*trained, *held_back), tested)
     if candidates is not None:
         candidates = checked_candidates(model.mechanism, candidates)
     horizons = _prepare(model, trained, held_back, candidates, window_seconds)
@@ -130,6 +130,7 @@ def discover(
             state = fit_as_it_is(model, horizons, say, digest)
         else:
             state = as_it_was(model, horizons, say, digest, resume)
+        state.reading_notes += left_out
         while len(state.scores) < rounds:
             # 3. Score all candidates.
             promising = score_candidates(state)
@@ -148,12 +149,27 @@ def discover(
         return with_proposal(conclude(state, evaluated, started))
 
 
-def _with_signals(model: Model, recordings: Sequence[Recording]) -> Model:
-    """The model that measured signals may drive, those that all recordings have beside their input."""
-    first, *others = recordings
-    common = [name for name in first.signals if all(name in r.signals for r in others)]
+def _with_signals(
+    model: Model, deciding: Sequence[Recording], tested: Sequence[Recording]
+) -> tuple[Model, tuple[str, ...]]:
+    """The model that measured signals may drive, those of all recordings with a say; a note on the others.
+
+    Raises:
+        InputError: A test recording lacks one of them.
+    """
+    every = dict.fromkeys(name for r in deciding for name in r.signals)
+    common = [name for name in every if all(name in r.signals for r in deciding)]
+    for name, r in ((name, r) for name in common for r in tested):
+        if name not in r.signals:
+            raise InputError(
+                f"The recordings to fit and to validate have the signal {name!r}, but a recording to test "
+                "lacks it; add it there, or leave it out of all."
+            )
+    apart = [repr(name) for name in every if name not in common]
+    note = f"Not all recordings have the signal {', '.join(apart)}, so it was not tried as a disturbance."
     known = dict.fromkeys((*model.mechanism.signals, *common))
-    return dataclasses.replace(model, mechanism=model.mechanism.with_signals(tuple(known)))
+    model = dataclasses.replace(model, mechanism=model.mechanism.with_signals(tuple(known)))
+    return model, (note,) if apart else ()
 
 
 def _kind_of_programs(horizons: Horizons) -> tuple[Any, ...]:

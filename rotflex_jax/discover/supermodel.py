@@ -318,6 +318,11 @@ def checked_candidates(mechanism: Mechanism, candidates: Any) -> list[tuple[type
                 f"{shown(pair)}; write for instance [(rotflex_jax.effects.Coulomb, 'hub')]."
             )
         places = mechanism.locations(given[0])
+        if not places:
+            raise InputError(
+                f"{given[0].__name__} is to be tried at {given[1]!r}, but the recordings have no signal in "
+                "common; give all of them the signal."
+            )
         if given[1] not in places:
             raise InputError(
                 f"{given[0].__name__} is to be tried at {given[1]!r}, but this mechanism has "

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Real
 from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import Specification, specifications
+from rotflex_jax.recording.samples import name_and_unit
 
 Scalar = Real[Array, "..."] | Real[np.ndarray, "..."] | float | int
 """A number of one state, or an array of them for states side by side."""
@@ -217,6 +218,16 @@ class Effect(abc.ABC):
     def acts_at_port(self) -> bool:
         """Whether it acts on the motion of a port, driven by a signal or not."""
         return self.acts_on in ("port", "signal")
+
+    @property
+    def signal_name(self) -> str:
+        """The signal without its unit; empty for most."""
+        return name_and_unit(self.signal)[0]
+
+    @property
+    def signal_unit(self) -> str:
+        """Unit of the signal, per which its parameters are; empty for most."""
+        return name_and_unit(self.signal)[1]
 
     @property
     def signal(self) -> str:

@@ -2,7 +2,8 @@
 
 import re
 
-from rotflex_jax.effects.base import CATALOG
+from rotflex_jax.effects.base import CATALOG, SIGNAL_MARK
+from rotflex_jax.recording.samples import name_and_unit
 from rotflex_jax.text.numbers import together
 
 
@@ -11,8 +12,8 @@ def effect_label(effect: str, port: str) -> str:
 
     >>> effect_label("cubic_spring", "joint"), effect_label("sensor_bias", "alpha")
     ('cubic spring at joint', 'sensor bias of alpha')
-    >>> effect_label("delay", "input")
-    'input delay'
+    >>> effect_label("delay", "input"), effect_label("measured_disturbance", "arm: wind [N]")
+    ('input delay', 'wind at arm')
     """
     return _placed(effect, port, "")
 
@@ -48,6 +49,9 @@ def _placed(effect: str, port: str, article: str, noun: str = "") -> str:
         return noun
     if known is not None and known.acts_on == "channel":
         return f"{noun} of {port}"
+    if known is not None and known.acts_on == "signal" and SIGNAL_MARK in port:
+        port, _, signal = port.partition(SIGNAL_MARK)
+        noun = name_and_unit(signal)[0]
     return f"{noun} at {article}{port}"
 
 

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from rotflex_jax.effects.base import SIGNAL_MARK, Domain, Force, Probe, Scalar, Scale, register
 from rotflex_jax.errors import InputError
-from rotflex_jax.parameters import Specification, parameter
+from rotflex_jax.parameters import parameter
 
 
 @register
@@ -19,12 +19,13 @@ class MeasuredDisturbance(Force):
     at each port is minus the inertia that the base carries along. The current of a second motor is another.
     The signal is held over each sample, as the input is.
 
-    Not for a signal that the machine itself moves (its own output, say): it would explain itself.
+    Not for a function of the machine's own outputs, which would explain themselves. The measured motion of a
+    neighbouring body is fine, even where this machine moves that one too.
 
     Args:
         at: Port and name of the signal, `"arm: acceleration of link 1 [rad/s^2]"`; recordings have it among
             their `signals`.
-        gain: Torque per unit of the signal [N m].
+        gain: Torque per unit of the signal [N m, per the unit in its name].
 
     Raises:
         InputError: `at` does not name both.
@@ -54,21 +55,6 @@ class MeasuredDisturbance(Force):
                 f'signal; write at="{self.at or "arm"}{SIGNAL_MARK}acceleration of the base [m/s^2]".'
             )
 
-    @property
-    def signal_unit(self) -> str:
-        """Unit in the brackets of the signal's name; empty where it has none."""
-        _, bracket, unit = self.signal.rpartition("[")
-        return unit[:-1] if bracket and unit.endswith("]") else ""
-
-    def own_specifications(self) -> dict[str, Specification]:
-        """The gain in N m per unit of this signal."""
-        unit = self.signal_unit
-        divided = f"({unit})" if any(c in unit for c in "/* ") else unit
-        return {
-            name: dataclasses.replace(s, unit=f"{s.unit}/{divided}" if unit else s.unit)
-            for name, s in self.declared().items()
-        }
-
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
         """Torque [N m] on the port for a value of the signal, the last argument."""
         return self.gain * voltage
@@ -81,5 +67,4 @@ class MeasuredDisturbance(Force):
     def sentence(self) -> str:
         """In words."""
         per = f" per {self.signal_unit}" if self.signal_unit else ""
-        name = self.signal.removesuffix(f"[{self.signal_unit}]").strip()
-        return f"the {name} acts at the {self.port} ({self.gain:.3g} N m{per})"
+        return f"the {self.signal_name} acts at the {self.port} ({self.gain:.3g} N m{per})"

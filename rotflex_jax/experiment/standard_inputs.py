@@ -74,6 +74,8 @@ class Limits:
             k = np.arange(N)
             return inside, k, k
         step = self.slew * Ts * (1 - 1e-12)
+        # A start from which 0 V is further away counts as one step, so that the input scaled down follows it.
+        start = min(max(start, -step), step)
         begins, ends = step * np.arange(1, N + 1), step * np.arange(N, 0, -1)
         inside = np.clip(inside, np.maximum(start - begins, -ends), np.minimum(start + begins, ends))
         low, low_source = _lower_envelope(inside, step)

@@ -17,6 +17,7 @@ from rotflex_jax.experiment.sequential import (
     sequential_experiment,
 )
 from rotflex_jax.fit.greybox import fit
+from rotflex_jax.mechanism.mechanism import check_input_alone
 
 
 def experiment_until(
@@ -128,6 +129,7 @@ def models_of(given: Any, say: Progress) -> tuple[Any, Mapping[str, float] | Non
     known, train = getattr(given, "probabilities", None), getattr(given, "train", None)
     if known is None or not train:
         return given, None
+    check_input_alone(given.final.model.mechanism, "a designed experiment")
     models, found = {}, {}
     # The model to use may have another law in the place of one that was found (`FinalFit.laws`).
     fitted = (*given.final.model.mechanism.effects, *given.model.mechanism.effects)
@@ -138,7 +140,7 @@ def models_of(given: Any, say: Progress) -> tuple[Any, Mapping[str, float] | Non
         m, label = given.baseline.model, " + ".join(sorted(s.effects)) or "nothing more"
         have = {(e.name, e.at) for e in m.mechanism.effects}
         for name in sorted(s.effects):
-            at = tuple(name.split("@"))
+            at = tuple(name.split("@", 1))
             # The phase of a disturbance in the next seconds is not known.
             if at not in have and not CATALOG[at[0]].line:
                 m = m + final.get(at, CATALOG[at[0]](at=at[1]))

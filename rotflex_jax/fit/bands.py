@@ -18,12 +18,13 @@ import scipy
 from jaxtyping import Float
 
 from rotflex_jax import checks
+from rotflex_jax.effects.base import Memory
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
 from rotflex_jax.fit.problem import RunLayout, runs_with_slopes
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism, linearise
-from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.mechanism.assembly import Layout, effects_of
 from rotflex_jax.mechanism.linear import inverse_mass, output_units, process_covariance
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
@@ -53,6 +54,9 @@ AT_REST = 0.02
 FIRST_STATE_STEPS, HALVED_STEPS, ENOUGH_GAIN = 12, 4, 0.1
 # Standard deviation, in ranges of the measured motion, from which on propagation to first order says nothing.
 MOST_RANGES = 100
+# Phase per sample from which on a step no longer resolves the swing of bristles; speed [rad/s] and state at
+# which their stiffness at rest is taken.
+MOST_BRISTLE_PHASE, SLOW_SPEED, SMALL_STATE = 0.5, 1e-6, 1e-6
 # Halvings of an interval that holds a quantile of a mixture.
 HALVINGS = 60
 
@@ -379,12 +383,35 @@ def _refuse_growing(
     widths = np.sqrt(np.mean(np.sum(list(parts.values()), axis=0), axis=0))
     for channel, width, motion in zip(model.mechanism.channels, widths, ranges, strict=True):
         if width > MOST_RANGES * motion:
+            cause, cure = "as with negative damping", "Fit a model that is stable"
+            if fast := _fast_bristles(model.mechanism, recording.Ts):
+                cause = f"as where {fast} swings within a sample, or with negative damping"
+                cure = "Fit Coulomb or Stribeck friction in its place, or a model that is stable"
             raise InputError(
                 f"The band of {channel} would be {width / motion:.1g} times as wide as its motion in "
-                f"{recording.source or 'a recording'}: the slopes of this model grow along the run, as with "
-                "negative damping, and to first order nothing is known. Fit a model that is stable, or give "
-                "a shorter recording."
+                f"{recording.source or 'a recording'}: the slopes of this model grow along the run, {cause}, "
+                f"and to first order nothing is known. {cure}, or give a shorter recording."
             )
+
+
+def _fast_bristles(m: Mechanism, Ts: float) -> str:
+    """The friction with memory that swings too fast for the sampling period, in words; empty if none does.
+
+    At rest its torque is that of a spring `k = -(d tau/dz) (d (dz/dt)/d speed)`, which swings with
+    `w = sqrt(k / J)` against the inertia `J` of the port.
+    """
+    inverse = inverse_mass(m)
+    for _, e in effects_of(m, Memory):
+        if e.driven_by != "voltage" or not e.law_of:
+            continue
+        rate = float(e.flow(0.0, 0.0, SLOW_SPEED, 0.0)) / SLOW_SPEED
+        bent, straight = (float(e.force(z, 0.0, 0.0, 0.0)) for z in (SMALL_STATE, 0.0))
+        torque = (bent - straight) / SMALL_STATE
+        p = np.array(m.port_vectors[e.at])
+        w = np.sqrt(max(-rate * torque * float(p @ inverse @ p), 0.0))
+        if w * Ts > MOST_BRISTLE_PHASE:
+            return f"the {e.title} at the {e.at}"
+    return ""
 
 
 def _unseen(

@@ -102,7 +102,8 @@ def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
 
     The linear part of the model, with the parameters that it has, runs under the recorded input. Rough
     values will do, as only the direction of each move counts. A resonance that the model puts on the other
-    side of all excited frequencies reverses a channel as well: then a nearer start helps.
+    side of all excited frequencies reverses a channel as well: then a nearer start helps. Recordings with
+    signals are not looked at: what a signal moves may outweigh the input, whether the model has it or not.
 
     Args:
         model: Before any fit.
@@ -113,7 +114,7 @@ def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
     """
     against: set[str] = set()
     worst = 0.0
-    for recording in recordings:
+    for recording in (r for r in recordings if not r.signals):
         linear = linearise(model.at(recording).mechanism)
         r = recording.slice(0, min(recording.N, MAX_SIGN_SAMPLES))
         y, would = model.measured(r).astype(float), _response(linear.discretise(r.Ts), linear.C, r.u)
@@ -250,7 +251,8 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
             full, value = f"{effect.at}.{effect.name}.{name}", float(getattr(effect, name))
             if full in m.trusted:
                 continue
-            unit, limit = m.units.unit(spec.unit, effect.volts_of_input), reach.limit(effect, spec.unit)
+            unit = m.units.unit(spec.unit, effect.volts_of_input, effect.signal_unit)
+            limit = reach.limit(effect, spec.unit)
             if limit is not None and abs(value) > BEYOND * limit[0]:
                 why = (
                     f"is far beyond what these recordings reach ({limit[1]}: {limit[0]:.3g} {unit}), so that "

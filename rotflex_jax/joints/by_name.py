@@ -143,12 +143,11 @@ def effect(text: str) -> Any:
     name, separator, port = place.partition("@")
     kind = CATALOG[choose(name, CATALOG, "effect")]
     ports = list(kind.ports)
-    if kind.acts_on == "signal" and SIGNAL_MARK in text:
-        port, _, behind = text.partition("@")[2].partition(SIGNAL_MARK)
-        signal, colon, values = behind.rpartition(":")
-        if not colon or "=" not in values:
-            signal, values = behind, ""
-        port += SIGNAL_MARK + signal
+    if kind.acts_on == "signal" and values:
+        signal, colon, tail = values.rpartition(":")
+        valued = bool(colon) and tail.partition("=")[0].strip() in kind.declared()
+        signal, values = (signal, tail) if valued else (values, "")
+        port = f"{port.strip()}{SIGNAL_MARK}{signal.strip()}"
     if not separator and len(ports) > 1:
         raise InputError(
             f"The effect {name} was given no port, but can act at {', '.join(ports)}; give for "

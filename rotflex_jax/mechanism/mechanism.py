@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -282,7 +283,9 @@ class Mechanism:
             )
         prefix = f"{at}.{name}."
         trusted = frozenset(t for t in self.trusted if not t.startswith(prefix))
-        return dataclasses.replace(self, effects=others, trusted=trusted)
+        taken, removed = {e.signal for e in others}, self.effect(name, at).signal
+        signals = tuple(s for s in self.signals if s != removed or s in taken)
+        return dataclasses.replace(self, effects=others, trusted=trusted, signals=signals)
 
     def effect(self, name: str, at: str) -> Effect:
         """The effect `name` at port `at`."""
@@ -362,14 +365,22 @@ class Mechanism:
         """Unit, bounds and size of each parameter, in the order of `values`."""
         u = self.units
         return tuple(
-            dataclasses.replace(s, unit=u.unit(s.unit, e.volts_of_input), typical=s.typical * u.size(s.unit))
+            dataclasses.replace(
+                s,
+                unit=u.unit(s.unit, e.volts_of_input, e.signal_unit),
+                typical=s.typical * u.size(s.unit),
+            )
             for e in self.effects
             for s in specifications(e).values()
         )
 
     def sentence(self, effect: Effect) -> str:
-        """An effect in words, in the units of this mechanism."""
-        return self.units.sentence(effect.sentence(), effect.volts_of_input)
+        """An effect in words, in the units of this mechanism; a signal keeps its own name and unit."""
+        per = f" per {effect.signal_unit}" if effect.signal_unit else ""
+        own = [re.escape(part) for part in (effect.signal_name, per) if part]
+        parts = re.split(f"({'|'.join(own)})", effect.sentence()) if own else [effect.sentence()]
+        parts[::2] = [self.units.sentence(part, effect.volts_of_input) for part in parts[::2]]
+        return "".join(parts)
 
     @property
     def values(self) -> Float[np.ndarray, " P"]:
@@ -491,7 +502,7 @@ class Mechanism:
                 full = f"{e.at}.{e.name}.{name}"
                 held = {"held": "  (trusted)", "": ""}.get(state := self._status(full), f"  ({state})")
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
-                unit = self.units.unit(specifications(e)[name].unit, e.volts_of_input)
+                unit = self.units.unit(specifications(e)[name].unit, e.volts_of_input, e.signal_unit)
                 lines.append(f"  {full} = {number} {unit}{held}")
         return "\n".join(lines)
 

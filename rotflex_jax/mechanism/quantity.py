@@ -39,18 +39,24 @@ class Units(NamedTuple):
     effort_size: float = 1.0
     input: str = "V"
 
-    def unit(self, declared: str, of_input: bool = False) -> str:
+    def unit(self, declared: str, of_input: bool = False, per: str = "") -> str:
         """The unit of this machine for a unit that an effect declares.
 
         Args:
             declared: As the effect has it.
             of_input: Whether its volts are the unit of the input, whatever that is.
+            per: Unit of the signal by which it is divided, which is the same for any machine.
 
         >>> Units("m", "N").unit("N m s/rad"), Units("m", "N").unit("kg m^2")
         ('N s/m', 'kg')
         >>> Units(input="A").unit("N m/V", of_input=True), Units(input="rad").unit("V")
         ('N m/A', 'V')
+        >>> Units("m", "N").unit("N m", per="rad/s^2")
+        'N/(rad/s^2)'
         """
+        if per:
+            own = self.unit(declared, of_input)
+            return f"{own}/({per})" if any(c in per for c in "/* ") else f"{own}/{per}"
         driven = of_input and self.input != "V"
         if (self.motion, self.effort) == ("rad", "N m") and not driven:
             return declared

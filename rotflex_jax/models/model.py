@@ -142,7 +142,7 @@ class Model:
         names, effects = self.mechanism.parameter_names, {(e.at, e.name) for e in self.mechanism.effects}
         for name in recording.constants:
             head, _, parameter = name.rpartition(".")
-            if name not in names and tuple(head.split(".")) in effects:
+            if name not in names and head.rpartition(".")[::2] in effects:
                 own = ", ".join(n for n in names if n.startswith(f"{head}."))
                 raise InputError(
                     f"The recording has the constant {name!r}, but {head} of the model has no parameter "

@@ -125,6 +125,7 @@ def to_dict(saved: Saved) -> dict[str, Any]:
             "ports": {name: list(vector) for name, vector in mechanism.ports},
             "outputs": {name: {"port": port, "what": what} for name, (port, what) in mechanism.outputs},
             "effects": [_effect(e, mechanism) for e in mechanism.effects],
+            "signals": list(mechanism.signals),
             "units": list(mechanism.units[:4]),
             "input_unit": mechanism.units.input,
         },
@@ -155,7 +156,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
     parameters = {
         name: {
             "value": _json(float(value)),
-            "unit": mechanism.units.unit(declared[name].unit, effect.volts_of_input),
+            "unit": mechanism.units.unit(declared[name].unit, effect.volts_of_input, effect.signal_unit),
             "bounds": [_json(declared[name].lower), _json(declared[name].upper)],
             "trusted": f"{effect.at}.{effect.name}.{name}" in mechanism.trusted,
             "meaning": declared[name].meaning,
@@ -292,6 +293,7 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
         outputs={name: (o["port"], o["what"]) for name, o in given["outputs"].items()},
         trusted=trusted,
         units=units,
+        signals=tuple(given.get("signals", ())),
     )
     rule = dict(data["solver"])
     name = rule.pop("rule")
@@ -329,10 +331,11 @@ def _effect_back(given: Mapping[str, Any], units: Units) -> Effect:
         )
     settings = {key: _back(value) for key, value in given["settings"].items()}
     effect = cls(at=given["at"], **settings)
+    unit = lambda s: units.unit(s.unit, cls.volts_of_input, effect.signal_unit)  # noqa: E731
     declared = cls.declared() | specifications(effect)
     for key, p in parameters.items():
-        if key not in declared or units.unit(declared[key].unit, cls.volts_of_input) != p["unit"]:
-            has = ", ".join(f"{n} [{units.unit(s.unit, cls.volts_of_input)}]" for n, s in declared.items())
+        if key not in declared or unit(declared[key]) != p["unit"]:
+            has = ", ".join(f"{n} [{unit(s)}]" for n, s in declared.items())
             raise InputError(
                 f"The file gives {name!r} the parameter {key} [{p['unit']}], but the effect has {has}; "
                 f"use the version of the effect that the file was written with."

@@ -289,7 +289,8 @@ class Recording:
     def with_signals(self, signals: Mapping[str, Any]) -> "Recording":
         """The recording with these signals in the place of its own.
 
-        What it continues keeps its own: give signals to the whole recording before it is cut.
+        A part of a recording then knows no part before it, since that one has other signals: give them to the
+        whole recording before it is cut.
 
         Args:
             signals: as in `Recording`.
@@ -298,7 +299,7 @@ class Recording:
         >>> recording.with_signals({"second motor [A]": np.zeros(100)})
         Recording(100 samples, 1 s at 100 Hz, voltage [V] to theta [rad], beside second motor [A])
         """
-        return replace(self, signals=signals)
+        return replace(self, signals=signals, continues=None if signals else self.continues)
 
     def _repr_html_(self) -> str:
         """What was measured: extent, ranges, steps of the sensors, findings, and the signals over time."""

@@ -309,11 +309,12 @@ shape (2,); give each signal an array of its own that is cut to these samples.
         )
     found = {}
     for name, values in (given or {}).items():
-        if not isinstance(name, str) or not name.strip() or name in taken:
+        named = isinstance(name, str) and name == name.strip() != "" and name.isprintable()
+        if not named or name in taken:
             what = " of the input or of a channel" if name in taken else ""
             raise InputError(
-                f"A signal was given the name {shown(name)}{what}, but it needs text of its own, with the "
-                "unit in brackets behind; write for instance 'acceleration of the base [m/s^2]'."
+                f"A signal was given the name {shown(name)}{what}, but it needs one line of text of its own, "
+                "with the unit in brackets behind; write for instance 'acceleration of the base [m/s^2]'."
             )
         x = real_numbers(values, f"Signal {name!r}")
         if x.shape != u.shape:

@@ -231,7 +231,8 @@ def _recordings(discovery: SearchResult) -> list[dict[str, Any]]:
 
 def _signals(r: Recording) -> str:
     outputs = ", ".join(f"{c} [{u}]" for c, u in zip(r.channels, r.units, strict=True))
-    return f"{r.input_name} [{r.input_unit}] → {outputs}"
+    inputs = ", ".join((f"{r.input_name} [{r.input_unit}]", *r.signals))
+    return f"{inputs} → {outputs}"
 
 
 def _settings(discovery: SearchResult) -> list[tuple[str, str]]:
