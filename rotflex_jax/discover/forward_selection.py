@@ -24,7 +24,7 @@ from rotflex_jax.effects.labels import law_of
 
 # Candidates of both rankings together that are refitted in a round, the best of each beside them, and rounds.
 REFITTED, ROUNDS = 4, 4
-# Laws of dry friction that are refitted where a round has tried none and adds nothing.
+# Laws of dry friction that are refitted where the first round has tried none and adds nothing.
 FRICTION_LAWS = 2
 
 
@@ -71,19 +71,19 @@ def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
 
 
 def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool:
-    """Add dry friction at a motor where a round has tried none and added nothing; False if it is no better.
+    """Add dry friction at a motor where the first round has tried none and adds nothing; False if no better.
 
     Every machine has some, but its slopes say little of it beside a model whose inertia or damping stands in
-    its place, or where another effect that is missing explains far more.
+    its place, or where another effect that is missing explains far more. Once an effect is found, another one
+    may stand for the friction (a dead zone of the input, say), and a second law of it would only follow errors.
 
     Args:
         state: What was found so far.
         promising: What the round has tried.
     """
-    s, on = state.problem.supermodel, {*state.current.hypothesis.locations}
-    present = [*(e.name for e in s.baseline.effects), *(p.effect for p in on)]
-    tried = [start.location.effect for p in promising for start in p.starts]
-    if any(law_of(name) == DRY_FRICTION for name in (*present, *tried)):
+    s, tried = state.problem.supermodel, [start.location.effect for p in promising for start in p.starts]
+    known = (*tried, *(e.name for e in s.baseline.effects))
+    if state.scores or any(law_of(name) == DRY_FRICTION for name in known):
         return False
     if not is_unexplained(state.horizons, state.current):
         return False
@@ -93,9 +93,8 @@ def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool
     for beside in [state.origin] if state.origin is state.current else [state.origin, state.current]:
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
-        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven]
+        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven][:FRICTION_LAWS]
         first, second = ({x.location: x for x in test.listed} for test in tests)
-        laws = laws[:FRICTION_LAWS]
         starts, runs_starts = ([by[p].start for p in laws] for by in (first, second))
         if laws:
             chosen.append(Promising(beside, [first[p] for p in laws], starts, runs_starts))
