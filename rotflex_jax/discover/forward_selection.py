@@ -74,8 +74,8 @@ def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool
     """Add dry friction at a motor where the first round has tried none and adds nothing; False if no better.
 
     Every machine has some, but its slopes say little of it beside a model whose inertia or damping stands in
-    its place, or where another effect that is missing explains far more. Once an effect is found, it may stand
-    for the friction (a dead zone of the input, say), and a second law of it would only follow errors.
+    its place, or where another effect that is missing explains far more. An effect that was found may itself
+    stand for the friction (a dead zone of the input, say), and a second law of it would only follow errors.
 
     Args:
         state: What was found so far.
