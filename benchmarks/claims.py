@@ -14,6 +14,7 @@ import scipy.stats
 
 from arena.probability import classes, credible, scatter_of_right, usable
 from arena.wrong_table import SEEN as SEEN_WORLDS
+from rotflex_jax.arena.measured import MACHINES
 from rotflex_jax.arena.scores import Event, calibration_error
 from rotflex_jax.effects.labels import law_of
 from rotflex_jax.parameters import HALF_WIDTH_95
@@ -245,7 +246,9 @@ def joint_theta_fall() -> str:
 
 
 def _measured() -> dict[str, dict[str, Any]]:
-    return results("B9.json")["rows"]
+    """Directions of machines by their input alone; the same runs with signals are told apart."""
+    rows = results("B9.json")["rows"]
+    return {key: row for key, row in rows.items() if not MACHINES[row["machine"]].with_signals}
 
 
 @named
@@ -253,6 +256,11 @@ def measured_others() -> str:
     """Other methods that had the same recordings."""
     (count,) = {len(row["others"]["rows"]) for row in _measured().values()}
     return str(count)
+
+
+def _used(row: dict[str, Any]) -> dict[str, Any]:
+    """Errors of the model to use."""
+    return row["reported"].get("fitted to all") or row["reported"]["final"]
 
 
 def measured_lead(row: dict[str, Any], horizon: str, channel: int) -> float | None:
@@ -266,8 +274,8 @@ def measured_lead(row: dict[str, Any], horizon: str, channel: int) -> float | No
     Returns:
         The ratio, above one where the model to use is ahead; None where the machine has no such channel.
     """
-    key, reported = f"rmse{horizon}", row["reported"]
-    used = (reported.get("fitted to all") or reported["final"])[f"test_{key}"]
+    key = f"rmse{horizon}"
+    used = _used(row)[f"test_{key}"]
     names = [c for c in used if c != "seconds"]
     if channel >= len(names):
         return None
@@ -286,6 +294,52 @@ def measured_ahead(horizon: str, channel: int) -> str:
 for _number, _channel in enumerate(("first", "second")):
     for _name, _horizon in (("windows", "_windows"), ("whole", "")):
         NAMED[f"measured_{_channel}_{_name}"] = functools.partial(measured_ahead, _horizon, _number)
+
+
+# -- the two-link machine with signals -----------------------------------------------------------------------
+
+
+def _in_degrees(errors: dict[str, float], stage: int | None = None) -> str:
+    """Errors of theta and alpha over 2 s; of a stage of both where one is named."""
+    names = [name if stage is None else f"{name}{stage}" for name in ("theta", "alpha")]
+    return " / ".join(f"{math.degrees(errors[name]):.2f}" for name in names)
+
+
+@named
+def two_link_signals() -> str:
+    """The table of the two-link machine without and with the motion of the other stage."""
+    lines = [
+        "",
+        "| stage, run | as it is | search, by itself | ARX, by itself | search, other link known | ARX, other link known "
+        "| both stages in one |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    rows = results("B9.json")["rows"]
+    for stage, other in ((1, 2), (2, 1)):
+        for run, year in (("lqr", 2026), ("feedback", 2011)):
+            way = f"{run}, first half to its end"
+            alone, beside, both = (
+                rows[f"{machine}: {way}"]
+                for machine in (
+                    f"two_dof_link_{stage}",
+                    f"two_dof_link_{stage}_beside_{other}",
+                    "two_stage_link",
+                )
+            )
+            arx = [
+                next(m["held_out_rmse_windows"] for m in row["others"]["rows"] if m["method"] == "arx")
+                for row in (alone, beside)
+            ]
+            cells = [
+                _in_degrees(alone["reported"]["baseline"]["test_rmse_windows"]),
+                _in_degrees(_used(alone)["test_rmse_windows"]),
+                _in_degrees(arx[0]),
+                _in_degrees(_used(beside)["test_rmse_windows"]),
+                _in_degrees(arx[1]),
+                _in_degrees(_used(both)["test_rmse_windows"], stage),
+            ]
+            lines.append(f"| {stage}, {year} | {' | '.join(cells)} |")
+    return "\n".join([*lines, ""])
 
 
 # -- fits of measured machines ------------------------------------------------------------------------------
