@@ -1,6 +1,7 @@
 """Figures of the evidence: ranking of the candidates, held-out errors, parameters."""
 
 import math
+import textwrap
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,6 +19,8 @@ from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks
 
 MOST_BARS = 14
+# Characters of labels that stand side by side in a figure, and of the shortest line of one.
+TICK_CHARACTERS, SHORTEST_LINE = 100, 14
 MOST_SETS = 6
 
 
@@ -138,7 +141,7 @@ def staircase(discovery: SearchResult) -> Figure | None:
     colours = stage_colours(len(labels))
     figure = blank(10.0, 3.6)
     axes = figure.subplots(1, len(by_channel), squeeze=False)[0]
-    x = np.arange(len(labels))
+    x, width = np.arange(len(labels)), max(SHORTEST_LINE, TICK_CHARACTERS // (len(labels) * len(by_channel)))
     for ax, (channel, unit) in zip(axes, by_channel.items(), strict=True):
         scale, read = readable(1.0, unit)
         windows = [scale * s.held_out_rmse_windows[channel] for s in discovery.stages]
@@ -178,7 +181,7 @@ def staircase(discovery: SearchResult) -> Figure | None:
         values = [v for v in (*windows, *whole, floor) if v > 0 and math.isfinite(v)] or [1.0]
         ax.set_ylim(min(values) / 2.2, 1.8 * max(values))
         ax.set_xlim(-0.55, len(labels) - 0.55)
-        ax.set_xticks(x, [label.replace(" at ", "\nat ").replace(" of ", "\nof ") for label in labels])
+        ax.set_xticks(x, [textwrap.fill(label, width, break_long_words=False) for label in labels])
         ax.tick_params(axis="x", length=0)
         for text, colour in zip(ax.get_xticklabels(), colours, strict=True):
             text.set_color(colour)
