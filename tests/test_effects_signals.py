@@ -2,20 +2,36 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete
 
 import rotflex_jax as rf
-from rotflex_jax.effects import Coulomb, CubicSpring, Gravity, MeasuredDisturbance, SensorGain, Viscous
+from rotflex_jax.effects import (
+    Coulomb,
+    CubicSpring,
+    Delay,
+    Gravity,
+    MeasuredDisturbance,
+    SensorGain,
+    Viscous,
+)
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.rig import SimulatedRig
 from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.export import to_c
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, simulate
+from rotflex_jax.mechanism.sensitivities import (
+    RecordingSamples,
+    RunParameters,
+    TangentDirections,
+    outputs_with_sensitivities,
+)
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import double_precision
 
 BASE = "acceleration of the base [rad/s^2]"
 OTHER = "current of motor 2 [A]"
@@ -103,6 +119,35 @@ def test_friction_holds_against_a_signal():
     assert np.max(np.abs(simulate(m, w, TS)[:, 0])) < 1e-12
     w[:, 1] *= 1.2
     assert np.max(np.abs(simulate(m, w, TS)[:, 0])) > 1e-3
+
+
+@pytest.mark.parametrize("solver", [Exponential(), Exponential(substeps=2, between="smooth"), SmoothRK4()])
+def test_slopes_equal_central_differences(solver):
+    m = joint(*on_moving_base(), CubicSpring(at="joint", stiffness=20.0), Delay(time=0.006))
+    structure, values = m.structure, m.values
+    w = np.column_stack([coloured(120, 3.0, 6), coloured(120, 20.0, 7)])
+
+    def run(values):
+        mechanism = m.with_values(values)
+        return simulate(mechanism, w, TS, x0=[0.1, 0.02, 0.5, -0.3], solver=solver)
+
+    with double_precision():
+        parameters = RunParameters(
+            jnp.asarray(values), jnp.ones(len(m.effects)), jnp.asarray([0.1, 0.02, 0.5, -0.3]), None
+        )
+        P = len(values)
+        ways = TangentDirections(jnp.eye(P), jnp.zeros((P, len(m.effects))), jnp.zeros((P, 4)))
+        samples = RecordingSamples(jnp.asarray(w), jnp.zeros((120, 2)), jnp.ones(120), jnp.asarray(TS))
+        y, J = outputs_with_sensitivities(structure, solver, parameters, ways, samples)
+    np.testing.assert_allclose(y, run(values), atol=1e-12)
+    for name in m.free_names:
+        i = m.parameter_names.index(name)
+        h = 1e-5 * max(abs(values[i]), 1e-3)
+        step = h * np.eye(P)[i]
+        expected = (run(values + step) - run(values - step)) / (2 * h)
+        np.testing.assert_allclose(
+            J[..., i], expected, atol=1e-5 * np.abs(expected).max() + 1e-9, err_msg=name
+        )
 
 
 def test_two_signals_at_one_port_are_two_effects():

@@ -635,8 +635,9 @@ def test_derivatives_of_a_trajectory_equal_central_differences(laden):
 def test_every_effect_has_its_derivatives_checked():
     used = {e.name for effects in LADEN.values() for e in effects} | {"inertia", "motor", "current_drive"}
     # Play has no slope at a gap of zero; its own tests hold where it has one. Readings need outputs of their
-    # own: `test_effects_servo_loop.py`.
+    # own: `test_effects_servo_loop.py`; a signal, columns: `test_effects_signals.py`.
     elsewhere = {"backlash", "elastic_backlash", "pid_servo", "current_meter", "duty_meter"}
+    elsewhere |= {"measured_disturbance"}
     assert used | elsewhere == set(fx.CATALOG)
 
 
