@@ -82,8 +82,9 @@ measured
 
 # %% [markdown]
 # Friction at the hub is named, and the held-out error of theta falls several times. But the verdict is
-# honest: *something remains*. The error is still many times the noise of the sensor, that of the
-# deflection has grown, and the page on the measured joint follows up why.
+# honest: *something remains*. The errors are still many times the noise of the sensors. That of the
+# deflection may fall a little or grow: the fit of the maker's model has several ends, and the rounding of
+# a processor may decide between them. The page on the measured joint follows up what is missing.
 # `rf.explore(measured, run_b)` puts the model under sliders: switch an effect off, move a number, and see
 # at once what it does to the run and to its error (`pip install "rotflex_jax[notebook]"`).
 #
@@ -105,6 +106,8 @@ if measured:
     assert measured.verdict == "unexplained" and measured.rounds[0].port == "hub"
     assert measured.rounds[0].effect in ("coulomb", "stribeck", "lugre", "dahl")
     before, after = measured.baseline.held_out_rmse_windows, measured.final.held_out_rmse_windows
-    assert after["theta"] < before["theta"] / 4 and after["alpha"] > before["alpha"]
-    print(f"theta: {np.rad2deg(before['theta']):.2f} to {np.rad2deg(after['theta']):.2f} deg")
+    assert after["theta"] < before["theta"] / 4 and after["alpha"] > before["alpha"] / 2
+    assert all(after[channel] > 5 * floor for channel, floor in measured.noise_floor.items())
+    for channel in after:
+        print(f"{channel}: {np.rad2deg(before[channel]):.2f} to {np.rad2deg(after[channel]):.2f} deg")
 print("All claims hold.")

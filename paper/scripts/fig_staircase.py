@@ -8,8 +8,8 @@ from rotflex_jax.text.colours import BASELINE, FINAL, NOISE
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled
 
 TITLES = {
-    "ab": "learnt from run A, judged on B",
-    "ba": "learnt from run B, judged on A",
+    "ab": "learnt from run A, evaluated on B",
+    "ba": "learnt from run B, evaluated on A",
     "mixed": "first 7 s, last 3 s",
 }
 
