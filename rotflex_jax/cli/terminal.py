@@ -275,7 +275,9 @@ def save_simulation(file: Path, recording: Any, simulated: Mapping[str, Real[np.
     """
     inputs = [recording.input_name, *recording.signals]
     names = ["t", *inputs, *recording.channels, *(f"{c}_simulated" for c in simulated)]
-    columns = np.column_stack([recording.t, recording.inputs, recording.y, *simulated.values()])
+    columns = np.column_stack(
+        [recording.t, recording.inputs(recording.signals), recording.y, *simulated.values()]
+    )
     csv.writer(head := StringIO(), lineterminator="").writerow(spreadsheet_cell(one_line(n)) for n in names)
     header = head.getvalue()
     np.savetxt(text := StringIO(), columns, delimiter=",", header=header, comments="", fmt="%.9g")

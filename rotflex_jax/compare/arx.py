@@ -61,7 +61,7 @@ class DifferenceEquation:
                 f"The equation takes the signal {missing[0]!r} beside the input, but the recording lacks it; "
                 "give a recording that has it."
             )
-        return _columns(recording, self.signals)
+        return recording.inputs(self.signals).astype(float)
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """Free run: the first `n_init` samples as measured, from there on its own outputs.
@@ -146,18 +146,13 @@ def fit_difference_equation(recordings: Sequence[Recording], order: int) -> Diff
     rows, targets = [], []
     for r in recordings:
         y = r.y.astype(float)
-        rows.append(np.hstack([_lags(y, order), _lags(_columns(r, signals), order)]))
+        rows.append(np.hstack([_lags(y, order), _lags(r.inputs(signals).astype(float), order)]))
         targets.append(y[order:])
     X, Y = np.vstack(rows), np.vstack(targets)
     size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-300)
     W = (np.linalg.lstsq(X / size, Y, rcond=None)[0] / size[:, None]).T
     A, B = W[:, : order * C].reshape(C, order, C), W[:, order * C :].reshape(C, order, -1)
     return DifferenceEquation(A, B, recordings[0].Ts, signals)
-
-
-def _columns(recording: Recording, signals: Sequence[str]) -> Float[np.ndarray, "N m"]:
-    """The input and some signals of a recording."""
-    return np.column_stack([recording.u, *(recording.signals[name] for name in signals)]).astype(float)
 
 
 def _lags(x: Float[np.ndarray, "N c"], n: int) -> Float[np.ndarray, "M K"]:

@@ -288,8 +288,9 @@ def run_loop(
 ) -> ClosedLoop:
     """`close_loop` along a motion that is planned already."""
     if isinstance(plant, Model | Mechanism):
-        check_input_alone(Model.of(plant).mechanism, "a closed loop")
-        return _with_model(controller, Model.of(plant), motion, noise, checked_seed(seed))
+        model = Model.of(plant)
+        check_input_alone(model.mechanism, "a closed loop")
+        return _with_model(controller, model, motion, noise, checked_seed(seed))
     if not isinstance(plant, Plant):
         raise InputError(
             f"Argument `plant` must be a model, or an object with read() and advance(voltage), but is "

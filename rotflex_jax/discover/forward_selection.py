@@ -43,6 +43,15 @@ class Promising(NamedTuple):
     starts: list[CandidateStart]
     runs_starts: list[CandidateStart]
 
+    @classmethod
+    def at(
+        cls, beside: ValidatedHypothesis, scores: Sequence[list[Score]], places: Sequence[EffectLocation]
+    ) -> "Promising":
+        """Those at some places, from the scores of predictions and of free runs beside a model."""
+        first, second = ({x.location: x for x in listed} for listed in scores)
+        found = [first[p] for p in places]
+        return cls(beside, found, [x.start for x in found], [second[p].start for p in places])
+
 
 def score_candidates(state: SearchState) -> list[Promising]:
     """The candidates with the best scores beside each model that they may be added to."""
@@ -94,10 +103,8 @@ def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
         laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven][:FRICTION_LAWS]
-        first, second = ({x.location: x for x in test.listed} for test in tests)
-        starts, runs_starts = ([by[p].start for p in laws] for by in (first, second))
         if laws:
-            chosen.append(Promising(beside, [first[p] for p in laws], starts, runs_starts))
+            chosen.append(Promising.at(beside, [test.listed for test in tests], laws))
     return bool(chosen) and add_best(state, chosen)
 
 
@@ -195,12 +202,12 @@ def _refit_replaced(
     if not locations:
         return []
     state.say("refitting what it may stand for: " + ", ".join(map(str, locations)))
-    first, second = ({x.location: x for x in listed} for listed in before)
-    starts, runs_starts = ([by[p].start for p in locations] for by in (first, second))
-    more = refit_and_validate(state, state.origin, starts, runs_starts)
+    beside, scores, *starts = Promising.at(state.origin, before, locations)
+    more = refit_and_validate(state, beside, *starts)
     for candidate in more:
         state.say("  " + describe(candidate, state.current))
-    return [(first[c.location], c) for c in more if c.location]
+    known = {x.location: x for x in scores}
+    return [(known[c.location], c) for c in more if c.location]
 
 
 def add_pair(state: SearchState, rounds: int) -> bool:

@@ -60,13 +60,12 @@ def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
     data = problem.dataset.data
     if getattr(problem.predictor.solver, "between", "") != "held":
         return 0.0
-    u = np.array(data.u)
-    voltages = u if u.ndim == 2 else u[..., 0]
-    for row, recording in zip(voltages, problem.dataset.recordings, strict=True):
+    data = data._replace(u=np.array(data.u))
+    for row, recording in zip(data.voltage, problem.dataset.recordings, strict=True):
         if np.mean(np.diff(recording.u) == 0) > MOST_REPEATED:
             return 0.0
         row[: recording.N] = held_equivalent(recording.u.astype(float))
-    smooth = problem.of_dataset(dataclasses.replace(problem.dataset, data=data._replace(u=u)))
+    smooth = problem.of_dataset(dataclasses.replace(problem.dataset, data=data))
     start = smooth.with_likelihood(h)
     if not np.isfinite(start.log_likelihood):
         return 0.0

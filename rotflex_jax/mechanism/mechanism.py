@@ -365,11 +365,7 @@ class Mechanism:
         """Unit, bounds and size of each parameter, in the order of `values`."""
         u = self.units
         return tuple(
-            dataclasses.replace(
-                s,
-                unit=u.unit(s.unit, e.volts_of_input, e.signal_unit),
-                typical=s.typical * u.size(s.unit),
-            )
+            dataclasses.replace(s, unit=u.of(e, s.unit), typical=s.typical * u.size(s.unit))
             for e in self.effects
             for s in specifications(e).values()
         )
@@ -502,7 +498,7 @@ class Mechanism:
                 full = f"{e.at}.{e.name}.{name}"
                 held = {"held": "  (trusted)", "": ""}.get(state := self._status(full), f"  ({state})")
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
-                unit = self.units.unit(specifications(e)[name].unit, e.volts_of_input, e.signal_unit)
+                unit = self.units.of(e, specifications(e)[name].unit)
                 lines.append(f"  {full} = {number} {unit}{held}")
         return "\n".join(lines)
 

@@ -14,6 +14,8 @@ import enum
 import re
 from typing import NamedTuple
 
+from rotflex_jax.effects.base import Effect
+
 _UNIT = re.compile(
     r"kg m\^2|\(N m\)\^2|N m\b(?: s(?:\^\d)?(?![a-z]))?(?:/(?:rad|s|A|V)(?:\^\d)?)*|rad\b(?:/s(?:\^\d)?)?"
 )
@@ -71,6 +73,10 @@ class Units(NamedTuple):
         for name, power in ((self.effort, E), *powers.items(), (self.motion, Q)):
             whole[name] = whole.get(name, 0) + power
         return _written(whole)
+
+    def of(self, effect: Effect, declared: str) -> str:
+        """The unit of this machine for a unit that a parameter of an effect declares."""
+        return self.unit(declared, effect.volts_of_input, effect.signal_unit)
 
     def size(self, declared: str) -> float:
         """Factor on a typical size that an effect declares, for this machine."""

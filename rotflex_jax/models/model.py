@@ -169,14 +169,14 @@ class Model:
         Raises:
             InputError: The recording lacks one of these signals.
         """
-        u, names = recording.u.astype(float), self.mechanism.signals
+        names = self.mechanism.signals
         if missing := [name for name in names if name not in recording.signals]:
             has = ", ".join(map(repr, recording.signals)) or "none"
             raise InputError(
                 f"The model is driven by the signal {missing[0]!r} beside the input, but the signals of the "
                 f"recording are {has}; add it, recording.with_signals({{...}})."
             )
-        return np.column_stack([u, *(recording.signals[n] for n in names)]) if names else u
+        return (recording.inputs(names) if names else recording.u).astype(float)
 
     def parameters_and_gates(self) -> tuple[Float[Array, " P"], Float[Array, " E"]]:
         """Parameter values and gates, in the precision of the context."""

@@ -156,7 +156,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
     parameters = {
         name: {
             "value": _json(float(value)),
-            "unit": mechanism.units.unit(declared[name].unit, effect.volts_of_input, effect.signal_unit),
+            "unit": mechanism.units.of(effect, declared[name].unit),
             "bounds": [_json(declared[name].lower), _json(declared[name].upper)],
             "trusted": f"{effect.at}.{effect.name}.{name}" in mechanism.trusted,
             "meaning": declared[name].meaning,
@@ -331,11 +331,10 @@ def _effect_back(given: Mapping[str, Any], units: Units) -> Effect:
         )
     settings = {key: _back(value) for key, value in given["settings"].items()}
     effect = cls(at=given["at"], **settings)
-    unit = lambda s: units.unit(s.unit, cls.volts_of_input, effect.signal_unit)  # noqa: E731
     declared = cls.declared() | specifications(effect)
     for key, p in parameters.items():
-        if key not in declared or unit(declared[key]) != p["unit"]:
-            has = ", ".join(f"{n} [{unit(s)}]" for n, s in declared.items())
+        if key not in declared or units.of(effect, declared[key].unit) != p["unit"]:
+            has = ", ".join(f"{n} [{units.of(effect, s.unit)}]" for n, s in declared.items())
             raise InputError(
                 f"The file gives {name!r} the parameter {key} [{p['unit']}], but the effect has {has}; "
                 f"use the version of the effect that the file was written with."

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -191,10 +191,9 @@ class Recording:
         """Time from the first sample to the end of the last [s]."""
         return self.N * self.Ts
 
-    @property
-    def inputs(self) -> Float[np.ndarray, "N m"]:
-        """The input, and beside it the signals, in columns."""
-        return np.column_stack([self.u, *self.signals.values()])
+    def inputs(self, signals: Iterable[str]) -> Float[np.ndarray, "N m"]:
+        """The input, and beside it some of the signals, in columns."""
+        return np.column_stack([self.u, *(self.signals[name] for name in signals)])
 
     def channel(self, name: str) -> Float[np.ndarray, " N"]:
         """One output by name."""
