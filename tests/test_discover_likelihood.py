@@ -172,6 +172,15 @@ def test_side_by_side_is_the_same_as_alone(rough):
         np.testing.assert_allclose(h.z, alone.z, rtol=1e-6, atol=1e-9)
 
 
+def test_refits_side_by_side_are_the_same_as_alone(rough):
+    starts = [with_friction(rough, 0.005), sp.start(rough, wrong=0.1), with_friction(rough, 0.05)]
+    for h, one in zip(refit(rough, starts), starts, strict=True):
+        alone = refit(rough, [one])[0]
+        assert h.log_likelihood == alone.log_likelihood
+        assert h.process_noise == alone.process_noise
+        np.testing.assert_array_equal(h.z, alone.z)
+
+
 def test_the_truth_is_recovered(rough):
     found = refit(rough, [with_friction(rough, 0.008)])[0]
     values = found.values(rough.supermodel)
@@ -280,13 +289,13 @@ def test_a_refit_is_not_stopped_on_its_way(monkeypatch, plain, gains, alternatio
     start = dataclasses.replace(h, densities=np.zeros((2, 1)))
     calls = []
 
-    def fitted(_, hypotheses):
+    def fitted(_, x):
         calls.append(1)
         more = next(left) if len(calls) > 1 else 0.0
-        return [dataclasses.replace(x, densities=x.densities + more / 2) for x in hypotheses]
+        return dataclasses.replace(x, densities=x.densities + more / 2)
 
-    monkeypatch.setattr(refit_module, "levenberg_marquardt", fitted)
-    monkeypatch.setattr(refit_module, "choose_process_noises", lambda problem, starts, wide: starts)
+    monkeypatch.setattr(refit_module, "_fitted", fitted)
+    monkeypatch.setattr(refit_module, "choose_process_noise", lambda problem, start, wide: start)
     end = refit(problem, [start], alternations=alternations)[0]
     assert len(calls) - 1 == taken
     assert end.log_likelihood == sum(gains[:taken])

@@ -1,9 +1,7 @@
 """Innovations and their slopes for several parameter sets, side by side on threads."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -24,7 +22,7 @@ from rotflex_jax.mechanism.sensitivities import (
 )
 from rotflex_jax.models.model import program_length
 from rotflex_jax.runtime.persistent_jit import persistent_jit
-from rotflex_jax.runtime.xla import cores, double_precision
+from rotflex_jax.runtime.xla import double_precision, on_threads
 
 # Windows of a program, at least.
 LEAST_WINDOWS = 16
@@ -263,34 +261,3 @@ class BatchedPredictor:
             samples = ProgramSamples(data, np.pad(window, ((0, 0), (0, more)), "edge"), count)
             found = self._placed[id(window)] = window, jax.tree.map(jnp.asarray, samples)
         return found[1]
-
-
-def on_threads(run: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
-    """Results of independent calls, on as many threads as there are cores.
-
-    A scan keeps one core busy; compiled code runs outside of Python's lock. Where one call fails, those that
-    have begun end before its error is raised.
-
-    Args:
-        run: What to call; no two calls may run a program that spreads over devices. What several calls need
-            to be compiled is compiled once, by the first of them.
-        jobs: Its arguments.
-    """
-    if len(jobs) == 1:
-        return [run(jobs[0])]
-    settings = np.geterr()  # a thread has its own
-
-    def on_thread(job: Any) -> Any:
-        with np.errstate(**settings):
-            return run(job)
-
-    begun = [_threads().submit(on_thread, job) for job in jobs]
-    try:
-        return [each.result() for each in begun]
-    finally:
-        wait([each for each in begun if not each.cancel()])
-
-
-@functools.cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(cores())

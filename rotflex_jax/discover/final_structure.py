@@ -10,7 +10,6 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-from rotflex_jax.discover.batched_predictor import on_threads
 from rotflex_jax.discover.hypothesis import Hypothesis, replacing, usual_start, without
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.effects.base import DRY_FRICTION
@@ -21,7 +20,7 @@ from rotflex_jax.mechanism import Solver
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, Transform
 from rotflex_jax.recording import Recording
-from rotflex_jax.runtime.xla import mesh_of
+from rotflex_jax.runtime.xla import mesh_of, on_threads
 
 
 @dataclasses.dataclass(frozen=True)

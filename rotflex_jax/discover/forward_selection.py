@@ -135,14 +135,15 @@ def refit_and_validate(
     runs = refit_candidates(problem, beside.free_run.hypothesis, informed)
     runs = refit_near_predictions(problem, runs, grown)
     state.say("  free runs are fitted, validation follows")
-    validated = [
-        dataclasses.replace(
-            horizons.validated(h, f, beside),
-            location=c.location,
-            parameter_count=parameter_count(s, h, c.location),
-        )
+    plausible = [
+        (h, f, c.location)
         for h, f, c in zip(grown, runs, starts, strict=True)
         if state.is_plausible(h, c.location) and state.is_plausible(f, c.location)
+    ]
+    found = horizons.all_validated([(h, f) for h, f, _ in plausible], beside)
+    validated = [
+        dataclasses.replace(v, location=location, parameter_count=parameter_count(s, h, location))
+        for v, (h, _, location) in zip(found, plausible, strict=True)
     ]
     validated = validate_from_best_states(state.validation, validated)
     state.tried += validated

@@ -20,8 +20,9 @@ from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows
 from rotflex_jax.mechanism import Exponential, Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
-from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise, minimise_together
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
 from rotflex_jax.runtime.persistent_jit import make_ahead
+from rotflex_jax.runtime.xla import on_threads
 
 # Hypotheses are compared block by block, so that the scatter shows what is chance.
 BLOCK_SECONDS = 0.5
@@ -295,33 +296,37 @@ class _Point:
 
 
 def levenberg_marquardt(
-    problem: LikelihoodProblem, hypotheses: list[Hypothesis], max_steps: int = MAX_STEPS
+    problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], max_steps: int = MAX_STEPS
 ) -> list[Hypothesis]:
-    """Fit all hypotheses with whiteners and process noise held; returns them with new whiteners."""
-    seen = problem.seen
+    """Hypotheses fitted with whiteners and process noise held, each with the whitener that it ends with."""
+    return on_threads(lambda h: _fitted(problem, h, max_steps), hypotheses)
+
+
+def _fitted(problem: LikelihoodProblem, h: Hypothesis, max_steps: int = MAX_STEPS) -> Hypothesis:
+    """The same for one hypothesis."""
+    seen, coordinates = problem.seen, FitCoordinates.of(h, problem.windows)
 
     # Slopes come with every trial: most steps are taken, and a run alone is not much cheaper.
-    def coordinates(h: Hypothesis) -> FitCoordinates:
-        return FitCoordinates.of(h, problem.windows)
+    def linearise(point: _Point) -> NormalEquations:
+        here = point.hypothesis
 
-    def linearise(points: list[_Point]) -> list[NormalEquations]:
-        def equations(i: int, e: np.ndarray, J: np.ndarray) -> NormalEquations:
-            h, points[i].innovations = points[i].hypothesis, e
-            w = h.whitener(e, seen)
-            H, g = coordinates(h).sums(w, h.whitener(J[: h.moved], seen))
+        def equations(_: int, e: np.ndarray, J: np.ndarray) -> NormalEquations:
+            point.innovations = e
+            w = here.whitener(e, seen)
+            H, g = coordinates.sums(w, here.whitener(J[: here.moved], seen))
             return NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H)
 
-        return problem.of_slopes(equations, [p.hypothesis for p in points])
+        return problem.of_slopes(equations, [here])[0]
 
-    found = minimise_together(
+    found = minimise(
         linearise,
-        [_Point(h) for h in hypotheses],
+        _Point(h),
         REFIT_RULES,
-        limit=lambda i: coordinates(hypotheses[i]).step_limit(MAX_COORDINATE_STEP),
-        move=lambda p, step: _Point(coordinates(p.hypothesis).moved(p.hypothesis, step)),
+        limit=coordinates.step_limit(MAX_COORDINATE_STEP),
+        move=lambda p, step: _Point(coordinates.moved(p.hypothesis, step)),
         max_steps=max_steps,
     )
-    return [problem.evaluated(m.x.hypothesis, m.x.innovations) for m in found]
+    return problem.evaluated(found.x.hypothesis, found.x.innovations)
 
 
 def _grid(
@@ -344,82 +349,60 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
     Zero is a free run, a large intensity follows the data within a few samples. Where the model is right, the
     smallest value of the grid is the likeliest; where another one is, something is missing.
     """
-    return choose_process_noises(problem, [h], wide)[0]
-
-
-def choose_process_noises(
-    problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], wide: bool = False
-) -> list[Hypothesis]:
-    """The same for several hypotheses, which are run side by side."""
     if problem.free_run:
-        return list(hypotheses)
+        return h
     least, most = problem.process_noise_range
-    chosen = [_ProcessNoise(h) for h in hypotheses]
+    best, tried = h, list[dict[str, float]]()
+
+    def likeliest(trials: list[dict[str, float]]) -> Hypothesis:
+        """The best so far or one with a further process noise; none is run again."""
+        new = [t for k, t in enumerate(trials) if t not in (*trials[:k], *tried)]
+        if not new:
+            return best
+        runs = [
+            dataclasses.replace(best, K=K, process_noise=intensity)
+            for intensity, K in zip(new, problem.gains(best, new), strict=True)
+        ]
+        parameter_sets = [run.parameter_set(problem.supermodel) for run in runs]
+        evaluated = problem.predictor.of_innovations(
+            lambda i, e: problem.evaluated(runs[i], e), parameter_sets, problem.windows.index
+        )
+        # Before the first trials nothing was run with the likelihood that counts here.
+        known = [best] if tried else []
+        tried.extend(new)
+        return max([*known, *evaluated], key=lambda run: run.log_likelihood)
+
     if wide:
-        levels = np.geomspace(least, most, 4) / most
-        grid = _grid(dict.fromkeys(problem.ports, most), levels)
-        _try_process_noises(problem, chosen, [grid] * len(chosen))
+        best = likeliest(_grid(dict.fromkeys(problem.ports, most), np.geomspace(least, most, 4) / most))
     for factor in (10.0, 10**0.5):
-        trials = [_grid(c.best.process_noise, (1 / factor, 1.0, factor)) for c in chosen]
-        trials = [[{p: min(max(v, least), most) for p, v in t.items()} for t in each] for each in trials]
-        _try_process_noises(problem, chosen, trials)
-    return [c.best for c in chosen]
-
-
-@dataclasses.dataclass
-class _ProcessNoise:
-    """A hypothesis with the likeliest process noise of those tried."""
-
-    best: Hypothesis
-    tried: list[dict[str, float]] = dataclasses.field(default_factory=list)
-
-
-def _try_process_noises(
-    problem: LikelihoodProblem, chosen: list[_ProcessNoise], trials: list[list[dict[str, float]]]
-) -> None:
-    """Runs each hypothesis with further process noises; none is run again."""
-    runs: list[tuple[_ProcessNoise, Hypothesis]] = []
-    parameter_sets: list[ParameterSet] = []
-    for c, each in zip(chosen, trials, strict=True):
-        if new := [t for k, t in enumerate(each) if t not in (*each[:k], *c.tried)]:
-            as_it_is = c.best.parameter_set(problem.supermodel)
-            for intensity, K in zip(new, problem.gains(c.best, new), strict=True):
-                runs.append((c, dataclasses.replace(c.best, K=K, process_noise=intensity)))
-                parameter_sets.append(as_it_is._replace(K=K))
-    evaluated = problem.predictor.of_innovations(
-        lambda i, e: problem.evaluated(runs[i][1], e), parameter_sets, problem.windows.index
-    )
-    for c in chosen:
-        new = [h for (of, _), h in zip(runs, evaluated, strict=True) if of is c]
-        found = max(new, key=lambda h: h.log_likelihood, default=c.best)
-        if not c.tried or found.log_likelihood > c.best.log_likelihood:
-            c.best = found
-        c.tried += [h.process_noise for h in new]
+        trials = _grid(best.process_noise, (1 / factor, 1.0, factor))
+        best = likeliest([{p: min(max(v, least), most) for p, v in t.items()} for t in trials])
+    return best
 
 
 def refit(
-    problem: LikelihoodProblem, hypotheses: list[Hypothesis], wide: bool = False, alternations: int = 3
+    problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], wide: bool = False, alternations: int = 3
 ) -> list[Hypothesis]:
-    """Alternate parameters and process noise until the likelihood converges.
+    """Alternate parameters and process noise of each hypothesis until its likelihood converges.
 
     After so many alternations little is left to gain. What still gains much goes on for `EXTRA_ALTERNATIONS`
     at most: stopped too early, the right effect may look worse than a wrong one that has converged.
     """
     if alternations and not problem.free_run:
         problem.make_ahead(hypotheses)
-    current = levenberg_marquardt(problem, hypotheses)
-    converged = [False] * len(current)
+    return on_threads(lambda h: _refitted(problem, h, wide, alternations), hypotheses)
+
+
+def _refitted(problem: LikelihoodProblem, h: Hypothesis, wide: bool, alternations: int) -> Hypothesis:
+    """The same for one hypothesis."""
+    current = _fitted(problem, h)
     for k in range(alternations + EXTRA_ALTERNATIONS if alternations else 0):
-        moving = [i for i in range(len(current)) if not converged[i]]
-        if not moving:
+        new = _fitted(problem, choose_process_noise(problem, current, wide and k == 0))
+        gain = new.log_likelihood - current.log_likelihood
+        # The whitener may lose a little likelihood between alternations; keep the better of the two.
+        current = new if gain > 0 else current
+        if gain < (1.0 if k + 1 < alternations else EXTRA_ALTERNATION_NATS):
             break
-        chosen = choose_process_noises(problem, [current[i] for i in moving], wide and k == 0)
-        new = levenberg_marquardt(problem, chosen)
-        for i, h in zip(moving, new, strict=True):
-            gain = h.log_likelihood - current[i].log_likelihood
-            # The whitener may lose a little likelihood between alternations; keep the better of the two.
-            current[i] = h if gain > 0 else current[i]
-            converged[i] = gain < (1.0 if k + 1 < alternations else EXTRA_ALTERNATION_NATS)
     return current
 
 

@@ -7,6 +7,7 @@ beside the model as it is and beside each of its members alone.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -35,6 +36,7 @@ from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
 from rotflex_jax.discover.verdict import NATS_PER_SAMPLE, NEAR_FLOOR
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.runtime.xla import on_threads
 
 # Candidates of which pairs are scored, and pairs that are refitted: the best, and those that gain most beyond
 # what their members promise alone.
@@ -130,13 +132,17 @@ def validated_pairs(
         grown = refit_pairs(problem, beside.hypothesis, [a.starts for a, _ in pairs])
     runs = refit_pairs(runs_problem, beside.free_run.hypothesis, [b.starts for _, b in pairs])
     runs = refit_near_predictions(runs_problem, runs, grown)
-    found: dict[Pair, ValidatedHypothesis] = {}
-    for h, f, (score, _) in zip(grown, runs, pairs, strict=True):
-        if all(is_plausible(x, p) for x in (h, f) for p in score.locations if p in x.locations):
-            count = sum(parameter_count(problem.supermodel, h, p) for p in score.locations)
-            v = horizons.validated(h, f, beside)
-            found[score.locations] = dataclasses.replace(v, parameter_count=count)
-    return found
+    plausible = [
+        (h, f, score.locations)
+        for h, f, (score, _) in zip(grown, runs, pairs, strict=True)
+        if all(is_plausible(x, p) for x in (h, f) for p in score.locations if p in x.locations)
+    ]
+    found = horizons.all_validated([(h, f) for h, f, _ in plausible], beside)
+    count = functools.partial(parameter_count, problem.supermodel)
+    return {
+        pair: dataclasses.replace(v, parameter_count=sum(count(h, p) for p in pair))
+        for v, (h, _, pair) in zip(found, plausible, strict=True)
+    }
 
 
 def pairs_passed_by(
@@ -175,10 +181,10 @@ def pairs_passed_by(
         return [], []
     say("pairs of the start that were not found: " + ", ".join(_named(a.locations) for a, _ in others))
     grown = refit_pairs(horizons.prediction.problem, beside.hypothesis, [a.starts for a, _ in others])
+    predictions = on_threads(lambda h: validate(horizons.prediction.validation, h, beside), grown)
     tried: dict[Pair, ValidatedHypothesis] = {}
-    for h, scores in zip(grown, others, strict=True):
+    for h, v, scores in zip(grown, predictions, others, strict=True):
         pair = scores[0].locations
-        v = validate(horizons.prediction.validation, h, beside)
         if not predictions_apart(found, v):
             tried |= validated_pairs(horizons, beside, [scores], is_plausible, [h])
         # One whose predictions are worse beyond doubt needs no fit to free runs, whatever they say. It has no
@@ -273,14 +279,13 @@ def _without(
 ) -> ValidatedHypothesis:
     """A model less one effect, refitted and validated at both horizons."""
     assert found.free_run
-    fits = []
-    for horizon, h in (
-        (horizons.prediction, found.hypothesis),
-        (horizons.free_run, found.free_run.hypothesis),
-    ):
-        less = without(horizon.problem.supermodel, h, location)
-        fits.append(refit(horizon.problem, [less])[0])
-    return horizons.validated(fits[0], fits[1], current)
+    s = horizons.prediction.problem.supermodel
+    at = (
+        (horizons.prediction.problem, without(s, found.hypothesis, location)),
+        (horizons.free_run.problem, without(s, found.free_run.hypothesis, location)),
+    )
+    prediction, runs = on_threads(lambda one: refit(one[0], [one[1]])[0], at)
+    return horizons.validated(prediction, runs, current)
 
 
 def _rivals(pair: Pair, able: dict[Pair, ValidatedHypothesis]) -> dict[EffectLocation, list[EffectLocation]]:

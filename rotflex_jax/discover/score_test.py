@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.batched_predictor import ParameterSet, on_threads
+from rotflex_jax.discover.batched_predictor import ParameterSet
 from rotflex_jax.discover.candidate_slopes import MOST_LINES, Slopes, candidate_sensitivities
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
@@ -23,6 +23,7 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.coordinates import FitCoordinates, Projection
 from rotflex_jax.latent.in_time import periodic_torques
 from rotflex_jax.runtime.persistent_jit import make_ahead
+from rotflex_jax.runtime.xla import on_threads
 
 # An effect that can gain this much (chi-square) is found about every other time: both the training and
 # the validation data must have their share of it.

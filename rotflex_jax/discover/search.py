@@ -51,7 +51,7 @@ from rotflex_jax.models.model import Model, program_length
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, listed
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches, loaded_ahead
-from rotflex_jax.runtime.xla import one_thread
+from rotflex_jax.runtime.xla import on_threads, one_thread
 
 
 @one_thread
@@ -325,8 +325,5 @@ def _left_out(state: SearchState, needed: Eliminated) -> list[ValidatedHypothesi
     if state.validation.folds:  # a fit for each recording, for a comparison that decides nothing
         return []
     known = {effects(v.hypothesis.locations) for v in state.tried}
-    return [
-        validate(state.validation, h, state.current)
-        for h in needed.without
-        if effects(h.locations) not in known
-    ]
+    unknown = [h for h in needed.without if effects(h.locations) not in known]
+    return on_threads(lambda h: validate(state.validation, h, state.current), unknown)

@@ -49,6 +49,7 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.runtime.persistent_jit import make_ahead
+from rotflex_jax.runtime.xla import on_threads
 
 
 def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
@@ -330,7 +331,7 @@ def remaining_rivals(
     for p, r in pairs:
         start = CandidateStart(r, np.array(s.candidates[r].probes[0]).max(axis=0))
         swapped.append(with_effect(s, without(s, final.hypothesis, p), start, 0.4))
-    validated = [validate(validation, h) for h in refit(problem, swapped)]
+    validated = on_threads(lambda h: validate(validation, h), refit(problem, swapped))
     alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(final, t)}
     left = {p: [r for r in remaining[p] if (p, r) in alike or CATALOG[r.effect].line] for p in found}
     return RemainingRivals(left, validated)

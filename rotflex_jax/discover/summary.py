@@ -49,6 +49,7 @@ from rotflex_jax.effects import CATALOG, ChannelDelay, SensorBias
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.fit.plausibility import BEYOND_RECORDINGS, Remark, at_bounds, beyond_recordings
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import on_threads
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,12 +91,14 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
     evaluation = evaluation.with_built_in(every)
     built = dataclasses.replace(validation, built_in=every)
     near = state.at(reported, state.current)
-    validated = [validate(validation, h, near) for h in models]
-    stages = []
-    for k, v in enumerate(validated):
-        stage = evaluate(problem, built, model.solver, v, order[:k])
-        stage = _with_process_noise(state, stage, v.hypothesis)
-        stages.append(evaluation.of_stage(stage, v, order[:k]))
+    validated = on_threads(lambda h: validate(validation, h, near), models)
+
+    def stage(k: int) -> Stage:
+        found = evaluate(problem, built, model.solver, validated[k], order[:k])
+        found = _with_process_noise(state, found, validated[k].hypothesis)
+        return evaluation.of_stage(found, validated[k], order[:k])
+
+    stages = on_threads(stage, range(len(models)))
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
     longest, channels = max((*train, *held_back), key=lambda r: r.N), model.mechanism.channels
     seconds, noise = validation.window_seconds, problem.noise

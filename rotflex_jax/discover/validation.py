@@ -22,6 +22,7 @@ from rotflex_jax.fit.dataset import Dataset, Windows
 from rotflex_jax.metrics import window_starts, windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
+from rotflex_jax.runtime.xla import on_threads
 
 # Of the fit of a window's first state to a few samples, which determine it well: hardly damped.
 FIRST_STATE_RULES = Rules(enough_share=1e-9, damping=1e-6, least=1e-6)
@@ -467,6 +468,12 @@ class Horizons:
         runs = validate(self.free_run.validation, free_run, near.free_run if near else None)
         found = validate(self.prediction.validation, prediction, near, runs.adapted)
         return dataclasses.replace(found, free_run=runs)
+
+    def all_validated(
+        self, fits: Sequence[tuple[Hypothesis, Hypothesis]], near: ValidatedHypothesis | None = None
+    ) -> list[ValidatedHypothesis]:
+        """Several structures side by side, each by its fits to predictions and to free runs."""
+        return on_threads(lambda fit: self.validated(fit[0], fit[1], near), fits)
 
 
 def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:

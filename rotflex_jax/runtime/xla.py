@@ -9,6 +9,7 @@ import functools
 import os
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -163,6 +164,7 @@ def double_precision() -> contextlib.AbstractContextManager:
 
 
 Parameters = ParamSpec("Parameters")
+Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
@@ -180,6 +182,43 @@ def one_thread(function: Callable[Parameters, Result]) -> Callable[Parameters, R
 def cores() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def on_threads(run: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+    """Results of independent calls, on as many threads as there are cores.
+
+    A scan keeps one core busy; compiled code runs outside of Python's lock. Where one call fails, those that
+    have begun end before its error is raised. Calls from within a call follow one another on its thread: all
+    threads may be busy with such calls.
+
+    Args:
+        run: What to call; no two calls may run a program that spreads over devices. What several calls need
+            to be compiled is compiled once, by the first of them.
+        jobs: Its arguments.
+    """
+    if len(jobs) <= 1 or getattr(_own, "busy", False):
+        return [run(job) for job in jobs]
+    settings = np.geterr()  # a thread has its own
+
+    def on_thread(job: Job) -> Result:
+        _own.busy = True
+        with np.errstate(**settings):
+            return run(job)
+
+    begun = [_threads().submit(on_thread, job) for job in jobs]
+    try:
+        return [each.result() for each in begun]
+    finally:
+        wait([each for each in begun if not each.cancel()])
+
+
+# Of each thread: whether it is one of those below.
+_own = threading.local()
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cores())
 
 
 def bind_to_cores(place: int, of: int) -> None:

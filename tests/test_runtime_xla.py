@@ -1,0 +1,52 @@
+"""Calls side by side on threads."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from rotflex_jax.runtime.xla import cores, on_threads
+
+
+def test_results_come_in_the_order_of_the_jobs():
+    assert on_threads(lambda x: x**2, range(50)) == [x**2 for x in range(50)]
+    assert on_threads(lambda x: x, []) == []
+
+
+def test_calls_from_within_calls_end_though_all_threads_are_busy():
+    """Each outer call waits for its inner ones: these must not wait for a thread that an outer one holds."""
+    found = []
+
+    def outer(k):
+        return sum(on_threads(lambda x: k * x, range(10)))
+
+    def several():
+        found.extend(on_threads(outer, range(4 * cores())))
+
+    # Not on the threads themselves: where they wait for ever, the test fails instead of hanging.
+    caller = threading.Thread(target=several, daemon=True)
+    caller.start()
+    caller.join(timeout=30)
+    assert found == [45 * k for k in range(4 * cores())]
+
+
+def test_an_error_is_raised_once_what_has_begun_has_ended():
+    begun, ended = [], []
+
+    def run(k):
+        begun.append(k)
+        if k == 0:
+            raise ZeroDivisionError("first")
+        ended.append(k)
+
+    with pytest.raises(ZeroDivisionError, match="first"):
+        on_threads(run, range(100))
+    assert sorted(ended) == sorted(k for k in begun if k)
+
+
+def test_threads_take_numpys_settings_for_errors_from_the_caller():
+    zeros = [np.zeros(1)] * 3
+    with np.errstate(divide="raise"), pytest.raises(FloatingPointError):
+        on_threads(lambda x: 1.0 / x, zeros)
+    with np.errstate(divide="ignore"):
+        assert all(np.isinf(x[0]) for x in on_threads(lambda x: 1.0 / x, zeros))
