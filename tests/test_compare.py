@@ -301,7 +301,7 @@ def test_least_squares_finds_the_equation_behind_clean_data() -> None:
     table = rf.compare(record, [ARX(orders=(1, 2))])
     assert table["arx"].note == "order 2"
     assert table["arx"].rmse["theta"] < 1e-9
-    with pytest.raises(rf.InputError, match="takes the signal 'wind' beside the input"):
+    with pytest.raises(rf.InputError, match="signal 'wind' is needed, but the recording has none"):
         found.simulate(record.with_signals({}))
 
 

@@ -12,6 +12,7 @@ from rotflex_jax.basis.bank import Averages
 from rotflex_jax.compare import ARX, AdaptiveSeries, BatchSeries, LinearStateSpace, Subspace
 from rotflex_jax.compare.linear_models import refined, subspace
 from rotflex_jax.compare.series import bank_outputs, monomials
+from rotflex_jax.models.linear_system import LinearSystem
 from rotflex_jax.recording import Recording
 
 Ts = 0.01
@@ -33,6 +34,64 @@ def driven(seconds: float = 20.0, noise: float = 0.01, seed: int = 0, integrates
         first = Ts * np.cumsum(first)
     y = np.column_stack([first, last]) + noise * rng.normal(size=(len(u), 2)) * [first.std(), last.std()]
     return Recording(u=u, y=y, Ts=Ts, n_init=40)
+
+
+def driven_by_two(seconds: float = 20.0, noise: float = 0.01) -> Recording:
+    """The same system on a base that moves: from there to each output goes a filter of the same poles."""
+    record, rng = driven(seconds, noise=0.0), np.random.default_rng(1)
+    base = scipy.signal.lfilter([0.2], [1.0, -0.8], rng.normal(size=record.N))
+    first = scipy.signal.lfilter([0.0, 0.03, -0.02], np.poly(POLES[:2]).real, base)
+    y = record.y + np.column_stack([first, scipy.signal.lfilter([0.0, -0.2], [1.0, -0.9], base)])
+    y += noise * rng.normal(size=y.shape) * y.std(axis=0)
+    return dataclasses.replace(record, y=y).with_signals({"base [m/s^2]": base})
+
+
+def response(system: LinearSystem, frequencies: np.ndarray, column: int) -> np.ndarray:
+    """From one input to all outputs, from the matrices."""
+    z, one = np.exp(1j * frequencies), np.eye(system.order)
+    B, D = system.B[:, column], system.D[:, column]
+    return np.array([system.C @ np.linalg.solve(x * one - system.A, B) + D for x in z])
+
+
+@pytest.mark.parametrize("way", ["subspace", "fitted to free runs"])
+def test_a_signal_is_a_second_input(way: str) -> None:
+    record = driven_by_two(noise=1e-6)
+    system = subspace([record], 20, (4,))[4]  # the lag has a state for each output: two inputs, two gains
+    if way != "subspace":
+        system = refined(system, [record])
+    assert system.signals == ("base [m/s^2]",)
+    frequencies = np.linspace(0.01, 2.0, 20)
+    z, resonance = np.exp(-1j * frequencies), np.poly(POLES[:2]).real
+    lag, swinging = 1 - 0.9 * z, np.polyval(resonance[::-1], z)
+    from_input = np.column_stack([(0.01 * z + 0.02 * z**2) * 0.1 / (swinging * lag), 0.1 * z / lag])
+    from_base = np.column_stack([(0.03 * z - 0.02 * z**2) / swinging, -0.2 * z / lag])
+    for column, expected in enumerate((from_input, from_base)):
+        found = response(system, frequencies, column)
+        np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_a_linear_system_says_which_signal_a_recording_lacks() -> None:
+    system = subspace([driven_by_two()], 20, (4,))[4]
+    with pytest.raises(rf.InputError, match=r"signal 'base \[m/s\^2\]' is needed.* has 'wind \[m/s\]';"):
+        system.simulate(driven().with_signals({"wind [m/s]": driven().u}))
+
+
+def test_linear_methods_compare_with_the_signals_that_recordings_have() -> None:
+    record, methods = driven_by_two(), [Subspace(), LinearStateSpace()]
+    with_it, without = rf.compare(record, methods), rf.compare(record.with_signals({}), methods)
+    for name in ("subspace", "state_space"):
+        for channel, y in zip(record.channels, record.y.T, strict=True):
+            assert with_it[name].rmse[channel] < 0.03 * y.std()
+            assert without[name].rmse[channel] > 0.2 * y.std()
+
+
+def test_parameters_of_a_linear_model_with_a_signal_are_counted_once() -> None:
+    """Two outputs, two inputs: the gains of each input, offsets, and what the modes have."""
+    record, model = driven_by_two(), rf.Model(rf.joints.paper())
+    of_subspace = Subspace(orders=(4,)).fit(model, [record], quiet)
+    assert of_subspace.parameters == 4 * (2 + 2) + 2 * 2 + 2  # n (C + m) + C m + C: in any coordinates
+    of_poles = LinearStateSpace(orders=(4,)).fit(model, [record], quiet)
+    assert of_poles.parameters == 4 * (2 * 2 + 1) + 2 * 2 + 2  # a pole, and a residue for each way through it
 
 
 def test_the_subspace_method_finds_the_poles_that_scipy_simulated() -> None:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from rotflex_jax.compare.method import (
     Fitted,
     Progress,
+    common_signals,
     require_one_sampling_period,
     split_for_validation,
     validation_cost,
@@ -46,28 +47,15 @@ class DifferenceEquation:
         n, C, y = self.order, len(self.B), recording.y.astype(float)
         ahead = (
             _lags(y, n) @ self.A.reshape(C, -1).T
-            + _lags(self._inputs(recording), n) @ self.B.reshape(C, -1).T
+            + _lags(recording.inputs(self.signals).astype(float), n) @ self.B.reshape(C, -1).T
         )
         return np.concatenate([y[:n], ahead])
-
-    def _inputs(self, recording: Recording) -> Float[np.ndarray, "N m"]:
-        """The inputs of a recording.
-
-        Raises:
-            InputError: It lacks a signal.
-        """
-        if missing := [name for name in self.signals if name not in recording.signals]:
-            raise InputError(
-                f"The equation takes the signal {missing[0]!r} beside the input, but the recording lacks it; "
-                "give a recording that has it."
-            )
-        return recording.inputs(self.signals).astype(float)
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """Free run: the first `n_init` samples as measured, from there on its own outputs.
 
         Raises:
-            InputError: Its order exceeds `n_init`, or the sampling period is another one.
+            InputError: Its order exceeds `n_init`, the sampling period is another, or a signal is missing.
         """
         n, m, N = self.order, recording.n_init, recording.N
         if n > m:
@@ -82,7 +70,7 @@ class DifferenceEquation:
             )
         out = np.zeros((N, len(self.B)))
         out[:m] = recording.y[:m]
-        lags = _lags(self._inputs(recording), n)
+        lags = _lags(recording.inputs(self.signals).astype(float), n)
         # An unstable equation overflows; the evaluation of the run reports it.
         with np.errstate(all="ignore"):
             driven = lags @ self.B.reshape(len(self.B), -1).T  # row k - n drives sample k
@@ -142,7 +130,7 @@ def fit_difference_equation(recordings: Sequence[Recording], order: int) -> Diff
         order: Past samples that the equation uses.
     """
     C = recordings[0].y.shape[1]
-    signals = tuple(name for name in recordings[0].signals if all(name in r.signals for r in recordings))
+    signals = common_signals(recordings)
     rows, targets = [], []
     for r in recordings:
         y = r.y.astype(float)

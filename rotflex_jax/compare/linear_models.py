@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from rotflex_jax.compare.method import (
     Fitted,
     Progress,
+    common_signals,
     require_one_sampling_period,
     split_for_validation,
     validation_cost,
@@ -27,7 +28,8 @@ class Subspace:
 
     Order and length of the past are those with the best free run over the last part of the training
     recordings. Not for coarse sensors at a high sampling rate alone: the regression minimises the
-    error of the next sample, and `LinearStateSpace` goes on from here to the free run.
+    error of the next sample, and `LinearStateSpace` goes on from here to the free run. Signals that all
+    recordings have are further inputs.
 
     Source: A. Chiuso, The role of vector autoregressive modeling in predictor-based subspace
     identification, Automatica 43, 2007 (PBSIDopt).
@@ -53,9 +55,9 @@ class Subspace:
 
 
 def free_numbers(system: LinearSystem) -> int:
-    """Numbers of the behaviour from input to outputs, offsets included, whatever the coordinates."""
-    n, C = system.order, len(system.C)
-    return n * (C + 1) + 2 * C
+    """Numbers of the behaviour from inputs to outputs, offsets included, whatever the coordinates."""
+    C, columns = system.D.shape
+    return system.order * (C + columns - 1) + C * columns
 
 
 def chosen_system(
@@ -82,6 +84,8 @@ def subspace(recordings: Sequence[Recording], past: int, orders: Sequence[int]) 
         y[k] = sum over i of M_i z[k-i] + D [u[k], 1] + e[k],  z = (u, y),
         M_i = C (A - K C)^(i-1) [B - K D, K]
 
+    with the m inputs u: the input, and the signals that all recordings have.
+
     The M_i of a long regression, stacked as an observability matrix times the past, have the states as
     their strongest right singular vectors; with these the system is a linear regression.
 
@@ -90,32 +94,36 @@ def subspace(recordings: Sequence[Recording], past: int, orders: Sequence[int]) 
         past: Samples that the regression looks back.
         orders: Numbers of states; those beyond what the data carry are left out.
     """
-    mean, size = _sizes(recordings)
+    signals = common_signals(recordings)
+    m = 1 + len(signals)
+    columns = [np.column_stack([r.inputs(signals), r.y]).astype(float) for r in recordings]
+    mean, size = _sizes(columns)
     Z, Y, U, ends = [], [], [], []
-    for r in recordings:
-        z = (np.column_stack([r.u, r.y]).astype(float) - mean) / size
-        lags = np.lib.stride_tricks.sliding_window_view(z, past, axis=0)[:-1]  # (N - p, 1 + C, p)
+    for values in columns:
+        z = (values - mean) / size
+        lags = np.lib.stride_tricks.sliding_window_view(z, past, axis=0)[:-1]  # (N - p, m + C, p)
         Z.append(np.swapaxes(lags, 1, 2)[:, ::-1].reshape(len(z) - past, -1))  # newest first
-        Y.append(z[past:, 1:])
-        U.append(np.column_stack([z[past:, 0], np.ones(len(z) - past)]))
+        Y.append(z[past:, m:])
+        U.append(np.column_stack([z[past:, :m], np.ones(len(z) - past)]))
         ends.append(len(z) - past)
     Ys = np.vstack(Y)
     C, P = Ys.shape[1], Z[0].shape[1]
     # All that follows needs only the triangular factor of the rows, which is small.
     R = factor(np.hstack([np.vstack(Z), np.vstack(U), Ys]))
-    M = np.linalg.lstsq(R[:, : P + 2], R[:, P + 2 :], rcond=1e-10)[0][:P].T.reshape(C, past, 1 + C)
+    known = P + m + 1
+    M = np.linalg.lstsq(R[:, :known], R[:, known:], rcond=1e-10)[0][:P].T.reshape(C, past, m + C)
     # Rows of block i predict i samples ahead from what is known now: the newest i lags have left.
-    stacked = np.zeros((past, C, past, 1 + C))
+    stacked = np.zeros((past, C, past, m + C))
     for i in range(past):
         stacked[i, :, : past - i] = M[:, i:]
-    stacked = stacked.reshape(past * C, past * (1 + C))
+    stacked = stacked.reshape(past * C, past * (m + C))
     RZ = R[:P, :P]
     _, s, V = np.linalg.svd(stacked @ RZ.T, full_matrices=False)
     states = np.linalg.lstsq(RZ, np.eye(P), rcond=1e-12)[0]
     found = {}
     for n in (n for n in orders if n <= min(len(s), past * C) and s[n - 1] > 1e-12 * s[0]):
         T = (states @ V[:n].T) * np.sqrt(s[:n])
-        found[n] = _system([z @ T for z in Z], Y, U, mean, size, recordings[0].Ts)
+        found[n] = _system([z @ T for z in Z], Y, U, mean, size, recordings[0].Ts, signals)
     return found
 
 
@@ -126,9 +134,10 @@ def _system(
     mean: np.ndarray,
     size: np.ndarray,
     Ts: float,
+    signals: tuple[str, ...],
 ) -> LinearSystem:
     """The system with given states, by two regressions; in the units of the data."""
-    n = X[0].shape[1]
+    n, m = X[0].shape[1], 1 + len(signals)
     x, y, u = np.vstack(X), np.vstack(Y), np.vstack(U)
     CD = _regression(np.hstack([x, u]), y)
     C, D = CD[:, :n], CD[:, n:]
@@ -136,13 +145,17 @@ def _system(
     now = np.vstack([np.hstack([xi, ui, ei])[:-1] for xi, ui, ei in zip(X, U, e, strict=True)])
     nxt = np.vstack([xi[1:] for xi in X])
     ABK = _regression(now, nxt)
-    A, B, K = ABK[:, :n], ABK[:, n : n + 2], ABK[:, n + 2 :]
-    su, sy = size[0], size[1:]
-    # Back from numbers about their means and of size one.
-    B = np.column_stack([B[:, 0] / su, B[:, 1] - B[:, 0] * mean[0] / su])
-    D = np.column_stack([D[:, 0] / su, D[:, 1] - D[:, 0] * mean[0] / su]) * sy[:, None]
-    D[:, 1] += mean[1:]
-    return LinearSystem(A, B, C * sy[:, None], D, K / sy, Ts)
+    A, B, K = ABK[:, :n], ABK[:, n : n + m + 1], ABK[:, n + m + 1 :]
+    sy = size[m:]
+
+    def of_inputs(w: np.ndarray) -> np.ndarray:
+        """Columns of inputs and constant, from those of inputs about their means and of size one."""
+        columns = w[:, :m] / size[:m]
+        return np.column_stack([columns, w[:, m] - columns @ mean[:m]])
+
+    B, D = of_inputs(B), of_inputs(D) * sy[:, None]
+    D[:, m] += mean[m:]
+    return LinearSystem(A, B, C * sy[:, None], D, K / sy, Ts, signals)
 
 
 def _regression(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -152,9 +165,9 @@ def _regression(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(R[:, :P], R[:, P:], rcond=None)[0].T
 
 
-def _sizes(recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the input and the outputs."""
-    z = np.vstack([np.column_stack([r.u, r.y]) for r in recordings]).astype(float)
+def _sizes(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of each column of several recordings."""
+    z = np.vstack(columns)
     size = z.std(axis=0)
     return z.mean(axis=0), np.where(size > 0, size, 1.0)
 
@@ -171,41 +184,53 @@ LOG_COST_TOLERANCE = 1e-6
 class Modes:
     """A sum of modes and an offset.
 
-        x_i+ = p_i x_i + u,  x_i[0] = xi_ir in recording r,    y_c = offset_c + sum over i of Re(g_ci x_i)
+        x_i+ = p_i x_i + u_i,  x_i[0] = xi_ir in recording r,    y_c = offset_c + sum over i of Re(g_ci x_i)
+
+    Each of the m inputs (the input, then the signals) drives modes of its own, of the same n poles: they come
+    first of the input, then of each signal, S = m n in all.
 
     Attributes:
-        p: Poles (n,), one of each pair.
-        g: Residues (C, n), real where the pole is.
-        offset: (C,).
-        xi: First states (R, n), real where the pole is.
+        p: Poles of the modes, one of each pair.
+        g: Residues, real where the pole is.
+        offset: Of each channel.
+        xi: First states, real where the pole is.
+        signals: Names of the signals.
     """
 
-    p: Complex[np.ndarray, " n"]
-    g: Complex[np.ndarray, "C n"]
+    p: Complex[np.ndarray, " S"]
+    g: Complex[np.ndarray, "C S"]
     offset: Float[np.ndarray, " C"]
-    xi: Complex[np.ndarray, "R n"]
+    xi: Complex[np.ndarray, "R S"]
+    signals: tuple[str, ...] = ()
 
     @classmethod
     def begun(cls, poles: Sequence[complex], recordings: Sequence[Recording]) -> "Modes":
         """Residues and first states for given poles, by least squares one after the other."""
-        p = np.array(poles, complex)
-        n, R, C = len(p), len(recordings), recordings[0].y.shape[1]
+        signals = common_signals(recordings)
+        p = np.tile(np.array(poles, complex), 1 + len(signals))
+        S, R, C = len(p), len(recordings), recordings[0].y.shape[1]
         y = np.concatenate([r.y for r in recordings]).astype(float)
-        empty = cls(p, np.zeros((C, n), complex), np.zeros(C), np.zeros((R, n), complex))
+        empty = cls(p, np.zeros((C, S), complex), np.zeros(C), np.zeros((R, S), complex), signals)
         forced, free = empty._forced(recordings), empty._free(recordings)
-        columns = [_pair(forced), np.ones((len(y), 1)), _by_recording(_pair(free), recordings)]
+        of_poles = _pair(free[:, : len(poles)])  # those of the other inputs are the same
+        columns = [_pair(forced), np.ones((len(y), 1)), _by_recording(of_poles, recordings)]
         W = _least_norm(np.hstack(columns), y)
-        g = _complex(W[: 2 * n].T, p)
+        g = _complex(W[: 2 * S].T, p)
         # With the residues known, one first state serves all channels.
-        e = y - np.stack([(forced @ g_c).real for g_c in g], axis=1) - W[2 * n]
+        e = y - np.stack([(forced @ g_c).real for g_c in g], axis=1) - W[2 * S]
         size = np.maximum(y.std(axis=0), 1e-300)
         rows = [_by_recording(_pair(free * g_c), recordings) / s for g_c, s in zip(g, size, strict=True)]
-        xi = _least_norm(np.vstack(rows), (e / size).T.reshape(-1, 1))[:, 0].reshape(R, 2 * n)
-        return dataclasses.replace(empty, g=g, offset=W[2 * n], xi=_complex(xi, p))
+        xi = _least_norm(np.vstack(rows), (e / size).T.reshape(-1, 1))[:, 0].reshape(R, 2 * S)
+        return dataclasses.replace(empty, g=g, offset=W[2 * S], xi=_complex(xi, p))
+
+    @property
+    def poles(self) -> int:
+        """How many poles there are, which the modes of all inputs share."""
+        return len(self.p) // (1 + len(self.signals))
 
     def fitted(self, recordings: Sequence[Recording], max_steps: int) -> "Modes":
         """The modes with the least `sum over channels of N/2 log mean e^2` of free runs."""
-        n = len(self.p)
+        n, S = self.poles, len(self.p)
 
         def cost(modes: Modes) -> float:
             with np.errstate(all="ignore"):
@@ -219,7 +244,7 @@ class Modes:
             equations = NormalEquations.of(J.reshape(-1, J.shape[2]), (e / size).ravel())
             return equations._replace(costs=np.array([_log_cost(e)]))
 
-        limit = np.full(2 * n * (1 + len(self.g) + len(self.xi)) + len(self.g), np.inf)
+        limit = np.full(2 * n + 2 * S * (len(self.g) + len(self.xi)) + len(self.g), np.inf)
         limit[: 2 * n] = LARGEST_POLE_STEP
         rules = Rules(enough=LOG_COST_TOLERANCE / 2 * sum(r.N for r in recordings))
         return minimise(
@@ -233,22 +258,25 @@ class Modes:
             np.array([[p.real]]) if r else np.array([[p.real, -p.imag], [p.imag, p.real]])
             for p, r in zip(self.p, real, strict=True)
         ]
-        B = np.concatenate([[1.0] if r else [1.0, 0.0] for r in real])
+        driven = np.concatenate([[1.0] if r else [1.0, 0.0] for r in real])
+        size = sum(len(b) for b in blocks[: self.poles])
+        B = _block_diagonal(*[part[:, None] for part in np.split(driven, len(driven) // size)])
         C = np.column_stack(
             [c for g, r in zip(self.g.T, real, strict=True) for c in ([g.real] if r else [g.real, -g.imag])]
         )
-        zero = np.zeros_like(self.offset)
         return LinearSystem(
             _block_diagonal(*blocks),
             np.column_stack([B, np.zeros(len(B))]),
             C,
-            np.column_stack([zero, self.offset]),
+            np.column_stack([np.zeros((len(C), B.shape[1])), self.offset]),
             np.zeros((len(B), len(C))),
             Ts,
+            self.signals,
         )
 
     def _forced(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
-        return np.vstack([_filtered(self.p, r.u.astype(complex)[:, None]) for r in recordings])
+        each = (np.repeat(r.inputs(self.signals).astype(complex), self.poles, axis=1) for r in recordings)
+        return np.vstack([_filtered(self.p, u) for u in each])
 
     def _free(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
         return np.vstack(
@@ -272,21 +300,23 @@ class Modes:
         ends = np.cumsum([r.N for r in recordings])[:-1]
         by_pole = np.vstack([_filtered(self.p, part) for part in np.split(x, ends)])
         decay, angle = -np.log(np.abs(self.p)), np.angle(self.p)
-        C, n, N = len(self.g), len(self.p), len(x)
+        C, S, N = len(self.g), len(self.p), len(x)
         columns = []
         for c in range(C):
             slope = by_pole * self.g[c] * self.p
-            poles = np.concatenate([(slope * -decay).real, (slope * 1j * angle).real], axis=1)
-            residues, offsets = np.zeros((N, 2 * n * C)), np.zeros((N, C))
-            residues[:, 2 * n * c : 2 * n * (c + 1)] = _pair(x)
+            by_mode = np.stack([(slope * -decay).real, (slope * 1j * angle).real], axis=1)
+            poles = by_mode.reshape(N, 2, -1, self.poles).sum(axis=2).reshape(N, -1)
+            residues, offsets = np.zeros((N, 2 * S * C)), np.zeros((N, C))
+            residues[:, 2 * S * c : 2 * S * (c + 1)] = _pair(x)
             offsets[:, c] = 1.0
             starts = _by_recording(_pair(free * self.g[c]), recordings)
             columns.append(np.hstack([poles, residues, offsets, starts]))
         return np.stack(columns, axis=1)
 
     def _moved(self, move: Float[np.ndarray, " P"]) -> "Modes":
-        C, n, R = len(self.g), len(self.p), len(self.xi)
-        a, b, g, offset, xi = np.split(move, np.cumsum([n, n, 2 * n * C, C]))
+        C, n, S, R = len(self.g), self.poles, len(self.p), len(self.xi)
+        a, b, g, offset, xi = np.split(move, np.cumsum([n, n, 2 * S * C, C]))
+        a, b = np.tile(a, S // n), np.tile(b, S // n)
         decay = -np.log(np.abs(self.p)) * np.exp(a)
         angle = np.angle(self.p)
         turned = np.where(np.imag(self.p) == 0, angle, np.clip(angle * np.exp(b), 1e-9, np.pi - 1e-9))
@@ -294,9 +324,10 @@ class Modes:
         p = np.where(np.imag(self.p) == 0, np.sign(np.real(self.p)) * np.abs(p), p)
         return Modes(
             p,
-            self.g + _complex(g.reshape(C, 2 * n), self.p),
+            self.g + _complex(g.reshape(C, 2 * S), self.p),
             self.offset + offset,
-            self.xi + _complex(xi.reshape(R, 2 * n), self.p),
+            self.xi + _complex(xi.reshape(R, 2 * S), self.p),
+            self.signals,
         )
 
 
@@ -348,7 +379,8 @@ class LinearStateSpace:
     """A linear state space whose free run is fitted, begun at the poles of a subspace estimate.
 
     The best that a linear model with so many states can do in free run, whatever its physics. Not
-    where friction sticks for long: the poles then are a mean of two regimes.
+    where friction sticks for long: the poles then are a mean of two regimes. Signals that all recordings have
+    are further inputs, each with modes of its own of the same poles.
 
     Source: L. Ljung, System Identification, 2nd ed., 1999, section 7.3 (output error).
 
@@ -384,7 +416,10 @@ class LinearStateSpace:
             raise RuntimeError("no subspace estimate could be made, the recordings are too short")
         best = min(fitted, key=lambda n: fitted[n][0])
         final = with_gain(refined(fitted[best][1], train), train)
-        return Fitted(final, free_numbers(final), f"order {best}", final.predict)
+        # Poles are shared by the inputs.
+        C, columns = final.D.shape
+        count = best * (C * (columns - 1) + 1) + C * columns
+        return Fitted(final, count, f"order {best}", final.predict)
 
 
 def refined(system: LinearSystem, recordings: Sequence[Recording], max_steps: int = 80) -> LinearSystem:
@@ -392,7 +427,7 @@ def refined(system: LinearSystem, recordings: Sequence[Recording], max_steps: in
 
         minimise  sum over channels of N log sum (y_c - y_hat_c)^2
 
-    over poles, residues, offsets and first states. With one input a mode is `x+ = p x + u`, whose
+    over poles, residues, offsets and first states. A mode of one input is `x+ = p x + u`, whose
     derivative by its pole is the same filter once more, so that a step costs a few filters.
 
     Args:

@@ -17,19 +17,21 @@ class LinearSystem:
 
     Attributes:
         A: State matrix.
-        B: Columns of the input and of the constant.
+        B: Columns of the inputs (the input, then the signals) and of the constant.
         C: Output matrix.
-        D: Columns of the input and of the constant.
+        D: Columns of the inputs and of the constant.
         K: Gain of the prediction error e.
         Ts: Sampling period it holds for [s].
+        signals: Names of the signals that it takes beside the input.
     """
 
     A: Float[np.ndarray, "n n"]
-    B: Float[np.ndarray, "n 2"]
+    B: Float[np.ndarray, "n k"]
     C: Float[np.ndarray, "C n"]
-    D: Float[np.ndarray, "C 2"]
+    D: Float[np.ndarray, "C k"]
     K: Float[np.ndarray, "n C"]
     Ts: float
+    signals: tuple[str, ...] = ()
 
     @property
     def order(self) -> int:
@@ -42,12 +44,16 @@ class LinearSystem:
         return np.linalg.eigvals(self.A)
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """Free run; the first state is the one that follows the first `n_init` samples best."""
+        """Free run; the first state is the one that follows the first `n_init` samples best.
+
+        Raises:
+            InputError: The sampling period is another one, or the recording lacks a signal.
+        """
         with np.errstate(all="ignore"):  # an unstable system overflows
             return self._run(recording, self.start(recording), np.zeros_like(self.K))
 
     def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """One step ahead: every sample from all before it."""
+        """One step ahead: every sample from all before it; errors as in a free run."""
         with np.errstate(all="ignore"):
             return self._run(recording, self.start(recording), self.K)
 
@@ -75,7 +81,7 @@ class LinearSystem:
 
     def _run(self, recording: Recording, x: np.ndarray, K: np.ndarray) -> np.ndarray:
         y = recording.y.astype(float)
-        u = np.stack([recording.u.astype(float), np.ones(recording.N)], axis=1)
+        u = np.column_stack([recording.inputs(self.signals).astype(float), np.ones(recording.N)])
         forcing, through = u @ self.B.T, u @ self.D.T
         out = np.empty((recording.N, len(self.C)))
         correct = bool(K.any())

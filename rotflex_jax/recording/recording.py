@@ -192,7 +192,18 @@ class Recording:
         return self.N * self.Ts
 
     def inputs(self, signals: Iterable[str]) -> Float[np.ndarray, "N m"]:
-        """The input, and beside it some of the signals, in columns."""
+        """The input, and beside it some of the signals, in columns.
+
+        Raises:
+            InputError: The recording lacks one of them.
+        """
+        signals = tuple(signals)
+        if missing := [name for name in signals if name not in self.signals]:
+            has = ", ".join(map(repr, self.signals)) or "none"
+            raise InputError(
+                f"The signal {missing[0]!r} is needed, but the recording has {has}; give one that has it, or "
+                "add it by `recording.with_signals`."
+            )
         return np.column_stack([self.u, *(self.signals[name] for name in signals)])
 
     def channel(self, name: str) -> Float[np.ndarray, " N"]:
