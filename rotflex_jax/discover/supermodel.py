@@ -15,7 +15,7 @@ from jaxtyping import Float, Shaped
 
 from rotflex_jax.checks import entries, shown
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.base import SIGNAL_MARK, Effect, Scale
+from rotflex_jax.effects.base import Effect, Scale, driven_place
 from rotflex_jax.effects.labels import law_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.plausibility import motion
@@ -69,7 +69,7 @@ def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict
         out[port] = Scale(voltage, max(speed, 1e-6), max(position, 1e-6), torque, stiffness, inertia)
         for name in mechanism.signals:
             size = float(np.sqrt(np.mean(np.concatenate([r.signals[name] for r in recordings]) ** 2)))
-            out[f"{port}{SIGNAL_MARK}{name}"] = dataclasses.replace(out[port], signal=max(size, 1e-12))
+            out[driven_place(port, name)] = dataclasses.replace(out[port], signal=max(size, 1e-12))
     whole = Scale(voltage, 1.0, 1.0, torque)
     for channel in mechanism.channels:
         y = np.concatenate([model.measured(r)[:, mechanism.channels.index(channel)] for r in recordings])

@@ -35,9 +35,24 @@ Drive = Literal["voltage", "motor", "current", "duty"]
 Domain = Literal["port", "input", "channel", "signal"]
 Beside = Literal["nothing", "other", "states"]
 StatePart = Literal["linear", "rotor", "memory"]
-SIGNAL_MARK = ": "
-"""Between a port and the signal that drives an effect there."""
 EffectType = TypeVar("EffectType", bound="Effect")
+# Between a port and the signal that drives an effect there.
+_SIGNAL_MARK = ": "
+
+
+def driven_place(port: str, signal: str) -> str:
+    """The place of an effect that a signal drives at a port.
+
+    >>> port_and_signal(driven_place("arm", "base [m/s^2]"))
+    ('arm', 'base [m/s^2]')
+    """
+    return f"{port}{_SIGNAL_MARK}{signal}"
+
+
+def port_and_signal(place: str) -> tuple[str, str]:
+    """Port and signal of such a place; the signal of another one is empty."""
+    port, _, signal = place.partition(_SIGNAL_MARK)
+    return port, signal
 
 
 class Stamp(NamedTuple):
@@ -212,7 +227,7 @@ class Effect(abc.ABC):
     @property
     def port(self) -> str:
         """The place where it acts, without the signal that drives it."""
-        return self.at.partition(SIGNAL_MARK)[0] if self.acts_on == "signal" else self.at
+        return port_and_signal(self.at)[0] if self.acts_on == "signal" else self.at
 
     @property
     def acts_at_port(self) -> bool:
@@ -232,7 +247,7 @@ class Effect(abc.ABC):
     @property
     def signal(self) -> str:
         """The measured signal that drives it in the place of the voltage; empty for most."""
-        return self.at.partition(SIGNAL_MARK)[2] if self.acts_on == "signal" else ""
+        return port_and_signal(self.at)[1] if self.acts_on == "signal" else ""
 
     @property
     def values(self) -> dict[str, Any]:

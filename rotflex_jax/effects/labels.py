@@ -2,7 +2,7 @@
 
 import re
 
-from rotflex_jax.effects.base import CATALOG, SIGNAL_MARK
+from rotflex_jax.effects.base import CATALOG, port_and_signal
 from rotflex_jax.recording.samples import name_and_unit
 from rotflex_jax.text.numbers import together
 
@@ -49,9 +49,9 @@ def _placed(effect: str, port: str, article: str, noun: str = "") -> str:
         return noun
     if known is not None and known.acts_on == "channel":
         return f"{noun} of {port}"
-    if known is not None and known.acts_on == "signal" and SIGNAL_MARK in port:
-        port, _, signal = port.partition(SIGNAL_MARK)
-        noun = name_and_unit(signal)[0]
+    if known is not None and known.acts_on == "signal":
+        port, signal = port_and_signal(port)
+        noun = name_and_unit(signal)[0] or noun
     return f"{noun} at {article}{port}"
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
-from rotflex_jax.effects.base import SIGNAL_MARK, Domain, Force, Probe, Scalar, Scale, register
+from rotflex_jax.effects.base import Domain, Force, Probe, Scalar, Scale, driven_place, register
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import parameter
 
@@ -52,7 +52,7 @@ class MeasuredDisturbance(Force):
         if not self.signal:
             raise InputError(
                 f"MeasuredDisturbance was given at={self.at!r}, but it needs a port and the name of a "
-                f'signal; write at="{self.at or "arm"}{SIGNAL_MARK}acceleration of the base [m/s^2]".'
+                f'signal; write at="{driven_place(self.at or "arm", "acceleration of the base [m/s^2]")}".'
             )
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:

@@ -137,7 +137,7 @@ def effect(text: str) -> Any:
     A signal stands behind its port, before the values: `measured_disturbance@arm: wind [N]:gain=0.1`.
     """
     from rotflex_jax.effects import CATALOG
-    from rotflex_jax.effects.base import SIGNAL_MARK
+    from rotflex_jax.effects.base import driven_place
 
     place, _, values = text.partition(":")
     name, separator, port = place.partition("@")
@@ -147,7 +147,7 @@ def effect(text: str) -> Any:
         signal, colon, tail = values.rpartition(":")
         valued = bool(colon) and tail.partition("=")[0].strip() in kind.declared()
         signal, values = (signal, tail) if valued else (values, "")
-        port = f"{port.strip()}{SIGNAL_MARK}{signal.strip()}"
+        port = driven_place(port.strip(), signal.strip())
     if not separator and len(ports) > 1:
         raise InputError(
             f"The effect {name} was given no port, but can act at {', '.join(ports)}; give for "

@@ -5,7 +5,7 @@ import math
 from types import MappingProxyType
 
 from rotflex_jax.effects import CurrentDrive, Inertia, MeasuredDisturbance, Motor, Spring, Viscous
-from rotflex_jax.effects.base import SIGNAL_MARK, Effect
+from rotflex_jax.effects.base import Effect, driven_place
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.rotary_flexible import PORTS, flexible_joint
 from rotflex_jax.mechanism import Mechanism
@@ -301,7 +301,7 @@ def two_stage_link() -> Mechanism:
             Viscous(at=f"hub{stage}", coefficient=constants["hub_damping"]),
             Viscous(at=f"joint{stage}", coefficient=constants["joint_damping"]),
         ]
-    driven = MeasuredDisturbance(at=f"hub2{SIGNAL_MARK}{SECOND_CURRENT}", gain=second["torque_per_current"])
+    driven = MeasuredDisturbance(at=driven_place("hub2", SECOND_CURRENT), gain=second["torque_per_current"])
     return Mechanism(
         coordinates=("theta1", "alpha1", "theta2", "alpha2"),
         ports=ports,

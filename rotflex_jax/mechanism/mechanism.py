@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Real
 
 from rotflex_jax import checks
 from rotflex_jax.checks import number, shown, shown as describe
-from rotflex_jax.effects.base import SIGNAL_MARK, Effect, Linear, Memory
+from rotflex_jax.effects.base import Effect, Linear, Memory, driven_place
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.quantity import TURNING, Quantity, Units
@@ -299,7 +299,7 @@ class Mechanism:
         if effect.acts_on == "input":
             return ("input",)
         if effect.acts_on == "signal":
-            return tuple(f"{port}{SIGNAL_MARK}{s}" for s in self.signals for port in self.port_vectors)
+            return tuple(driven_place(port, s) for s in self.signals for port in self.port_vectors)
         return self.channels if effect.acts_on == "channel" else tuple(self.port_vectors)
 
     def vector(self, effect: Effect) -> tuple[float, ...]:

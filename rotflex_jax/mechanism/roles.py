@@ -8,7 +8,7 @@ needs no list of machines and a machine none of effects.
 
 from collections.abc import Callable
 
-from rotflex_jax.effects.base import CATALOG, SIGNAL_MARK, Effect
+from rotflex_jax.effects.base import CATALOG, Effect, driven_place, port_and_signal
 from rotflex_jax.mechanism.mechanism import Mechanism
 
 PORTS, SENSORS = ("hub", "arm", "joint"), ("theta", "alpha")
@@ -73,7 +73,7 @@ def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
         "input": lambda voltage: {voltage},
         "channel": lambda channel: {sensor_role(mechanism, channel)},
         "signal": lambda place: {
-            f"{role}{SIGNAL_MARK}signal" for role in port_roles(mechanism, place.partition(SIGNAL_MARK)[0])
+            driven_place(role, "signal") for role in port_roles(mechanism, port_and_signal(place)[0])
         },
     }
     roles = {place: read[cls.acts_on](place) for place in mechanism.locations(cls)}
