@@ -224,13 +224,13 @@ class Modes:
         return dataclasses.replace(empty, g=g, offset=W[2 * S], xi=_complex(xi, p))
 
     @property
-    def poles(self) -> int:
+    def pole_count(self) -> int:
         """How many poles there are, which the modes of all inputs share."""
         return len(self.p) // (1 + len(self.signals))
 
     def fitted(self, recordings: Sequence[Recording], max_steps: int) -> "Modes":
         """The modes with the least `sum over channels of N/2 log mean e^2` of free runs."""
-        n, S = self.poles, len(self.p)
+        n, S = self.pole_count, len(self.p)
 
         def cost(modes: Modes) -> float:
             with np.errstate(all="ignore"):
@@ -259,7 +259,7 @@ class Modes:
             for p, r in zip(self.p, real, strict=True)
         ]
         driven = np.concatenate([[1.0] if r else [1.0, 0.0] for r in real])
-        size = sum(len(b) for b in blocks[: self.poles])
+        size = sum(len(b) for b in blocks[: self.pole_count])
         B = _block_diagonal(*[part[:, None] for part in np.split(driven, len(driven) // size)])
         C = np.column_stack(
             [c for g, r in zip(self.g.T, real, strict=True) for c in ([g.real] if r else [g.real, -g.imag])]
@@ -274,11 +274,11 @@ class Modes:
             self.signals,
         )
 
-    def _forced(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
-        each = (np.repeat(r.inputs(self.signals).astype(complex), self.poles, axis=1) for r in recordings)
-        return np.vstack([_filtered(self.p, u) for u in each])
+    def _forced(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N S"]:
+        inputs = (r.inputs(self.signals).astype(complex) for r in recordings)
+        return np.vstack([_filtered(self.p, np.repeat(u, self.pole_count, axis=1)) for u in inputs])
 
-    def _free(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
+    def _free(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N S"]:
         return np.vstack(
             [
                 np.stack([scipy.signal.lfilter([1], [1, -p], np.eye(1, r.N)[0]) for p in self.p], axis=1)
@@ -286,7 +286,7 @@ class Modes:
             ]
         )
 
-    def _states(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N n"]:
+    def _states(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N S"]:
         each = np.repeat(self.xi, [r.N for r in recordings], axis=0)
         return self._forced(recordings) + each * self._free(recordings)
 
@@ -305,7 +305,7 @@ class Modes:
         for c in range(C):
             slope = by_pole * self.g[c] * self.p
             by_mode = np.stack([(slope * -decay).real, (slope * 1j * angle).real], axis=1)
-            poles = by_mode.reshape(N, 2, -1, self.poles).sum(axis=2).reshape(N, -1)
+            poles = by_mode.reshape(N, 2, -1, self.pole_count).sum(axis=2).reshape(N, -1)
             residues, offsets = np.zeros((N, 2 * S * C)), np.zeros((N, C))
             residues[:, 2 * S * c : 2 * S * (c + 1)] = _pair(x)
             offsets[:, c] = 1.0
@@ -314,7 +314,7 @@ class Modes:
         return np.stack(columns, axis=1)
 
     def _moved(self, move: Float[np.ndarray, " P"]) -> "Modes":
-        C, n, S, R = len(self.g), self.poles, len(self.p), len(self.xi)
+        C, n, S, R = len(self.g), self.pole_count, len(self.p), len(self.xi)
         a, b, g, offset, xi = np.split(move, np.cumsum([n, n, 2 * S * C, C]))
         a, b = np.tile(a, S // n), np.tile(b, S // n)
         decay = -np.log(np.abs(self.p)) * np.exp(a)
