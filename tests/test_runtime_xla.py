@@ -1,6 +1,7 @@
 """Calls side by side on threads."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -42,6 +43,28 @@ def test_an_error_is_raised_once_what_has_begun_has_ended():
     with pytest.raises(ZeroDivisionError, match="first"):
         on_threads(run, range(100))
     assert sorted(ended) == sorted(k for k in begun if k)
+
+
+def test_what_has_begun_stops_at_its_next_call_from_within() -> None:
+    """A fit of many runs does not go on to its end after the user has stopped the search."""
+    begun, steps = threading.Event(), []
+
+    def run(k):
+        if k == 0:
+            begun.wait(30)
+            raise KeyboardInterrupt
+        for _ in range(20_000):
+            steps.append(k)
+            begun.set()
+            on_threads(time.sleep, [0.001])
+        return k
+
+    if cores() == 1:
+        pytest.skip("one core: nothing runs beside the call that fails")
+    with pytest.raises(KeyboardInterrupt):
+        on_threads(run, [0, 1])
+    assert 0 < len(steps) < 20_000
+    assert on_threads(lambda x: x, [1, 2]) == [1, 2]  # the threads are free again
 
 
 def test_threads_take_numpys_settings_for_errors_from_the_caller():

@@ -9,7 +9,7 @@ import functools
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -187,32 +187,38 @@ def cores() -> int:
 def on_threads(run: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
     """Results of independent calls, on as many threads as there are cores.
 
-    A scan keeps one core busy; compiled code runs outside of Python's lock. Where one call fails, those that
-    have begun end before its error is raised. Calls from within a call follow one another on its thread: all
-    threads may be busy with such calls.
+    A scan keeps one core busy; compiled code runs outside of Python's lock. Calls from within a call follow
+    one another on its thread: all threads may be busy with such calls. Where a call fails, or the user stops
+    the program, others that have begun end before the error is raised, at the latest when they come here.
 
     Args:
         run: What to call; no two calls may run a program that spreads over devices. What several calls need
             to be compiled is compiled once, by the first of them.
         jobs: Its arguments.
     """
-    if len(jobs) <= 1 or getattr(_own, "busy", False):
+    outer: threading.Event | None = getattr(_own, "stopped", None)
+    if outer is not None and outer.is_set():
+        raise CancelledError
+    if len(jobs) <= 1 or outer is not None:
         return [run(job) for job in jobs]
-    settings = np.geterr()  # a thread has its own
+    settings, stopped = np.geterr(), threading.Event()  # a thread has its own settings
 
     def on_thread(job: Job) -> Result:
-        _own.busy = True
+        _own.stopped = stopped
         with np.errstate(**settings):
             return run(job)
 
     begun = [_threads().submit(on_thread, job) for job in jobs]
     try:
         return [each.result() for each in begun]
+    except BaseException:
+        stopped.set()
+        raise
     finally:
         wait([each for each in begun if not each.cancel()])
 
 
-# Of each thread: whether it is one of those below.
+# Of each of the threads below: whether what it works for has been stopped.
 _own = threading.local()
 
 
