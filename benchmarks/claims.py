@@ -631,7 +631,7 @@ def _millimetres(pair: list[float]) -> str:
 @named
 def emps_unequal() -> str:
     """By how much the damping is stronger backwards than forwards [N s/m]."""
-    found = _last_effect("emps")["predictor estimates"]["axis.viscous_asymmetric.asymmetry"]
+    found = _last_effect("emps")["search estimates"]["axis.viscous_asymmetric.asymmetry"]
     return f"{-2 * found['value']:.0f}"
 
 

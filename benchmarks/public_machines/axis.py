@@ -22,8 +22,8 @@ def run(say: Say) -> dict[str, Any]:
     rows = [
         {
             "model": label,
-            "predictor": benchmark.score(stage.model),
-            "predictor estimates": estimates(stage),
+            "search": benchmark.score(stage.model),
+            "search estimates": estimates(stage),
         }
         for label, stage in zip(labels(result), result.stages, strict=True)
     ]

@@ -28,7 +28,7 @@ def _case(case: dict[str, Any]) -> list[str]:
     lines += [f"- {note}" for note in case["notes"]]
     for entry in case.get("free-run rounds", []):
         lines.append(f"- {_free_round(entry)}")
-    kinds = ("estimates", "predictor estimates", "free-run estimates")
+    kinds = ("estimates", "search estimates", "free-run estimates")
     last = {k: row[k] for k in kinds for row in case["rows"] if k in row}
     return [*lines, "", *_parameters(case, last)]
 
@@ -47,15 +47,15 @@ def _free_round(entry: dict[str, Any]) -> str:
 def _errors(case: dict[str, Any]) -> list[str]:
     """Root mean square errors of free runs, round by round, published ones below."""
     tests = list(case["rows"][0]["free run"])
-    both = "predictor" in case["rows"][0]
+    both = "search" in case["rows"][0]
     heads = [f"{t} [{case['unit']}]" for t in tests]
-    heads += [f"{t}, numbers of the predictor" for t in tests] if both else []
+    heads += [f"{t}, parameters of the search" for t in tests] if both else []
     heads += [f"windows of 2 s, {c}" for c in case["rows"][0].get("windows", {})]
     lines = ["| model | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
     for k, row in enumerate(case["rows"]):
         label = row["model"] if k == 0 or row["model"].startswith("the ") else "+ " + row["model"]
         cells = [f"{row['free run'][t]:.3g}" for t in tests]
-        cells += [f"{row['predictor'][t]:.3g}" if "predictor" in row else "" for t in tests] if both else []
+        cells += [f"{row['search'][t]:.3g}" if "search" in row else "" for t in tests] if both else []
         cells += [f"{e:.3g}" for e in row.get("windows", {}).values()]
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     if "bound" in case:
@@ -68,7 +68,7 @@ def _errors(case: dict[str, Any]) -> list[str]:
 
 
 def _parameters(case: dict[str, Any], row: dict[str, Any]) -> list[str]:
-    columns = {"predictor": "predictor estimates", "free run": "free-run estimates"}
+    columns = {"search": "search estimates", "free run": "free-run estimates"}
     columns = {k: v for k, v in columns.items() if v in row} or {"": "estimates"}
     heads = [f"{k} 95 %".strip() for k in columns] + (["published"] if case["constants"] else [])
     names = list(dict.fromkeys(n for v in columns.values() for n in row[v]))

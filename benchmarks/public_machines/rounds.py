@@ -36,5 +36,6 @@ def told(result: rf.Discovery) -> dict[str, Any]:
             for r in result.rounds
         ],
         "notes": list(result.notes),
+        "conditional_intervals": [c.to_dict() for c in result.conditional],
         "discovery_seconds": round(result.elapsed_s, 1),
     }
