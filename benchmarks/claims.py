@@ -6,7 +6,7 @@ import functools
 import json
 import math
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,12 @@ def named(function: Callable[[], str]) -> Callable[[], str]:
     """Registers a function under its name."""
     NAMED[function.__name__] = function
     return function
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in markdown, between the marks of a quotation."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join(["", *(f"| {' | '.join(cells)} |" for cells in lines), ""])
 
 
 ASKED: set[str] = set()
@@ -318,12 +324,8 @@ def _best_linear(row: dict[str, Any]) -> str:
 @named
 def two_link_signals() -> str:
     """The table of the two-link machine without and with the motion of the other stage."""
-    lines = [
-        "",
-        "| stage, run | as it is | search, by itself | linear, by itself | search, other link known "
-        "| linear, other link known | both stages in one |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
+    ways = ("search, by itself", "linear, by itself", "search, other link known", "linear, other link known")
+    lines = []
     rows = results("B9.json")["rows"]
     for stage, other in ((1, 2), (2, 1)):
         for run, year in (("lqr", 2026), ("feedback", 2011)):
@@ -344,8 +346,8 @@ def two_link_signals() -> str:
                 _best_linear(beside),
                 _in_degrees(_used(both)["test_rmse_windows"], stage),
             ]
-            lines.append(f"| {stage}, {year} | {' | '.join(cells)} |")
-    return "\n".join([*lines, ""])
+            lines.append([f"{stage}, {year}", *cells])
+    return _table(["stage, run", "as it is", *ways, "both stages in one"], lines)
 
 
 # -- fits of measured machines ------------------------------------------------------------------------------
@@ -384,20 +386,16 @@ def _ratio(pairs: list[list[dict[str, Any]]], errors: str) -> float:
 @named
 def restarted_fits() -> str:
     """The table of fits without and with restarts."""
-    lines = [
-        "",
-        "| machine | fits | with a lower cost | training data | test data |",
-        "|---|---:|---:|---:|---:|",
-    ]
+    lines = []
     for machine, title in FITTED_MACHINES.items():
         rows = results("B15.json")["rows"]
         pairs = [
             pair for key, laws in rows.items() if key.startswith(f"{machine}:") for pair in laws.values()
         ]
         lower = sum(more["cost"] < one["cost"] - SAME_COST for one, more in pairs)
-        ratios = " | ".join(f"{_ratio(pairs, errors):.2f}" for errors in ("rmse", "test_rmse"))
-        lines.append(f"| {title} | {len(pairs)} | {lower} | {ratios} |")
-    return "\n".join([*lines, ""])
+        ratios = (f"{_ratio(pairs, errors):.2f}" for errors in ("rmse", "test_rmse"))
+        lines.append([title, str(len(pairs)), str(lower), *ratios])
+    return _table(["machine", "fits", "with a lower cost", "training data", "test data"], lines)
 
 
 @named
@@ -614,6 +612,100 @@ for _part in ("multisine", "arrow"):
     NAMED[f"silverbox_{_part}"] = lambda part=_part: f"{_last_effect('silverbox')['free run'][part]:.2f}"
     NAMED[f"silverbox_{_part}_narx"] = lambda part=_part: (
         f"{results('B3.json')['silverbox']['published']['Gaussian-process NARX'][part]:.2f}"
+    )
+
+
+@named
+def silverbox_errors() -> str:
+    """Errors of free runs over the official tests, found and published [mV]."""
+    case = results("B3.json")["silverbox"]
+    tests = list(case["rows"][0]["free run"])
+    last = len(case["rounds"])
+    rows = {
+        "mass, damper, spring": case["rows"][0],
+        "all that was found but the bias of the output": case["rows"][last - 1],
+        "all that was found": case["rows"][last],
+        "the same with a held input": case["rows"][-1],
+    }
+    errors = {words: row["free run"] for words, row in rows.items()}
+    for method in ("Gaussian-process NARX", "SUBNET", "linear"):
+        errors[f"published by Champneys et al.: {method}"] = case["published"][method]
+    cells = [
+        [words, *(f"{each[t]:.3g}" if t in each else "" for t in tests)] for words, each in errors.items()
+    ]
+    return _table(["model", *(f"{t} [{case['unit']}]" for t in tests)], cells)
+
+
+@named
+def emps_errors() -> str:
+    """Errors of models of EMPS, each fitted to one free run over the training record [mm]."""
+    case = results("B3.json")["emps"]
+    words = ("mass and viscous damping", "+ dry friction", "+ damping unequal in the two directions")
+    labels = [*words, "+ an offset that drifts through the record"]
+    rows = [
+        [label, f"{row['trained']:.3g}", f"{row['free run']['pulses']:.3g}"]
+        for label, row in zip(labels, case["rows"], strict=True)
+    ]
+    bound = case["bound"]["errors"]["pulses"]
+    rows.append(["the last, fitted to the test itself: what the structure could do", "", f"{bound:.2g}"])
+    methods = ("polynomial NARX", "linear state space", "ARX")
+    errors = ", ".join(f"{case['published'][m]['pulses']:.3g}" for m in methods)
+    rows.append([f"published by Champneys et al.: {', '.join(methods)}", "", errors])
+    model = "model, parameters fitted to one free run over the training record"
+    return _table([model, "training [mm]", "official test [mm]"], rows)
+
+
+EMPS_PARAMETERS = {
+    "axis.inertia.inertia": "mass [kg]",
+    "axis.viscous.coefficient": "viscous damping [N s/m]",
+    "axis.coulomb.level": "dry friction [N]",
+    "axis.viscous_asymmetric.asymmetry": "half the damping forwards less that backwards [N s/m]",
+}
+
+
+@named
+def emps_parameters() -> str:
+    """Parameters of EMPS by several fits, with 95 % intervals, and as published."""
+    case = results("B3.json")["emps"]
+    predictions = {c["parameter"]: c["prediction"] for c in case["conditional_intervals"]}
+    of_search, of_run = _last_effect("emps")["search estimates"], case["rows"][-1]["free-run estimates"]
+
+    def told(estimates: dict[str, Any], name: str) -> str:
+        if name not in estimates:
+            return ""
+        low, high = estimates[name]["ci95"]
+        return f"{estimates[name]['value']:.4g} ({low:.4g} to {high:.4g})"
+
+    return _table(
+        ["", "predictions", "search: free runs of 2 s", "one free run over the record", "published"],
+        [
+            [
+                words,
+                *(told(estimates, name) for estimates in (predictions, of_search, of_run)),
+                f"{case['constants'][name][0]:.4g}" if name in case["constants"] else "",
+            ]
+            for name, words in EMPS_PARAMETERS.items()
+        ],
+    )
+
+
+@named
+def rigid_arm_errors() -> str:
+    """Errors of free runs of the rigid arm, learnt from the run with gain 6 [mrad]."""
+    case = results("B3.json")["rigid arm"]
+    first, *found = case["rows"]
+    by_search = found[: len(case["rounds"])]
+    rows = [["inertia and viscous damping", first]]
+    rows += [[f"+ {row['model'].replace('_', ' ')}, by the search", row] for row in by_search]
+    by_hand = ("dry friction, by hand, fitted to free runs", "and an offset of the voltage")
+    rows += [list(pair) for pair in zip(by_hand, found[len(by_search) :], strict=True)]
+    tests = list(first["free run"])
+    return _table(
+        ["rigid arm", *(t.removesuffix(", theta") for t in tests), "windows of 2 s of both"],
+        [
+            [words, *(f"{row['free run'][t]:.3g}" for t in tests), f"{row['windows']['theta']:.3g}"]
+            for words, row in rows
+        ],
     )
 
 

@@ -184,6 +184,8 @@ KNOWN = {
             ["0.49", "7.1", "20.06"], "mass and clocks of measured servos, checked by their readers"
         ),
         "-3.16": "published [N]",
+        **dict.fromkeys(["5.7", "9.2"], "supply of a measured servo [V], as its files have it"),
+        **dict.fromkeys(["0.85", "0.80"], "errors of B9 before something that was tried"),
         **dict.fromkeys(
             [
                 "0.88",
