@@ -302,6 +302,64 @@ for _number, _channel in enumerate(("first", "second")):
         NAMED[f"measured_{_channel}_{_name}"] = functools.partial(measured_ahead, _horizon, _number)
 
 
+MEASURED_DIRECTIONS = {
+    "rotflex: A to B": "measured joint, A to B",
+    "rotflex: B to A": "measured joint, B to A",
+    "rotflex: A and half of B to the rest": "measured joint, A and half of B to the rest",
+    "rotflex: B and half of A to the rest": "measured joint, B and half of A to the rest",
+    "rotflex: first 70 % of all to the rest": "measured joint, the first 70 % of both to the rest",
+    "emps: official": "EMPS, official",
+    "emps: first half to second half": "EMPS, first half to second half",
+    "rigid_arm: gain 6, decided on gain 8, to gains 1 and 3": "rigid arm, gain 6 to gains 1 and 3",
+    "rigid_arm: gain 8, decided on gains 1 and 3, to gain 6": "rigid arm, gain 8 to gain 6",
+    "rigid_arm: gains 1 and 3, decided on gain 6, to gain 8": "rigid arm, gains 1 and 3 to gain 8",
+    "rigid_arm: first 70 % of all to the rest": "rigid arm, first 70 % of all to the rest",
+    "flexible_arm: first half to second half": "flexible arm, first half to second half",
+}
+"""Directions of the table of the model to use, in its words."""
+_OF_STAGES = {
+    "lqr, first half to its end": "2026, first half to its end",
+    "feedback, first half to its end": "2011, first half to its end",
+    "lqr to feedback": "2026 to 2011",
+    "feedback to lqr": "2011 to 2026",
+    "lqr and half of feedback to the rest": "2026 and half of 2011 to the rest",
+    "feedback and half of lqr to the rest": "2011 and half of 2026 to the rest",
+}
+for _stage, _ways in ((1, list(_OF_STAGES)), (2, list(_OF_STAGES)[:2])):
+    for _way in _ways:
+        MEASURED_DIRECTIONS[f"two_dof_link_{_stage}: {_way}"] = (
+            f"two-link machine, stage {_stage}, {_OF_STAGES[_way]}"
+        )
+
+
+def _whole_and_windows(errors: dict[str, Any], name: str, channel: str) -> str:
+    """Errors of one channel over whole runs and over 2 s, of positions in millimetres, else in degrees."""
+    factor = 1e3 if channel == "position" else math.degrees(1.0)
+    return " / ".join(f"{factor * errors[name + horizon][channel]:.2f}" for horizon in ("", "_windows"))
+
+
+@named
+def measured_models() -> str:
+    """The table of the model to use beside the best other method, in the first channel."""
+    rows, lines = results("B9.json")["rows"], []
+    for key, label in MEASURED_DIRECTIONS.items():
+        reported, best = rows[key]["reported"], rows[key]["others"]["rows"][0]
+        channel = next(iter(reported["final"]["test_rmse"]))
+        lines.append(
+            [
+                label,
+                "mm" if channel == "position" else "deg",
+                _whole_and_windows(reported["final"], "test_rmse", channel),
+                _whole_and_windows(used, "test_rmse", channel)
+                if (used := reported["fitted to all"])
+                else "not taken",
+                f"{_whole_and_windows(best, 'held_out_rmse', channel)} (`{best['method']}`)",
+            ]
+        )
+    head = ["machine, direction", "unit", "the search, fitted to training data", "the model to use"]
+    return _table([*head, "best other, by whole runs"], lines)
+
+
 # -- the two-link machine with signals -----------------------------------------------------------------------
 
 
