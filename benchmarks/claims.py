@@ -753,16 +753,16 @@ def rigid_arm_errors() -> str:
     case = results("B3.json")["rigid arm"]
     first, *found = case["rows"]
     by_search = found[: len(case["rounds"])]
-    rows = [["inertia and viscous damping", first]]
-    rows += [[f"+ {row['model'].replace('_', ' ')}, by the search", row] for row in by_search]
+    rows = {"inertia and viscous damping": first}
+    rows |= {f"+ {row['model'].replace('_', ' ')}, by the search": row for row in by_search}
     by_hand = ("dry friction, by hand, fitted to free runs", "and an offset of the voltage")
-    rows += [list(pair) for pair in zip(by_hand, found[len(by_search) :], strict=True)]
+    rows |= dict(zip(by_hand, found[len(by_search) :], strict=True))
     tests = list(first["free run"])
     return _table(
         ["rigid arm", *(t.removesuffix(", theta") for t in tests), "windows of 2 s of both"],
         [
             [words, *(f"{row['free run'][t]:.3g}" for t in tests), f"{row['windows']['theta']:.3g}"]
-            for words, row in rows
+            for words, row in rows.items()
         ],
     )
 

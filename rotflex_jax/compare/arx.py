@@ -9,7 +9,6 @@ from jaxtyping import Float
 from rotflex_jax.compare.method import (
     Fitted,
     Progress,
-    common_signals,
     require_one_sampling_period,
     split_for_validation,
     validation_cost,
@@ -17,6 +16,7 @@ from rotflex_jax.compare.method import (
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import common_signals
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,6 @@ from jaxtyping import Complex, Float
 from rotflex_jax.compare.method import (
     Fitted,
     Progress,
-    common_signals,
     require_one_sampling_period,
     split_for_validation,
     validation_cost,
@@ -20,6 +19,7 @@ from rotflex_jax.models.linear_system import LinearSystem
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import common_signals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -279,12 +279,12 @@ class Modes:
         return np.vstack([_filtered(self.p, np.repeat(u, self.pole_count, axis=1)) for u in inputs])
 
     def _free(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N S"]:
-        return np.vstack(
-            [
-                np.stack([scipy.signal.lfilter([1], [1, -p], np.eye(1, r.N)[0]) for p in self.p], axis=1)
-                for r in recordings
-            ]
-        )
+        poles, of_inputs = self.p[: self.pole_count], (1, 1 + len(self.signals))
+        each = [
+            np.stack([scipy.signal.lfilter([1], [1, -p], np.eye(1, r.N)[0]) for p in poles], axis=1)
+            for r in recordings
+        ]
+        return np.tile(np.vstack(each), of_inputs)
 
     def _states(self, recordings: Sequence[Recording]) -> Complex[np.ndarray, "N S"]:
         each = np.repeat(self.xi, [r.N for r in recordings], axis=0)

@@ -343,11 +343,6 @@ def split_for_validation(train: Sequence[Recording], share: float) -> tuple[list
     return [a for a, _ in parts], [b for _, b in parts]
 
 
-def common_signals(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Names of the signals that all recordings have: further inputs of a linear model."""
-    return tuple(name for name in recordings[0].signals if all(name in r.signals for r in recordings))
-
-
 def require_one_sampling_period(recordings: Sequence[Recording], what: str) -> None:
     """Refuse recordings of different sampling periods, for which no single sampled model holds.
 

@@ -363,7 +363,8 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
             dataclasses.replace(best, K=K, process_noise=intensity)
             for intensity, K in zip(new, problem.gains(best, new), strict=True)
         ]
-        parameter_sets = [run.parameter_set(problem.supermodel) for run in runs]
+        as_it_is = best.parameter_set(problem.supermodel)
+        parameter_sets = [as_it_is._replace(K=run.K) for run in runs]
         evaluated = problem.predictor.of_innovations(
             lambda i, e: problem.evaluated(runs[i], e), parameter_sets, problem.windows.index
         )

@@ -49,7 +49,7 @@ from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model, program_length
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, listed
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, common_signals, listed
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches, loaded_ahead
 from rotflex_jax.runtime.xla import on_threads, one_thread
 
@@ -158,7 +158,7 @@ def _with_signals(
         InputError: A test recording lacks one of them.
     """
     every = dict.fromkeys(name for r in deciding for name in r.signals)
-    common = [name for name in every if all(name in r.signals for r in deciding)]
+    common = common_signals(deciding)
     for name, r in ((name, r) for name in common for r in tested):
         if name not in r.signals:
             raise InputError(

@@ -445,6 +445,11 @@ def of_one_run(a: Recording, b: Recording) -> bool:
 _OF_ONE_MACHINE = ("Ts", "channels", "units", "input_name", "input_unit", "constants")
 
 
+def common_signals(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Names of the signals that all recordings have."""
+    return tuple(name for name in recordings[0].signals if all(name in r.signals for r in recordings))
+
+
 def joined(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
     """Recordings in their order, where parts of one run that follow on each other are one recording.
 
