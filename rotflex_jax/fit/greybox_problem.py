@@ -227,6 +227,7 @@ class GreyBoxProblem:
                 found = self._minimum(
                     point, stage, K, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE
                 )
+                moved = found.x is not point
                 point, cost, steps = found.x, found.cost, steps + found.evaluations
                 status = self._status(found)
                 if not history:
@@ -242,7 +243,8 @@ class GreyBoxProblem:
                 if best is None or cost < best[0]:
                     best = cost, point, K, status
                 worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - SETTLED
-                if status != "converged" or not worth:
+                # Without a step, what follows the parameters is what it was.
+                if status != "converged" or not moved or not worth:
                     break
             assert best
             cost, point, K, status = best
