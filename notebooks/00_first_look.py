@@ -161,7 +161,7 @@ show_missing(textbook, RED)
 #
 # ## Which effect?
 #
-# Add a suspect with `+`, fit again, compare. Two suspects, one at a time: a hardening spring, and a dead
+# Add a candidate with `+`, fit again, compare. Two candidates, one at a time: a hardening spring, and a dead
 # zone of the amplifier, which would hold the hub back as friction does.
 
 # %%
@@ -276,8 +276,8 @@ figures.ranking(result)
 #
 # Here it can be checked, since the recording was simulated. The second lesson of missing physics is
 # in the middle column: the textbook fit does not only follow badly, two of its **parameters are far
-# off, and their intervals do not know it**. The missing friction was booked as damping of the hub,
-# the hardening as stiffness.
+# off, and their intervals do not know it**. The fit has put the missing friction into the damping of
+# the hub, and the hardening into the stiffness.
 
 # %%
 truth = json.loads((files("rotflex_jax.data") / "demo_truth.json").read_text())

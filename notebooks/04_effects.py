@@ -10,8 +10,8 @@
 # # What does each effect do to the motion?
 #
 # A textbook joint has inertias, a spring, a motor and viscous damping. A real one has more. This notebook
-# adds one effect at a time to the same joint, plays the same voltage, and looks: first at the aftermath
-# of a pulse, where dry friction shows itself best, then at which effects one must not hope to see with a
+# adds one effect at a time to the same joint, plays the same voltage, and looks: first at the motion
+# after a pulse, where dry friction shows itself best, then at which effects one must not hope to see with a
 # given input.
 
 # %%

@@ -10,9 +10,10 @@
 # # What if the effect I suspect is not in the catalogue?
 #
 # Then the search finds a relative of it, or nothing, and says `unexplained`. You look at where the model
-# still fails, get an idea, and write it down: an effect is a class with one method, and from then on the
-# search tries it like any other. Here the hidden effect is friction that changes with the *angle* of the
-# hub, as a bent shaft or a worn gear makes it. No effect of the catalogue does that.
+# still fails, get an idea, and write it down: an effect is a class with two methods, its law and the
+# values to try first, and from then on the search tries it like any other. Here the hidden effect is friction
+# that changes with the *angle* of the hub, as a bent shaft or a worn gear makes it. No effect of the
+# catalogue does that.
 
 # %%
 import dataclasses

@@ -225,7 +225,7 @@ def load(
 ) -> Recording:
     """Reads a recording and checks it; nothing is repaired unless it is asked for by name.
 
-    Text (.csv, .tsv, .txt; any delimiter), MATLAB (.mat of any version), NumPy (.npz), Parquet,
+    Text (.csv, .tsv, .txt; any delimiter), JSON, MATLAB (.mat of any version), NumPy (.npz), Parquet,
     spreadsheets (.xlsx), LabVIEW (.tdms), MDF4 (.mf4), ROS 2 (.mcap), or a pandas DataFrame; a folder or a
     list of files with one channel each is one recording. Columns `t,voltage,theta,alpha` in seconds,
     volts and radians unless other names are given; capitals and a unit behind the name, as in

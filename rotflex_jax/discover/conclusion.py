@@ -4,7 +4,7 @@ Where the final model leaves more than sensor noise, something else is wrong wit
 been added because it imitates a part of that. Three signs, none of which the search decides by:
 
 - its size differs between the windows of the recordings: an effect of the machine has one size;
-- free runs change less by it than their error still is;
+- free runs change by it by less than half of the error that is left;
 - predictions gain less by it than they would if their errors were the sensor noise alone.
 
 In a model that explains its recordings none of them says anything: what is left there is noise.

@@ -67,7 +67,7 @@ class Recording:
         source: where it comes from.
         start: time of the first sample [s].
         accept: faults to accept, which then are findings of severity `warning`: `short`,
-            `constant_input`, `constant`, `saturated`, `units`.
+            `constant_input`, `constant`, `saturated`, `units`, `absolute`, `swapped`, `huge`.
         resolution: quantisation step by channel, where it is known; found from the data otherwise.
         continues: the recording that ended where this one starts, if any; a part of a recording knows the
             part before it. States that no sensor shows (a warm motor) continue from there.
