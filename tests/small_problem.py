@@ -84,7 +84,7 @@ def start(at: LikelihoodProblem, wrong: float = 0.0, locations=None) -> Hypothes
         x0=np.zeros((R, 1, 4)),
         K=np.zeros((R, Layout.of(s.mechanism.structure).size, 2)),
         process_noise={},
-        whitener=Whitener(np.ones((2, 1)), np.diag(1 / NOISE)),
+        whitener=Whitener(np.diag(1 / NOISE)),
     )
     return at.with_process_noise(h, {"hub": 0.0, "joint": 0.0})
 

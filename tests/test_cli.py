@@ -413,7 +413,7 @@ class FakeSearch:
             report=self.report,
             probabilities=SimpleNamespace(sentence="Most probable: Coulomb friction at hub 93 %."),
             final_fit=None,
-            assessment=assess({"theta": 0.2}, {"theta": 0.1}, {"theta": 5e-4}, 0.0, 600),
+            assessment=assess({"theta": 0.2}, {"theta": 0.1}, {"theta": 5e-4}, 0.0),
         )
 
     @staticmethod

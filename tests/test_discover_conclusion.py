@@ -208,7 +208,6 @@ def test_a_bias_beside_another_fault_of_its_sensor_is_provisional(monkeypatch: p
 
 
 HELPS = HorizonGain(1.0, 2.0, 0.5)
-SAMPLES = 1000  # of each of the two channels
 NEAR = 1.5  # times the noise of the sensor
 
 
@@ -234,8 +233,7 @@ def told(
         for noun in ("dry friction" if others else "Coulomb friction",)
     ]
     ranking: Any = [SimpleNamespace(excited=k < excited) for k in range(candidates)]
-    recordings: Any = [SimpleNamespace(N=SAMPLES // 2)] * 2
-    return end_state(baseline, found, final, floor, ranking, recordings)
+    return end_state(baseline, found, final, floor, ranking)
 
 
 def ended(**given: Any) -> Verdict:
@@ -253,8 +251,8 @@ def test_explained_is_near_the_noise_of_every_sensor(share: float, explained: bo
 
 @pytest.mark.parametrize(("share", "explained"), [(0.999, True), (1.001, False)])
 def test_explained_leaves_little_to_process_noise(share: float, explained: bool) -> None:
-    # 0.07 nat for each measured value, those of both channels.
-    verdict = ended(noise_nats=0.07 * 2 * SAMPLES * share)
+    # 0.03 nat for each measured value of the training recordings.
+    verdict = ended(noise_nats=0.03 * share)
     assert verdict == (Verdict.NOTHING_MISSING if explained else Verdict.UNEXPLAINED)
 
 
@@ -403,20 +401,18 @@ def test_a_sensor_of_unknown_noise_leaves_the_verdict_open() -> None:
 
 
 def test_shares_and_nats_of_nothing_are_no_numbers() -> None:
-    end = assess({"theta": 0.0, "alpha": 2.0}, {"theta": 0.1, "alpha": 1.0}, {}, 5.0, 10)
+    end = assess({"theta": 0.0, "alpha": 2.0}, {"theta": 0.1, "alpha": 1.0}, {}, 0.5)
     assert math.isnan(end.explained["theta"]) and end.explained["alpha"] == 75.0
-    assert end.torque_nats == 0.5  # without a floor as for one channel
     assert end.explained_text == "alpha 75.0 % of the baseline's squared error is explained"
-    assert math.isnan(assess({}, {}, {"theta": 0.1}, 5.0, 0).torque_nats)
     written = end.to_dict()
     assert written["explained_percent"] == {"theta": None, "alpha": 75.0}
     assert written["remaining_over_noise"] == {"theta": None, "alpha": None}
-    assert assess({}, {}, {}, 5.0, 0).to_dict()["random_torque_nats_per_value"] is None
+    assert assess({}, {}, {}, math.nan).to_dict()["random_torque_nats_per_value"] is None
 
 
 @pytest.mark.parametrize("after", [0.1, math.inf])
 def test_a_baseline_that_diverges_has_no_share_that_is_explained(after) -> None:
-    end = assess({"theta": math.inf, "alpha": 2.0}, {"theta": after, "alpha": 1.0}, {}, 5.0, 10)
+    end = assess({"theta": math.inf, "alpha": 2.0}, {"theta": after, "alpha": 1.0}, {}, 0.5)
     assert end.explained_text == "alpha 75.0 % of the baseline's squared error is explained"
     assert end.to_dict()["explained_percent"] == {"theta": None, "alpha": 75.0}
 
@@ -506,7 +502,7 @@ FOUND = "Coulomb friction at the hub"
 REACHED = "the held-out error over 2 s is theta 1.00, alpha 1.00 times the sensor noise"
 SHARE = "; theta > 99.99 %, alpha > 99.99 % of the baseline's squared error is explained"
 REMAINS = "something remains that no candidate explains"
-TORQUE = "predictions still ask for a random torque (0.1 nat per measured value, at most 0.07)"
+TORQUE = "predictions still ask for a random torque (0.1 nat per measured value, at most 0.03)"
 
 
 @pytest.mark.parametrize(
@@ -528,7 +524,7 @@ TORQUE = "predictions still ask for a random torque (0.1 nat per measured value,
         ),
         ({"ratio": 3.0}, f"S{REMAINS[1:]}: {REACHED.replace('alpha 1.', 'alpha 3.')}."),
         (
-            {"noise_nats": 200.0, "rounds": ((),)},
+            {"noise_nats": 0.1, "rounds": ((),)},
             f"{FOUND} found, but {REMAINS}: {REACHED}; short runs are at the noise, but {TORQUE}{SHARE}.",
         ),
         (

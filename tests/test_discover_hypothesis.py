@@ -1,11 +1,10 @@
-"""The likelihood of innovations against SciPy's densities and against autoregressions made by hand."""
+"""The likelihood of innovations against SciPy's densities."""
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from rotflex_jax.discover.hypothesis import Whitener, fit_whitener, log_likelihood
+from rotflex_jax.discover.hypothesis import Whitener, fit_whitener
 
 FLOOR = np.array([1e-9, 1e-9])
 MIXED = np.array([[2.0, 0.6], [0.6, 0.5]])
@@ -20,9 +19,14 @@ def everything(e: np.ndarray) -> np.ndarray:
     return np.ones(e.shape[:2])
 
 
+def log_likelihood(e: np.ndarray, seen: np.ndarray, floor: np.ndarray) -> float:
+    """Of innovations under the whitener that is fitted to them."""
+    return float(fit_whitener(e, seen, floor).log_densities(e, seen).sum())
+
+
 def test_densities_are_those_of_a_normal_distribution():
     e = white()
-    w = fit_whitener(e, everything(e), FLOOR, 0)
+    w = fit_whitener(e, everything(e), FLOOR)
     sample = np.einsum("rni,rnj->ij", e, e) / e[..., 0].size
     expected = multivariate_normal(np.zeros(2), sample).logpdf(e)
     np.testing.assert_allclose(w.log_densities(e, everything(e)), expected, rtol=1e-9)
@@ -31,63 +35,41 @@ def test_densities_are_those_of_a_normal_distribution():
 
 def test_whitened_is_white_and_of_unit_size():
     e = white()
-    flat = fit_whitener(e, everything(e), FLOOR, 0)(e, everything(e)).reshape(-1, 2)
+    flat = fit_whitener(e, everything(e), FLOOR)(e, everything(e)).reshape(-1, 2)
     np.testing.assert_allclose(flat.T @ flat / len(flat), np.eye(2), atol=1e-9)
 
 
-@pytest.mark.parametrize("order", [0, 2])
-def test_what_is_not_seen_does_not_count(order):
+def test_what_is_not_seen_does_not_count():
     e = white(N=300)
     seen = everything(e)
     seen[1, 200:] = 0
     other = e.copy()
     other[1, 200:] = 77.0  # the mask decides, whatever stands there
     e[1, 200:] = 0.0
-    a, b = (fit_whitener(x * seen[..., None], seen, FLOOR, order) for x in (e, other))
+    a, b = (fit_whitener(x * seen[..., None], seen, FLOOR) for x in (e, other))
     np.testing.assert_array_equal(a.L, b.L)
     densities = a.log_densities(e, seen)
-    assert (densities[1, 200:] == 0).all() and (densities[:, :order] == 0).all()
-    assert (densities[0, order:] != 0).all() and (densities[1, order:200] != 0).all()
-    assert densities.sum() == pytest.approx(log_likelihood(e, seen, FLOOR, order))
+    assert (densities[1, 200:] == 0).all()
+    assert (densities[0] != 0).all() and (densities[1, :200] != 0).all()
+    assert densities.sum() == pytest.approx(log_likelihood(e, seen, FLOOR))
 
 
 def test_no_other_whitener_is_likelier():
     e = white(N=400)
     seen = everything(e)
-    best = log_likelihood(e, seen, FLOOR, 0)
-    L = fit_whitener(e, seen, FLOOR, 0).L
+    best = log_likelihood(e, seen, FLOOR)
+    L = fit_whitener(e, seen, FLOOR).L
     rng = np.random.default_rng(1)
     for _ in range(20):
-        other = Whitener(np.ones((2, 1)), L @ (np.eye(2) + 0.05 * np.tril(rng.normal(size=(2, 2)))))
+        other = Whitener(L @ (np.eye(2) + 0.05 * np.tril(rng.normal(size=(2, 2)))))
         assert other.log_densities(e, seen).sum() < best
-
-
-def test_autoregressions_are_found_and_taken_away():
-    driven = white(R=2, N=6000, seed=3)
-    true = np.array([[1.0, -1.2, 0.5], [1.0, 0.6, 0.0]])
-    e = np.stack([lfilter([1.0], true[c], driven[..., c], axis=1) for c in range(2)], axis=-1)
-    seen = everything(e)
-    w = fit_whitener(e, seen, FLOOR, 2)
-    np.testing.assert_allclose(w.a, true, atol=0.04)
-    left = w(e, seen)[:, 2:]
-    for k in (1, 2, 3):
-        product = np.einsum("rni,rnj->ij", left[:, k:], left[:, :-k]) / left[..., 0].size
-        np.testing.assert_allclose(product, 0.0, atol=0.04)
-    # Entropy: an autoregression gains half the log ratio of the variances per sample and channel.
-    gain = log_likelihood(e, seen, FLOOR, 2) - log_likelihood(e, seen, FLOOR, 0)
-    variances = np.array([e[..., c].var() for c in range(2)]), np.diag(MIXED)
-    ideal = multivariate_normal(np.zeros(2), MIXED).entropy()
-    marginal = np.einsum("rni,rnj->ij", e, e) / e[..., 0].size
-    expected = (multivariate_normal(np.zeros(2), marginal).entropy() - ideal) * seen.sum()
-    assert (variances[0] > variances[1]).all()
-    assert gain == pytest.approx(expected, rel=0.03)
 
 
 def test_slopes_are_whitened_like_innovations():
     """Any leading axes; and the whitener is linear."""
     e, J = white(N=100), np.random.default_rng(4).normal(size=(3, 2, 100, 2))
     seen = everything(e)
-    w = fit_whitener(e, seen, FLOOR, 2)
+    w = fit_whitener(e, seen, FLOOR)
     together = w(J, seen)
     assert together.shape == J.shape
     for one, row in zip(J, together, strict=True):
@@ -97,12 +79,12 @@ def test_slopes_are_whitened_like_innovations():
 def test_noise_free_data_stay_finite():
     e = np.zeros((1, 50, 2))
     floor = np.array([1e-4, 2e-4])
-    w = fit_whitener(e, everything(e), floor, 0)
+    w = fit_whitener(e, everything(e), floor)
     np.testing.assert_allclose(np.linalg.inv(w.L), np.diag(0.05 * floor), rtol=1e-9)
-    assert np.isfinite(log_likelihood(e, everything(e), floor, 0))
+    assert np.isfinite(log_likelihood(e, everything(e), floor))
 
 
 def test_the_floor_does_not_matter_where_there_is_noise():
     e = white()
-    low, high = (log_likelihood(e, everything(e), f * np.ones(2), 0) for f in (1e-6, 0.1))
+    low, high = (log_likelihood(e, everything(e), f * np.ones(2)) for f in (1e-6, 0.1))
     assert high == pytest.approx(low, abs=0.1)

@@ -162,7 +162,7 @@ def mapped(found: MapEquations, weights: int, prior: float = 1e-3) -> FittedMap:
         np.zeros((1, 1, 0)),
         np.zeros((1, 0, 1)),
         {},
-        Whitener(np.ones((1, 1)), np.eye(1)),
+        Whitener(np.eye(1)),
     )
     return FittedMap(h, np.eye(weights), V, False, at)
 

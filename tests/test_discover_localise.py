@@ -258,6 +258,23 @@ def test_a_current_is_no_motion(place: int, named: bool) -> None:
     assert condition_sets(alone, ("current",), {"current": 1e-4}, None) == ()
 
 
+def test_a_speed_beside_an_angle_does_not_deflect() -> None:
+    rec = recording()
+    theta, speed = rec.channel("theta"), np.gradient(rec.channel("theta"), rec.Ts)
+    for names, units, y in (
+        (("theta", "gyro"), ("rad", "rad/s"), [theta, speed]),
+        (("gyro", "theta"), ("rad/s", "rad"), [speed, theta]),
+    ):
+        both = Recording(u=rec.u, y=np.column_stack(y), Ts=rec.Ts, channels=names, units=units)
+        (found,) = [
+            v for v in condition_sets(both, names, dict.fromkeys(names, 1e-4), None) if v.kind == "deflection"
+        ]
+        assert all("theta" in phrase and "/s" not in phrase for phrase in found.phrases)
+    alone = Recording(u=rec.u, y=speed, Ts=rec.Ts, channels="gyro", units="rad/s")
+    kinds = [v.kind for v in condition_sets(alone, ("gyro",), {"gyro": 1e-4}, None)]
+    assert "deflection" not in kinds and "speed" in kinds
+
+
 def test_the_error_of_a_speed_arises_with_its_first_derivative() -> None:
     """Kicks to the speed at reversals decay slowly, so that the error lies everywhere and arises there."""
     both = recording()

@@ -80,6 +80,22 @@ def by_hand():
     return c, slopes, r, made(c, slopes, r)
 
 
+def test_a_shape_without_slope_does_not_hide_the_others():
+    """One shape of a friction has no slope here; the pair is worth what the other one gains."""
+    rng = np.random.default_rng(8)
+    friction = candidate("coulomb", "hub", (((1.0,),), ((2.0,),)))
+    step = candidate("dead_zone", "input", (((0.2,),),), threshold=True)
+    rows = rng.normal(size=(2, SAMPLES))
+    slopes = {
+        (friction.location, 0): np.zeros((1, SAMPLES)),
+        (friction.location, 1): rows[:1],
+        (step.location, 0): rows[1:],
+    }
+    r = -3.0 * rows[0] + 0.2 * rng.normal(size=SAMPLES)
+    (pair,) = made([friction, step], slopes, r).pairs([friction.location, step.location])
+    assert pair.gain == pytest.approx(dense([rows[:1], rows[1:]], r, [-np.inf] * 2, [np.inf] * 2), rel=1e-6)
+
+
 def test_the_joint_score_is_dense_least_squares(by_hand):
     (both, positive, step), slopes, r, test = by_hand
     pairs = {frozenset(p.locations): p for p in test.pairs([c.location for c in (both, positive, step)])}

@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import levenberg_marquardt
-from rotflex_jax.discover.score_test import Score, _amplitudes, scores
+from rotflex_jax.discover.score_test import Score, _amplitudes, score_test
 from rotflex_jax.discover.supermodel import EffectLocation, build
 from rotflex_jax.effects.base import Scale
 from rotflex_jax.joints import paper
@@ -25,7 +25,7 @@ def weak():
     """Recordings with a little friction: likelihood, baseline at its optimum, its scores by place."""
     problem = sp.problem(sp.recordings(sp.records(SMALL)))
     h = sp.fitted(problem)
-    return problem, h, {s.location: s for s in scores(problem, h)}
+    return problem, h, {s.location: s for s in score_test(problem, h).listed}
 
 
 def switched_on(problem, h: Hypothesis, score: Score) -> Hypothesis:
@@ -60,7 +60,7 @@ def test_a_score_foretells_the_gain_of_a_refit(weak):
 
 def test_the_true_effect_comes_first(weak):
     problem, h, found = weak
-    listed = scores(problem, h)
+    listed = score_test(problem, h).listed
     assert [s.location for s in listed] == [s.location for s in sorted(listed, key=lambda s: -s.nats)]
     assert listed[0].location == sp.HUB and listed[0].nats > 0
     assert found[sp.HUB].excited and 0.001 < found[sp.HUB].orthogonal_fraction < 1
@@ -80,7 +80,7 @@ def test_what_the_baseline_can_move_has_no_score(weak):
 
 def test_nothing_scores_where_nothing_is_missing():
     problem = sp.problem(sp.recordings(sp.records(0.0)))
-    found = scores(problem, sp.fitted(problem))
+    found = score_test(problem, sp.fitted(problem)).listed
     assert len(found) == len(sp.WANTED)
     assert all(s.nats < 0 for s in found)
 
@@ -88,7 +88,7 @@ def test_nothing_scores_where_nothing_is_missing():
 def test_what_is_in_the_hypothesis_is_scored_no_more(weak):
     problem, h, found = weak
     with_it = switched_on(problem, h, found[sp.HUB])
-    assert {s.location for s in scores(problem, with_it)} == set(found) - {sp.HUB}
+    assert {s.location for s in score_test(problem, with_it).listed} == set(found) - {sp.HUB}
 
 
 def test_switched_off_it_is_the_baseline(weak):

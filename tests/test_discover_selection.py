@@ -56,7 +56,7 @@ def trial(
     pattern = scatter * (pattern - pattern.mean()) / pattern.std()
     blocks = COMMON + held_out / BLOCKS + pattern
     trained = COMMON[::-1] + train / BLOCKS + pattern
-    white, none = Whitener(np.ones((2, 1)), np.eye(2)), np.zeros((1, 0))
+    white, none = Whitener(np.eye(2)), np.zeros((1, 0))
     h = Hypothesis(
         (), (), (), np.zeros(0), none, none[None], np.zeros((1, 0, 2)), {}, white, trained[None], trained
     )

@@ -15,7 +15,7 @@ from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, kalman_gains, simulate
-from rotflex_jax.mechanism.assembly import Layout, motor_voltage, own_states
+from rotflex_jax.mechanism.assembly import Layout, motor_inputs, own_states
 from rotflex_jax.mechanism.simulate import PredictorStep, read_outputs
 from rotflex_jax.runtime.xla import double_precision
 
@@ -55,7 +55,7 @@ ONE_RUN = np.zeros((2, N), np.int32)
 
 
 @functools.cache
-def predictor() -> BatchedPredictor:
+def predictor(between: str = "held") -> BatchedPredictor:
     rng = np.random.default_rng(0)
     u = 1.5 * np.repeat(rng.normal(size=(2, N // 5)), 5, axis=1)
     y = np.stack([simulate(paper(stiffness=1.5), v, Ts) for v, Ts in zip(u, TS, strict=True)])
@@ -63,7 +63,7 @@ def predictor() -> BatchedPredictor:
     seen = 1.0 * (rng.random((2, N)) < 0.95)
     seen[0, 2 * N // 3 :] = 0.0  # as where the first seconds alone count
     data = StackedRecordings(u, y, seen, np.array(TS))
-    return BatchedPredictor(supermodel(), Exponential(), data)
+    return BatchedPredictor(supermodel(), Exponential(between=between), data)
 
 
 def numbers(name: str) -> ParameterSet:
@@ -86,22 +86,22 @@ def parameter_set(name: str) -> ParameterSet:
 
 
 @functools.cache
-def program():
+def program(between: str):
     """Innovations of the whole super-model by ordinary scans, and their slopes as JAX makes them."""
-    structure, solver = supermodel().mechanism.structure, Exponential()
+    structure, solver = supermodel().mechanism.structure, Exponential(between=between)
     step = PredictorStep(structure, solver)
 
     def predicted(gates, values, x0, K, u, y, seen, Ts):
         mechanism = structure.with_values(values)
         constants = (solver.prepare(structure, values, gates, Ts), K)
-        inputs = (motor_voltage(mechanism, gates, u, Ts), y, seen)
+        inputs = (motor_inputs(solver, mechanism, gates, u, Ts), y, seen)
         X = jax.lax.scan(lambda x, w: (step(x, w, constants), x), x0, inputs)[1]
         return (y - read_outputs(mechanism, gates, X.T).T) * seen[:, None]
 
     def run(whole, dvalues, dgates):
         def e(values, gates):
             each = jax.vmap(functools.partial(predicted, gates))
-            return each(values, whole.x0[:, 0], whole.K, *map(jnp.asarray, predictor().data))
+            return each(values, whole.x0[:, 0], whole.K, *map(jnp.asarray, predictor(between).data))
 
         at = (whole.values, whole.gates)
         return e(*at), jax.vmap(lambda dv, dg: jax.jvp(e, at, (dv, dg))[1])(dvalues, dgates)
@@ -111,10 +111,10 @@ def program():
     return jax.jit(run, compiler_options=rough)
 
 
-def whole_run(whole: ParameterSet, along: Directions) -> tuple[np.ndarray, np.ndarray]:
+def whole_run(whole: ParameterSet, along: Directions, between: str = "held") -> tuple[np.ndarray, np.ndarray]:
     """Innovations (R, N, C) and slopes (D, R, N, C)."""
     with double_precision():
-        e, J = program()(*jax.tree.map(jnp.asarray, (whole, along.values, along.gates)))
+        e, J = program(between)(*jax.tree.map(jnp.asarray, (whole, along.values, along.gates)))
         return np.asarray(e), np.asarray(J)
 
 
@@ -209,7 +209,8 @@ def test_slopes_on_parts_are_those_of_the_whole():
     assert np.abs(whole_J[:4]).max(axis=(1, 2, 3)).min() > 1e-5
 
 
-def test_probes_are_the_slopes_of_the_whole():
+@pytest.mark.parametrize("between", ["held", "switched"])
+def test_probes_are_the_slopes_of_the_whole(between: str):
     """Along amplitudes of what is off, and along the gate of the lag, which has no amplitude."""
     s, now, put = supermodel(), parameter_set("one memory"), numbers("one memory")
     # States of what is off are not corrected: gains are those of the baseline.
@@ -217,7 +218,7 @@ def test_probes_are_the_slopes_of_the_whole():
     K[:, s.baseline_states] = now.K[:, s.baseline_states]
     now, put = now._replace(K=K), put._replace(K=K)
     absent = [c for c in s.candidates.values() if now.gates[c.effect] == 0]
-    found = candidate_sensitivities(predictor(), now, absent, ONE_RUN)
+    found = candidate_sensitivities(predictor(between), now, absent, ONE_RUN)
     tried = [(p.candidate.location, p.shape, p.member) for slopes in found for p in slopes.probes]
     assert sorted(tried) == sorted(
         (c.location, k, m) for c in absent for k, shape in enumerate(c.probes) for m in range(len(shape))
@@ -232,7 +233,7 @@ def test_probes_are_the_slopes_of_the_whole():
             gates[c.effect] = 1.0
         else:
             along.gates[0, c.effect] = 1.0
-        expected = whole_run(put._replace(values=values, gates=gates), along)[1][0]
+        expected = whole_run(put._replace(values=values, gates=gates), along, between)[1][0]
         size = np.abs(expected).max()
         assert size > 1e-6, c.location
         np.testing.assert_allclose(

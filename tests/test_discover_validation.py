@@ -26,7 +26,7 @@ def sides():
 def test_a_model_that_fits_its_training_data_closely_is_not_punished_for_it(sides):
     """Ten times as small in training: in units of that, each held-out sample would lose some 50 nats."""
     _, h, validation = sides
-    close = Whitener(h.whitener.a, 10 * h.whitener.L)
+    close = Whitener(10 * h.whitener.L)
     plain, proud = validate(validation, h), validate(validation, dataclasses.replace(h, whitener=close))
     np.testing.assert_allclose(proud.blocks, plain.blocks, atol=1.0)
 

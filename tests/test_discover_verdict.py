@@ -12,8 +12,8 @@ from rotflex_jax.cli import terminal
 from rotflex_jax.discover.conclusion import end_state
 from rotflex_jax.discover.verdict import (
     FAR_FLOOR,
-    NATS_PER_SAMPLE,
     NEAR_FLOOR,
+    TORQUE_NATS,
     Assessment,
     Grade,
     Verdict,
@@ -48,12 +48,12 @@ def ended(times: float, nats: float = 0.0, verdict: Verdict = Verdict.UNEXPLAINE
     )
     floor = dict.fromkeys(channels, NOISE)
     found = dataclasses.replace(found, baseline=baseline, rounds=rounds, noise_floor=floor)
-    reached, text = end_state(baseline, rounds, found.final, floor, [], found.validation)
+    reached, text = end_state(baseline, rounds, found.final, floor, [])
     return dataclasses.replace(found, verdict=reached, sentence=text)
 
 
 def test_explained_shares_are_of_the_squared_error() -> None:
-    end = assess({"theta": 2.0, "alpha": 1.0}, {"theta": 0.2, "alpha": 2.0}, {"theta": 0.1}, 0.0, 100)
+    end = assess({"theta": 2.0, "alpha": 1.0}, {"theta": 0.2, "alpha": 2.0}, {"theta": 0.1}, 0.0)
     assert end.explained["theta"] == pytest.approx(99.0)
     assert end.explained["alpha"] == pytest.approx(-300.0)
     assert end.remaining["theta"] == pytest.approx(2.0)
@@ -89,14 +89,13 @@ def test_sentence_tile_table_json_and_terminal_say_the_same_number(times, monkey
 
 
 def test_the_verdict_says_which_criterion_decided() -> None:
-    samples = 2 * sum(r.N for r in two_rounds().validation)
     by_error = ended(229.0)
     assert by_error.verdict is Verdict.UNEXPLAINED
     assert "above 1.5 times the sensor noise" in by_error.assessment.criterion
-    by_torque = ended(1.17, nats=2 * NATS_PER_SAMPLE * samples)
+    by_torque = ended(1.17, nats=2 * TORQUE_NATS)
     assert by_torque.verdict is Verdict.UNEXPLAINED
-    assert "random torque (0.14 nat" in by_torque.sentence
-    explained = ended(1.17, nats=0.5 * NATS_PER_SAMPLE * samples)
+    assert "random torque (0.06 nat" in by_torque.sentence
+    explained = ended(1.17, nats=0.5 * TORQUE_NATS)
     assert explained.verdict is Verdict.FOUND
     assert "> 99.99 % of the baseline's squared error is explained" in explained.sentence
 
@@ -190,7 +189,7 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
     assert end.explained_text == "theta 0.5 % of the baseline's squared error is explained"
     below = dataclasses.replace(end, remaining={"theta": np.nextafter(near, 0)})
     assert below.at_noise and below.is_explained
-    assert not dataclasses.replace(below, torque_nats=NATS_PER_SAMPLE).torque_free
+    assert not dataclasses.replace(below, torque_nats=TORQUE_NATS).torque_free
     # A channel of unknown noise decides where the others are at theirs, not where one is at the limit.
     unknown = {"alpha": NAN}
     assert (
@@ -200,17 +199,14 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
     assert "error of theta" in dataclasses.replace(end, remaining=end.remaining | unknown).criterion
     assert [percent(share) for share in (99.99, 99.0, 0.0)] == ["99.99 %", "99.0 %", "0 %"]
     # Of a baseline without an error nothing can be explained.
-    assert np.isnan(assess({"theta": 0.0}, {"theta": 1.0}, {"theta": 1.0}, 0.0, 10).explained["theta"])
-    # Random torques gain per value of each channel; without a floor there is one.
-    ended_at = [assess({}, {}, floor, 6.0, 3).torque_nats for floor in ({}, {"a": 1.0}, {"a": 1.0, "b": 1.0})]
-    assert ended_at == [2.0, 2.0, 1.0]
+    assert np.isnan(assess({"theta": 0.0}, {"theta": 1.0}, {"theta": 1.0}, 0.0).explained["theta"])
 
 
 def test_the_misfit_is_what_is_left_over_what_the_verdict_allows() -> None:
     """Squares of errors, nats as they are; one where both are allowed, infinite where one is unknown."""
 
     def misfit(theta: float, nats: float) -> float:
-        return Assessment({}, {"theta": theta * NEAR_FLOOR, "alpha": 0.5}, nats * NATS_PER_SAMPLE).misfit
+        return Assessment({}, {"theta": theta * NEAR_FLOOR, "alpha": 0.5}, nats * TORQUE_NATS).misfit
 
     assert misfit(3.0, 2.0) == pytest.approx(9.0) and misfit(0.9, 2.0) == pytest.approx(2.0)
     assert misfit(0.9, 0.9) == 1.0 and misfit(NAN, 0.0) == np.inf

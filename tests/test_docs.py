@@ -244,7 +244,7 @@ def test_the_numbers_of_the_decision_are_those_of_the_code() -> None:
     }
     assert len(rows) == 4
     assert f"within {result.NEAR_FLOOR:g} times the noise" in text
-    assert f"less than {verdict.NATS_PER_SAMPLE:g} nat" in text
+    assert f"less than {verdict.TORQUE_NATS:g} nat" in text
     assert selection.SEPARATE_Z == 2.0 and "less than two standard deviations" in text
 
 

@@ -22,6 +22,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.rig import SimulatedRig
 from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.export import to_c
+from rotflex_jax.fit.identifiable import _other_inputs
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, simulate
 from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
@@ -251,6 +252,20 @@ def test_recordings_with_a_say_decide_which_signals_are_tried(measured):
     assert any("Not all recordings have the signal 'acceleration of the base" in note for note in found.notes)
     with pytest.raises(InputError, match="the recordings have no signal in common"):
         rf.discover(model, train, dataclasses.replace(validation, signals={}), candidates=CANDIDATES)
+
+
+def test_other_inputs_of_a_machine_with_signals_leave_these_as_they_are():
+    """What would help is sought among inputs; a signal is what it is."""
+    model = rf.Model(joint(*on_moving_base()))
+    short = spun_base(60)
+    quiet = dataclasses.replace(short, u=1e-2 * short.u)
+    found = rf.identifiable(model, quiet)
+    assert not found.practical
+    others = _other_inputs(np.column_stack([quiet.u, quiet.signals[BASE]]), TS)
+    assert set(found.inputs_here) <= set(others)
+    for u in others.values():
+        np.testing.assert_array_equal(u[:, 1], quiet.signals[BASE])
+        assert np.abs(u[:, 0]).max() > np.abs(quiet.u).max() / 2
 
 
 def test_what_knows_the_input_alone_says_so():

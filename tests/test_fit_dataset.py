@@ -11,7 +11,7 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.evaluation import calibrate
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
-from rotflex_jax.discover.score_test import scores
+from rotflex_jax.discover.score_test import score_test
 from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
 from rotflex_jax.discover.supermodel import build, scales
 from rotflex_jax.discover.validation import Horizons, as_free_run, validate
@@ -87,7 +87,7 @@ def test_the_score_of_free_runs_foretells_what_a_fit_gains(horizons):
     """To first order: a small step of the amplitude lowers the cost as the score says."""
     problem = horizons.free_run.problem
     h = refit(problem, [as_free_run(problem, sp.fitted(horizons.prediction.problem))])[0]
-    found = {x.location: x for x in scores(problem, h)}[sp.HUB]
+    found = {x.location: x for x in score_test(problem, h).listed}[sp.HUB]
     assert found.nats > 50 and found.start.values[0] == pytest.approx(0.02, rel=0.5)
 
 
@@ -127,7 +127,7 @@ def test_a_late_channel_is_seen_at_both_horizons():
     h = fit_baseline(both.prediction.problem)
     runs = refit(both.free_run.problem, [as_free_run(both.free_run.problem, h)])[0]
     for at, fitted in ((both.prediction.problem, h), (both.free_run.problem, runs)):
-        best, second, *_ = scores(at, fitted)
+        best, second, *_ = score_test(at, fitted).listed
         assert best.location == ("channel_delay", "alpha") and best.nats > 100 > second.nats
         grown = refit_candidates(at, fitted, [best.start])[0]
         assert grown.log_likelihood - fitted.log_likelihood > 0.9 * best.start.expected_gain
@@ -223,6 +223,26 @@ def test_shorter_recordings_are_padded_with_samples_that_do_not_count():
         np.testing.assert_array_equal(u[seen], r.u)
         np.testing.assert_array_equal(y[seen], r.y)
         assert not y[~seen].any()
+
+
+def test_samples_that_do_not_count_are_no_part_of_the_errors():
+    """Of white errors, each counts as one: samples that fill up a shorter recording are no correlation."""
+    rng = np.random.default_rng(3)
+    model = Model(sp.baseline())
+    long, *_ = sp.recordings(sp.records(0.02, (21,)))
+    short = long.split(100 / long.N)[0]
+    dataset = prepare(model, [long, short])
+    windows, seen = Windows.whole(dataset), dataset.data.seen
+    coordinates = FitCoordinates(3, 0, 0, windows)
+    e = rng.normal(size=dataset.data.y.shape) * seen[:, :, None]
+    J = rng.normal(size=(*e.shape, 3)) * seen[:, :, None, None]
+    parts = coordinates.parts(e, J, seen)
+    assert [len(p.e) for p in parts] == [long.N, short.N]
+    of_each = [e[r, : n.N] for r, n in enumerate((long, short))]
+    for p, mine in zip(parts, of_each, strict=True):
+        np.testing.assert_array_equal(p.e, mine)
+    left_out = coordinates.parts(e, J, seen * np.array([[1.0], [0.0]]))
+    assert len(left_out) == 1 and left_out[0].columns.tolist() == [0, 1, 2]
 
 
 def test_noise_and_torque_are_those_of_the_recordings_or_taken_over():

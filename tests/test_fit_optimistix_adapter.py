@@ -5,6 +5,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.fit import optimistix_adapter
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +22,12 @@ def model():
 @pytest.fixture(scope="module")
 def own(model, recording):
     return rf.fit(model, recording)
+
+
+def test_scales_that_have_not_settled_are_no_end(model, recording, monkeypatch):
+    monkeypatch.setattr(optimistix_adapter, "MAX_RESCALINGS", 1)
+    found = rf.fit(model, recording, minimiser=optx.LevenbergMarquardt(rtol=1e-7, atol=1e-7))
+    assert found.status.startswith("stopped")
 
 
 @pytest.mark.parametrize("kind", [optx.LevenbergMarquardt, optx.Dogleg])

@@ -15,7 +15,7 @@ from rotflex_jax.arena.simulator.laws import laws
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.score_test import scores
+from rotflex_jax.discover.score_test import score_test
 from rotflex_jax.discover.supermodel import EffectLocation, build, scales
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare
@@ -313,7 +313,7 @@ def test_a_search_meets_play_at_its_size():
         x0=np.zeros((1, 1, 4)),
         K=np.zeros((1, Layout.of(s.mechanism.structure).size, 2)),
         process_noise={},
-        whitener=Whitener(np.ones((2, 1)), np.diag(1 / NOISE)),
+        whitener=Whitener(np.diag(1 / NOISE)),
     )
     h = problem.with_process_noise(h, {"hub": 0.0, "joint": 0.0})
     off, on = (s.active(s.gates(locations)).mechanism for locations in ((), (PLACE,)))
@@ -322,7 +322,7 @@ def test_a_search_meets_play_at_its_size():
     assert any(isinstance(e, fx.Gear) for e in on.effects)
     assert h.initial_state_for(s, (PLACE,)).shape == (1, 1, 6)
 
-    best, *others = scores(problem, h)
+    best, *others = score_test(problem, h).listed
     assert best.location == PLACE and best.nats > 2 * max(o.nats for o in others) and best.excited
     assert 1 / 2 < best.start.values[0] / GAP < 2
     assert {o.location for o in others} == {("lag", "input"), ("coulomb", "hub")}

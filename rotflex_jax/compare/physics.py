@@ -162,4 +162,4 @@ class LearnedTorqueMethod:
         weights = np.asarray(found.effect.weights).size if found.kept else 0
         free = len(found.model.mechanism.free_names)
         note = f"at {at}, reads like {found.formula}" if found.kept else f"no torque at {at} was kept"
-        return Fitted(found.model, max(free, weights), note, one_step_predictor(found.model, train))
+        return Fitted(found.model, free + weights, note, one_step_predictor(found.model, train))

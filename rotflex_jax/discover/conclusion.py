@@ -18,11 +18,11 @@ import numpy as np
 
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.result import Round, SearchResult, Stage
+from rotflex_jax.discover.result import Round, SearchResult, Stage, assess_stages
 from rotflex_jax.discover.score_test import Score
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import SearchHorizon, ValidatedHypothesis
-from rotflex_jax.discover.verdict import Assessment, Verdict, assess, in_noise
+from rotflex_jax.discover.verdict import Verdict, in_noise
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.errors import InputError
@@ -31,21 +31,12 @@ from rotflex_jax.fit.coordinates import orthogonal_to
 from rotflex_jax.recording import Recording
 
 
-def assess_stages(
-    baseline: Stage, final: Stage, floor: dict[str, float], validation: Sequence[Recording]
-) -> Assessment:
-    """The final model by its errors on validation data; arguments as in `end_state`."""
-    errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
-    return assess(*errors, floor, final.process_noise_nats, sum(r.N for r in validation))
-
-
 def end_state(
     baseline: Stage,
     rounds: Sequence[Round],
     final: Stage,
     floor: dict[str, float],
     ranking: Sequence[Score],
-    test: Sequence[Recording],
 ) -> tuple[Verdict, str]:
     """The verdict, and a sentence that gives its reason.
 
@@ -55,9 +46,8 @@ def end_state(
         final: Stage after the last round.
         floor: Standard deviation of the sensor noise per channel.
         ranking: Scores of the baseline.
-        test: Held-out recordings.
     """
-    end = assess_stages(baseline, final, floor, test)
+    end = assess_stages(baseline, final, floor)
     seconds = final.window_seconds
     reached = f"the held-out error over {seconds:g} s is {in_noise(end.remaining)} times the sensor noise"
     names = " and ".join(effect_phrase(r.effect, r.port) for r in rounds)

@@ -23,12 +23,11 @@ from rotflex_jax.discover.validation import (
     carried_over,
 )
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.errors import InputError
 from rotflex_jax.fit import inference
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Windows, padded_length, prepare
 from rotflex_jax.fit.held_constants import with_held_constants
-from rotflex_jax.fit.inference import Combination, RecordingSlopes, curvature, sandwich
+from rotflex_jax.fit.inference import Combination, curvature, sandwich
 from rotflex_jax.fit.plausibility import check_signs
 from rotflex_jax.mechanism import Solver
 from rotflex_jax.models.model import Model
@@ -218,10 +217,13 @@ def evaluate(
 
 
 def process_noise_gain(problem: LikelihoodProblem, h: Hypothesis) -> float:
-    """Log-likelihood that process torques gain over a free run with the same parameters [nat]."""
+    """Log-likelihood per measured value that process torques gain over a free run [nat].
+
+    The parameters are the same.
+    """
     free_run = problem.with_process_noise(h, dict.fromkeys(problem.ports, problem.process_noise_range[0]))
     with_noise, without = problem.log_likelihoods([h, free_run])
-    return with_noise - without
+    return (with_noise - without) / problem.measured_values
 
 
 def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]:
@@ -231,14 +233,7 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
     w = h.whitener(e[0], seen)
     W = h.whitener(J[0, : h.moved], seen)
     R, coordinates = len(h.x0), FitCoordinates.of(h, problem.windows)
-    parts = []
-    for r in range(R):
-        for k, samples in problem.windows.of(r):
-            inside = seen[r, samples] > 0
-            if not inside.any():  # a recording that does not count
-                continue
-            slopes = np.moveaxis(W[:, r, samples], 0, -1)[inside]
-            parts.append(RecordingSlopes(slopes, w[r, samples][inside], coordinates.columns(r, k)))
+    parts = coordinates.parts(w, np.moveaxis(W, 0, -1), seen)
     covariance = sandwich(parts, curvature(parts, coordinates.size))
     values, derivative = h.physical(s)
     mean = h.mean_values(s)
@@ -383,13 +378,8 @@ class Evaluation:
         """What the recordings of a search and further ones are evaluated with.
 
         Raises:
-            InputError: A recording without a channel of the model or against its signs, or a negative time.
+            InputError: A recording without a channel of the model or against its signs.
         """
-        if calibrate_seconds < 0:
-            raise InputError(
-                f"calibrate_seconds was given {calibrate_seconds:g}, but it is how much of a recording its "
-                "own offsets may be fitted to; give a time in seconds, or 0 for none."
-            )
         validation, other = horizons.free_run.validation, None
         if test:
             check_signs(model, test)

@@ -114,8 +114,8 @@ def condition_sets(
 ) -> tuple[ConditionSet, ...]:
     """The sets of conditions that the motion of the recording allows; none for a recording at rest.
 
-    The first channel that measures a motion is taken for what turns and the second for what deflects; a
-    single one for both.
+    The first channel that measures a motion is taken for what turns, and another one that measures a position
+    for what deflects; a single position for both.
 
     Args:
         recording: Measured outputs.
@@ -124,25 +124,23 @@ def condition_sets(
         mechanism: Says what the channels measure; by their names if None.
     """
     half = half_width(recording)
-    moving = motion_channels({c: _unit(recording, c) for c in channels}, mechanism)
+    units = {c: _unit(recording, c) for c in channels}
+    moving = motion_channels(units, mechanism)
     if not half or not moving:
         return ()
-    turning, bending = moving[0], moving[min(1, len(moving) - 1)]
+    turning = moving[0]
+    positions = [c for c in moving if derivative_of(c, units[c], mechanism) == 0]
+    bending = next((c for c in positions if c != turning), positions[0] if positions else None)
     speed, error, unit = _speed(recording, turning, noise.get(turning, 0.0), mechanism)
     what = _subject(turning, mechanism)
-    position = smoothed(recording.channel(bending).astype(float), 2 * half + 1, 2)
-    subject = "the deflection" if _subject(bending, mechanism) == "the joint" else bending
-    found = (
-        _sides("speed", speed, unit, error, _turning(what, unit)),
-        _sides(
-            "deflection",
-            position,
-            _unit(recording, bending),
-            noise.get(bending, 0.0),
-            _beyond(subject),
-        ),
-        _reversals(speed, error, recording.Ts, what),
-    )
+    found = [_sides("speed", speed, unit, error, _turning(what, unit))]
+    if bending is not None:
+        position = smoothed(recording.channel(bending).astype(float), 2 * half + 1, 2)
+        subject = "the deflection" if _subject(bending, mechanism) == "the joint" else bending
+        found.append(
+            _sides("deflection", position, units[bending], noise.get(bending, 0.0), _beyond(subject))
+        )
+    found.append(_reversals(speed, error, recording.Ts, what))
     return tuple(conditions for conditions in found if conditions is not None)
 
 

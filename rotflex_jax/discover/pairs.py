@@ -34,7 +34,7 @@ from rotflex_jax.discover.selection import (
 from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
-from rotflex_jax.discover.verdict import NATS_PER_SAMPLE, NEAR_FLOOR
+from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.runtime.xla import on_threads
 
@@ -50,7 +50,7 @@ def is_unexplained(horizons: Horizons, current: ValidatedHypothesis) -> bool:
     problem = horizons.prediction.problem
     if bool(np.any(best_window_rmse(current) > NEAR_FLOOR * problem.noise)):
         return True
-    return process_noise_gain(problem, current.hypothesis) > NATS_PER_SAMPLE * problem.measured_values
+    return process_noise_gain(problem, current.hypothesis) > TORQUE_NATS
 
 
 def best_candidates(prediction: ScoreTest, free_run: ScoreTest, most: int) -> list[EffectLocation]:

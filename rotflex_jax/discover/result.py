@@ -111,7 +111,8 @@ class Stage:
         window_seconds: [s].
         process_noise: Port -> intensity of the process torque that the data ask for [(N m)^2 s]; small
             where the model is right.
-        process_noise_nats: Log-likelihood that the process torque gains; near zero where the model is right.
+        process_noise_nats: Log-likelihood per measured value of the training recordings that the process
+            torque gains [nat]; near zero where the model is right.
         log_likelihood: Of the validation recordings at this horizon [nat].
         horizon: What the parameters were fitted to: "prediction", or "free_run" where short free runs over
             the validation recordings are then clearly better.
@@ -198,6 +199,18 @@ class KnownRuns(NamedTuple):
 def _parameters(estimates: Sequence[Estimate]) -> dict[str, Any]:
     """Estimates by name as plain JSON."""
     return {e.name: {**e.to_dict(), "free": e.free, "note": e.note} for e in estimates}
+
+
+def assess_stages(baseline: Stage, final: Stage, floor: dict[str, float]) -> Assessment:
+    """What the verdict on a final stage rests on.
+
+    Args:
+        baseline: Stage before any effect was added.
+        final: Stage after the last round.
+        floor: Standard deviation of the sensor noise per channel.
+    """
+    errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
+    return assess(*errors, floor, final.process_noise_nats)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -558,9 +571,7 @@ class SearchResult:
     @property
     def assessment(self) -> Assessment:
         """What is explained, what remains in units of the noise, and which criterion decided."""
-        errors = self.baseline.held_out_rmse_windows, self.final.held_out_rmse_windows
-        samples = sum(r.N for r in self.validation)
-        return assess(*errors, self.noise_floor, self.final.process_noise_nats, samples)
+        return assess_stages(self.baseline, self.final, self.noise_floor)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types, schema 1.

@@ -60,11 +60,6 @@ class Score:
         return self.start.location
 
 
-def scores(problem: LikelihoodProblem, h: Hypothesis) -> list[Score]:
-    """Scores of all candidates that are not yet in the hypothesis, best first."""
-    return score_test(problem, h).listed
-
-
 def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[ErrorLine, ...]:
     """Lines in the spectrum of the innovations that the input has not, the clearest first.
 
@@ -382,7 +377,7 @@ class _Gram(NamedTuple):
         most = np.concatenate(
             [np.full(len(i), MAX_THRESHOLD_AMPLITUDE if s.candidate.threshold else np.inf) for s, i in shapes]
         )
-        a = np.minimum(a, most * size)
+        a[keep] = np.minimum(a[keep], most[keep] * size[keep])  # without slope there is no amplitude
         return a / np.where(keep, size, 1.0), float(-a @ b - 0.5 * a @ G @ a)
 
 

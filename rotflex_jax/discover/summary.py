@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from rotflex_jax.discover.checkpoint import beginning
-from rotflex_jax.discover.conclusion import assess_stages, end_state, signs
+from rotflex_jax.discover.conclusion import end_state, signs
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.evaluation import (
     Evaluation,
@@ -31,6 +31,7 @@ from rotflex_jax.discover.result import (
     Round,
     Stage,
     Where,
+    assess_stages,
     conditional_note,
     excluding,
 )
@@ -107,7 +108,7 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     m = stages[-1].model.mechanism
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
-    explained = assess_stages(stages[0], stages[-1], state.noise_floor, held_back).is_explained
+    explained = assess_stages(stages[0], stages[-1], state.noise_floor).is_explained
     return EvaluatedModels(
         stages=tuple(stages),
         final=validated[-1],
@@ -134,7 +135,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
     conditional, last = _conditional(state), evaluated.final_fit
     used = last.model if isinstance(last, FinalFit) else final.model
     scores = [s for s, _ in state.ranking]
-    verdict, sentence = end_state(baseline, evaluated.rounds, final, state.noise_floor, scores, held_back)
+    verdict, sentence = end_state(baseline, evaluated.rounds, final, state.noise_floor, scores)
     return Discovery(
         verdict=verdict,
         sentence=sentence,
@@ -164,9 +165,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *(f"{remark.sentence}." for remark in remarks),
         ),
         remarks=remarks,
-        probabilities=_probabilities(
-            state, assess_stages(baseline, final, state.noise_floor, held_back).misfit
-        ),
+        probabilities=_probabilities(state, assess_stages(baseline, final, state.noise_floor).misfit),
         conditional=conditional,
         final_fit=last if isinstance(last, FinalFit) else None,
     )

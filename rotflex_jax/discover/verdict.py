@@ -16,9 +16,10 @@ from rotflex_jax.text.numbers import json_number, json_numbers, multiple, ratio
 NEAR_FLOOR = 1.5
 # Beyond this times the sensor noise much is left.
 FAR_FLOOR = 5.0
-# The model explains the recordings if process torques gain no more than this per measured value [nat],
-# and short held-out runs come as near to the sensor noise as `NEAR_FLOOR` says.
-NATS_PER_SAMPLE = 0.07
+# The model explains the recordings if process torques gain no more than this per measured value of the
+# training recordings [nat], and short runs over validation recordings come as near to the sensor noise as
+# `NEAR_FLOOR` says.
+TORQUE_NATS = 0.03
 
 
 class Grade(StrEnum):
@@ -51,7 +52,8 @@ class Assessment:
         explained: Channel -> share of the baseline's squared error that the final model explains [%]; not a
             number where runs of the baseline diverge or have no error.
         remaining: Channel -> error of short runs that is left, in multiples of the sensor noise.
-        torque_nats: What random torques still gain per measured value [nat]; 0 where the model is right.
+        torque_nats: What random torques still gain per measured value of the training recordings [nat]; 0
+            where the model is right.
     """
 
     explained: dict[str, float]
@@ -66,7 +68,7 @@ class Assessment:
     @property
     def torque_free(self) -> bool:
         """Whether predictions need no random torque."""
-        return self.torque_nats < NATS_PER_SAMPLE
+        return self.torque_nats < TORQUE_NATS
 
     @property
     def is_explained(self) -> bool:
@@ -80,7 +82,7 @@ class Assessment:
         The largest of these; 1 where the model explains the recordings.
         """
         shares = [(times / NEAR_FLOOR) ** 2 for times in self.remaining.values()]
-        shares.append(self.torque_nats / NATS_PER_SAMPLE)
+        shares.append(self.torque_nats / TORQUE_NATS)
         return math.inf if any(map(math.isnan, shares)) else max(1.0, *shares)
 
     @property
@@ -103,7 +105,7 @@ class Assessment:
         if not self.torque_free:
             return (
                 f"short runs are at the noise, but predictions still ask for a random torque "
-                f"({self.torque_nats:.2g} nat per measured value, at most {NATS_PER_SAMPLE:g})"
+                f"({self.torque_nats:.2g} nat per measured value, at most {TORQUE_NATS:g})"
             )
         return (
             f"short runs are within {NEAR_FLOOR:g} times the sensor noise, and predictions ask for "
@@ -132,7 +134,6 @@ def assess(
     after: Mapping[str, float],
     floor: Mapping[str, float],
     nats: float,
-    samples: int,
 ) -> Assessment:
     """The end of a search by its errors.
 
@@ -140,18 +141,16 @@ def assess(
         before: Channel -> error of short runs of the baseline.
         after: The same of the final model.
         floor: Channel -> standard deviation of the sensor noise.
-        nats: Log-likelihood that random torques gain over the final model [nat].
-        samples: Validation samples.
+        nats: Log-likelihood per measured value that random torques gain over the final model [nat].
 
-    >>> end = assess({"theta": 0.1}, {"theta": 0.002}, {"theta": 0.001}, 5.0, 1000)
+    >>> end = assess({"theta": 0.1}, {"theta": 0.002}, {"theta": 0.001}, 0.005)
     >>> round(end.explained["theta"], 2), end.remaining, end.is_explained, end.grade
     (99.96, {'theta': 2.0}, False, <Grade.NEAR: 'near'>)
     """
     # There is no share where runs of the baseline diverge or have no error.
     shares = {c: 100 * (1 - (after[c] / e) ** 2) if 0 < e < math.inf else math.nan for c, e in before.items()}
-    values = samples * max(1, len(floor))
     remaining = {c: ratio(after[c], floor.get(c)) for c in after}
-    return Assessment(shares, remaining, nats / values if values else math.nan)
+    return Assessment(shares, remaining, nats)
 
 
 def percent(share: float) -> str:

@@ -319,7 +319,7 @@ class PositionLoop(Linear):
         return linear, wanted
 
     def duty(self, position: Scalar, speed: Scalar, goal: Scalar, integral: Scalar | None = None) -> Scalar:
-        """Duty that the firmware gives; `integral` is that of its I gain. None where the torque is off."""
+        """Duty that the firmware gives; `integral` is that of its I gain. Zero where the torque is off."""
         wanted = self._wanted(position, speed, goal)[1]
         given = _within(wanted if integral is None else wanted + integral, self.limit)
         return given if self.enabled is None else self.enabled * given

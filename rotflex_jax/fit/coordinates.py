@@ -9,7 +9,7 @@ import dataclasses
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.fit.inference import RecordingSlopes
@@ -103,13 +103,25 @@ class FitCoordinates:
                 g[columns] += J @ w[r, samples].ravel()
         return H, g
 
-    def parts(self, e: Float[np.ndarray, "R N C"], J: Float[np.ndarray, "R N C D"]) -> list[RecordingSlopes]:
-        """Errors and slopes window by window, with their columns."""
-        return [
-            RecordingSlopes(J[r, samples], e[r, samples], self.columns(r, k))
-            for r in range(len(e))
-            for k, samples in self.windows.of(r)
-        ]
+    def parts(
+        self, e: Float[np.ndarray, "R N C"], J: Float[np.ndarray, "R N C D"], seen: Shaped[np.ndarray, "R N"]
+    ) -> list[RecordingSlopes]:
+        """Errors and slopes of the samples that count, window by window, with their columns.
+
+        Args:
+            e: Errors.
+            J: Their slopes along the directions of each window.
+            seen: Not zero where a sample counts.
+        """
+        found = []
+        for r, counts in enumerate(np.asarray(seen) > 0):
+            for k, samples in self.windows.of(r):
+                inside = counts[samples]
+                if inside.any():  # not in a recording that does not count
+                    found.append(
+                        RecordingSlopes(J[r, samples][inside], e[r, samples][inside], self.columns(r, k))
+                    )
+        return found
 
     def moved(self, h: PointType, step: Float[np.ndarray, " M"]) -> PointType:
         """The point after a step in these coordinates."""

@@ -72,16 +72,10 @@ def report(
     at_end = problem.at_ends(point)
     moves = ~problem.held_by_ends(point, windows)
     place = np.cumsum(moves) - 1
-    parts = []
-    for r in each:
-        for k, samples in windows.of(r):
-            counts, columns = seen[r, samples], coordinates.columns(r, k)
-            inside = moves[columns]
-            slopes = (J[r, samples] / scale[:, None])[counts]
-            own = RecordingSlopes(
-                slopes[..., inside], (e[r, samples] / scale)[counts], place[columns[inside]]
-            )
-            parts.append(own)
+    parts = [
+        RecordingSlopes(p.J[..., moves[p.columns]], p.e, place[p.columns[moves[p.columns]]])
+        for p in coordinates.parts(e / scale, J / scale[:, None], seen)
+    ]
     H = curvature(parts, int(moves.sum()))
     covariance = _spread_out(sandwich(parts, H), moves)
     names, specs = m.parameter_names, m.parameter_specifications
@@ -102,11 +96,6 @@ def report(
             combinations.append(Combination([point.free.index(i)], stretch[:1, i]))
     free = [c for c in combinations if c is not None]
     free_names = tuple(name for name, c in zip(names, combinations, strict=True) if c is not None)
-    together = np.zeros((coordinates.size, len(free)))
-    for column, combination in enumerate(free):
-        together[combination.rows, column] = 1.0
-    together = together[moves]
-    determined = [k for k in range(len(free)) if together[:, k].any()]
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
     notes = [at_end.get(name, "") for name in names]
     fitted = m.with_values(common)
@@ -123,9 +112,6 @@ def report(
         free_names=free_names,
         steps=end.steps,
         history=tuple(end.history),
-        weakest=_weakest(
-            together[:, determined].T @ H @ together[:, determined], [free_names[k] for k in determined]
-        ),
         local=local,
         remarks=(*at_bounds(found), *beyond_recordings(fitted, reach)),
         options=options or FitOptions(),
@@ -140,15 +126,6 @@ def _spread_out(covariance: np.ndarray, moves: np.ndarray) -> np.ndarray:
     whole = np.full((len(moves), len(moves)), np.nan)
     whole[np.ix_(moves, moves)] = covariance
     return whole
-
-
-def _weakest(H: np.ndarray, names: list[str]) -> dict[str, float]:
-    """The combination of parameters that the data determine least, its largest entry 1."""
-    if not np.isfinite(H).all():
-        return {}
-    direction = np.linalg.eigh(H)[1][:, 0]
-    direction = direction / direction[np.argmax(np.abs(direction))]
-    return dict(zip(names, direction.tolist(), strict=True))
 
 
 @one_thread

@@ -280,7 +280,7 @@ class GreyBoxProblem:
             self.coordinates(point, stage.windows),
             e,
             J,
-            int(np.sum(self.dataset.data.seen)),
+            self.dataset.data.seen,
             LEAST_SCALE * self.dataset.noise,
             self._room(point, stage.windows),
         )

@@ -39,6 +39,7 @@ from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.mechanism import ROTOR
 from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, single
 from rotflex_jax.runtime.xla import double_precision
@@ -122,8 +123,9 @@ class Identifiability:
             return tuple(said)
         if not self.badly_known:
             worst = max(self.std, key=lambda n: self.std[n], default="")
-            tail = f"; worst is {worst}, ± {196 * self.std[worst]:.2g} %" if worst else ""
-            return (*said, f"This recording determines every combination to 10 % or better{tail}.")
+            tail = f"; worst is {worst}, {100 * self.std[worst]:.2g} %" if worst else ""
+            least = f"with a standard deviation of {100 * BADLY_KNOWN:.0f} % or less"
+            return (*said, f"This recording determines every combination {least}{tail}.")
         said += [f"{d.sentence}." for d in self.badly_known if np.isfinite(d.std)]
         if self.structural:
             for words, found in (
@@ -135,7 +137,7 @@ class Identifiability:
                     best = min(found, key=lambda n: found[n])
                     said.append(
                         f"What would help: {words.format(best)}; the worst combination would be known to "
-                        f"± {196 * found[best]:.2g} %."
+                        f"± {100 * HALF_WIDTH_95 * found[best]:.2g} %."
                     )
         return tuple(said)
 
@@ -310,17 +312,17 @@ def _structural_at_random(model: Model, sensors: Sensors, recording: Recording |
 
     def lost(rows: Sequence[int]) -> tuple[np.ndarray, int]:
         """What the best draw leaves unknown, and which draw that is."""
-        null = [_null_vectors(J[:, rows], k) for k, (_, J) in enumerate(draws)]
+        null = [_null_vectors(J[:, rows]) for _, J in draws]
         best = min(range(len(null)), key=lambda k: len(null[k]))
         return null[best], best
 
     vectors, best = lost(range(C))
     vectors = reduced(vectors)
     kinds = ["mixed"] * len(vectors)
-    alike = [k for k, (_, J) in enumerate(draws) if len(_null_vectors(J[:, range(C)], k)) == len(vectors)]
+    alike = [k for k, (_, J) in enumerate(draws) if len(_null_vectors(J[:, range(C)])) == len(vectors)]
     if len(alike) > 1:
         other = next(k for k in alike if k != best)
-        again = reduced(_null_vectors(draws[other][1][:, range(C)], other))
+        again = reduced(_null_vectors(draws[other][1][:, range(C)]))
         kinds = [
             kind_of(v, w, draws[best][0][index], draws[other][0][index])
             for v, w in zip(vectors, again, strict=True)
@@ -333,7 +335,7 @@ def _structural_at_random(model: Model, sensors: Sensors, recording: Recording |
     return _structural(tuple(free), vectors, unknown, helping, False)
 
 
-def _null_vectors(J: Float[np.ndarray, "N C K"], draw: int) -> Float[np.ndarray, "n K"]:
+def _null_vectors(J: Float[np.ndarray, "N C K"]) -> Float[np.ndarray, "n K"]:
     """Directions (rows) that sensitivities map to nothing but rounding."""
     flat = J.reshape(-1, J.shape[-1])
     if not np.isfinite(flat).all():
@@ -490,15 +492,19 @@ def _with_recording(
     )
 
 
-def _other_inputs(u: Float[np.ndarray, " N"], Ts: float) -> dict[str, Float[np.ndarray, " N"]]:
-    """Inputs of the same length that may show more, by what one would say of them."""
+def _other_inputs(u: Float[np.ndarray, "N *c"], Ts: float) -> dict[str, Float[np.ndarray, "N *c"]]:
+    """Inputs of the same length that may show more, by what one would say of them; signals stay."""
+    whole, u = u, u if u.ndim == 1 else u[:, 0]
     N, most = len(u), max(float(np.abs(u).max()), 1e-12)
     rms = max(float(np.sqrt(np.mean(u**2))), 1e-12)
     noise = excitation.noise(N, Ts, seed=0)
     t = np.arange(N) * Ts
     slow = np.sin(2 * np.pi * 3 * t / max(t[-1], Ts)) * most
-    return {
+    others = {
         "an input three times as large": 3 * u,
         "noise of the same rms": noise * rms / max(float(np.sqrt(np.mean(noise**2))), 1e-12),
         "three slow swings of the same peak": slow,
     }
+    if whole.ndim == 1:
+        return others
+    return {said: np.column_stack([v, whole[:, 1:]]) for said, v in others.items()}

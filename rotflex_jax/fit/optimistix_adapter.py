@@ -104,6 +104,8 @@ def minimise_by(
         status = Status.CONVERGED
         if np.all(np.abs(np.log(here.scale / before)) < SCALE_TOLERANCE):
             break
+    else:
+        status = Status.RUNNING
     return Minimum(point, first, here, here.cost, steps, status)
 
 

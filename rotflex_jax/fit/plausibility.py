@@ -176,7 +176,7 @@ class Reach(NamedTuple):
 
     Attributes:
         input: Largest |u| [unit of the input].
-        position: Port or channel -> largest distance from the middle of its travel.
+        position: Port -> largest distance from the middle of its travel; channel -> largest |reading|.
         speed: Port -> largest speed.
         seconds: The longest recording [s].
     """

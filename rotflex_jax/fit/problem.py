@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import StackedRecordings
@@ -294,7 +294,7 @@ def likelihood_equations(
     coordinates: FitCoordinates,
     e: Float[np.ndarray, "R N C"],
     J: Float[np.ndarray, "R N C D"],
-    samples: int,
+    seen: Shaped[np.ndarray, "R N"],
     floor: Float[np.ndarray, " C"],
     room: tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]],
 ) -> LikelihoodEquations:
@@ -304,15 +304,16 @@ def likelihood_equations(
         coordinates: What moves.
         e: Errors, zero where a sample does not count.
         J: Slopes along the directions of each window.
-        samples: How many samples count.
+        seen: Not zero where a sample counts.
         floor: Least scale of each channel.
         room: How far each coordinate may go down and up.
     """
+    samples = int(np.count_nonzero(seen))
     with np.errstate(over="ignore", invalid="ignore"):
         costs = np.einsum("rnc,rnc->c", e, e) / 2
         scale = channel_scale(costs, samples, floor)
         cost = float(np.sum(samples * (np.log(scale) - 0.5) + costs / scale**2))
-        parts = coordinates.parts(e / scale, J / scale[:, None])
+        parts = coordinates.parts(e / scale, J / scale[:, None], seen)
         H, g = curvature(parts, coordinates.size), np.zeros(coordinates.size)
         for part in parts:
             g[part.columns] += part.J.reshape(-1, len(part.columns)).T @ part.e.ravel()

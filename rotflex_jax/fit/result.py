@@ -62,7 +62,7 @@ class Fit:
 
     Attributes:
         model: The fitted model.
-        cost: Negative log-likelihood per recording sample set, constants included [nat].
+        cost: Negative log-likelihood of all samples of all recordings, constants included [nat].
         status: "converged", or in words what stopped the fit.
         parameters: Estimates, free and held.
         noise: Standard deviation of the residual per channel [unit of the channel].
@@ -70,7 +70,6 @@ class Fit:
         free_names: Full names of the free parameters.
         steps: Iterations of all attempts together.
         history: Negative log-likelihood after each minimisation that led here, constants left out [nat].
-        weakest: Direction of the free parameters (in shares of their values) that the data determine least.
         local: Parameter that each recording has for itself -> its estimates, in the order of the
             recordings; `parameters` has the mean.
         remarks: Parameters at a bound, or far beyond what the recordings reach, each with a sentence.
@@ -89,7 +88,6 @@ class Fit:
     free_names: tuple[str, ...]
     steps: int
     history: tuple[float, ...] = ()
-    weakest: dict[str, float] = dataclasses.field(default_factory=dict)
     local: dict[str, tuple[Estimate, ...]] = dataclasses.field(default_factory=dict)
     remarks: tuple[Remark, ...] = ()
     options: FitOptions = FitOptions()

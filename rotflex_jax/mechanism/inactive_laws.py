@@ -38,7 +38,7 @@ from rotflex_jax.effects.base import (
     Scalar,
     Sensing,
 )
-from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, split_input
+from rotflex_jax.mechanism.assembly import effects_of, motor_inputs, split_input
 from rotflex_jax.mechanism.gear import gear_steps
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import join_chunks, split_into_chunks, states
@@ -491,8 +491,7 @@ def signal_sensitivities(
 
     def voltage(values: Array, gates: Array) -> Array:
         u, _ = split_input(samples.u)
-        v = motor_voltage(structure.with_values(values), gates, u, samples.Ts)
-        return solver.inputs(v).reshape(N, -1)
+        return motor_inputs(solver, structure.with_values(values), gates, u, samples.Ts).reshape(N, -1)
 
     def reading(values: Array, gates: Array) -> Array:
         return sensor_readings(structure.with_values(values), gates, ideal, x).T
