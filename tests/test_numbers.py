@@ -171,7 +171,7 @@ KNOWN = {
     "glossary.md": {"0.2": "time that a model may look at, a setting [s]"},
     "load_data.md": {"7.3": "version of a file of MATLAB"},
     "method.md": {
-        **dict.fromkeys(["1.5", "0.07"], "numbers of the decision, compared in test_docs.py"),
+        **dict.fromkeys(["1.5", "0.03"], "numbers of the decision, compared in test_docs.py"),
         "2.5": "selection.FREE_RUN_Z",
         "13.4": "section of a book",
     },
