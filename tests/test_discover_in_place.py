@@ -60,9 +60,9 @@ def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch
             begun[c.location] = (less.hypothesis.locations, less.free_run.hypothesis.locations, c)
         return [dataclasses.replace(model(), location=c.location) for c in starts]
 
-    def decides(found, rival, left, data):
+    def decides(found, rival, left, measured):
         assert found.location in (STRIBECK, DELAY)
-        assert (found.parameter_count, left, data) == (3, 70.0, "data")
+        assert (found.parameter_count, left, measured) == (3, 70.0, 100.0)
         asked.append(rival.location)
         return rival.location in (COULOMB, DAHL, DEAD_ZONE)
 
@@ -77,7 +77,7 @@ def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(in_place, "describe", lambda rival, found: str(rival.location))
     lines: list[str] = []
     state: Any = SimpleNamespace(
-        problem=SimpleNamespace(supermodel=supermodel(), dataset=SimpleNamespace(data="data")),
+        problem=SimpleNamespace(supermodel=supermodel(), measured_values=100.0),
         horizons=SimpleNamespace(prediction="predictions"),
         current=final,
         scores={STRIBECK: 1.0, DELAY: 2.0, ARM: 3.0},  # the last was left out again
@@ -102,7 +102,7 @@ def test_a_law_that_data_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch)
     laws = ((at_bound, COULOMB), (better, DAHL), (best, LUGRE))
     tried = [dataclasses.replace(v, location=p) for v, p in laws]
     monkeypatch.setattr(in_place, "_in_place", lambda state, p, laws: tried if p == STRIBECK else [])
-    monkeypatch.setattr(in_place, "better_in_place", lambda rival, found, data: True)
+    monkeypatch.setattr(in_place, "better_in_place", lambda rival, found, measured: True)
     monkeypatch.setattr(in_place, "_shape_at_bound", lambda s, v, known: v.location == COULOMB)
     monkeypatch.setattr(in_place, "shares_of_gain", lambda rivals, found: np.array([1.0, 1.5]))
     monkeypatch.setattr(in_place, "parameter_count", lambda s, h, p: 3)
@@ -111,7 +111,7 @@ def test_a_law_that_data_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch)
     state.scores, state.gains = {DELAY: 2.0, STRIBECK: 1.0}, {DELAY: "a", STRIBECK: "b"}
     state.rivals = {DELAY: [LAG], STRIBECK: [LUGRE, COULOMB]}
     monkeypatch.setattr(
-        SearchState, "problem", SimpleNamespace(supermodel=supermodel(), dataset=SimpleNamespace(data=None))
+        SearchState, "problem", SimpleNamespace(supermodel=supermodel(), measured_values=100.0)
     )
     monkeypatch.setattr(in_place, "predictions_apart", lambda rival, found: True)
     (note,) = in_place.take_better_laws(state)
@@ -121,7 +121,7 @@ def test_a_law_that_data_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch)
     assert list(state.gains.items()) == [(DELAY, "a"), (LUGRE, "b")]
     assert state.rivals == {DELAY: [LAG], LUGRE: [STRIBECK, COULOMB]}
     # One that they do not prefer leaves all as it is.
-    monkeypatch.setattr(in_place, "better_in_place", lambda rival, found, data: False)
+    monkeypatch.setattr(in_place, "better_in_place", lambda rival, found, measured: False)
     assert in_place.take_better_laws(state) == () and state.current.hypothesis is best.hypothesis
 
 

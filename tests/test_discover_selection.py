@@ -33,7 +33,7 @@ from rotflex_jax.recording import Recording
 
 # 60 s at 50 Hz: 120 blocks of 25 samples, on either side.
 N, BLOCKS = 3000, 120
-DATA = StackedRecordings(np.zeros((1, N)), np.zeros((1, N, 2)), np.ones((1, N)), np.array([0.02]))
+MEASURED = 2.0 * N  # values of two channels
 NOISE = np.array([1e-3, 1e-3])
 COMMON = np.random.default_rng(0).normal(size=BLOCKS) * 50
 
@@ -111,14 +111,16 @@ STRONG = {"held_out": 40.0, "train": 40.0, "windows": 5.0, "scatter": 0.3}
 
 def test_free_runs_alone_may_ask_for_an_effect():
     """Predictions that follow the data within a few samples see nothing of what acts slowly."""
-    assert admissible(at_both(NOTHING, STRONG, COULOMB), FAR, DATA, NOISE)
-    assert not admissible(at_both(NOTHING, NOTHING, COULOMB), FAR, DATA, NOISE)
+    assert admissible(at_both(NOTHING, STRONG, COULOMB), FAR, MEASURED, NOISE)
+    assert not admissible(at_both(NOTHING, NOTHING, COULOMB), FAR, MEASURED, NOISE)
     # They must be sure, on both sets, and the error must fall by more than a little.
     for spoilt in ({"scatter": 4.0}, {"train": 0.0}, {"windows": 9.5}):
-        assert not admissible(at_both(NOTHING, STRONG | spoilt, COULOMB), FAR, DATA, NOISE), spoilt
+        assert not admissible(at_both(NOTHING, STRONG | spoilt, COULOMB), FAR, MEASURED, NOISE), spoilt
     # Near the sensor noise predictions have the power, and free runs alone do not count.
     near = at_both({"windows": 1.1}, {"windows": 1.1})
-    assert not admissible(at_both({"windows": 1.1}, STRONG | {"windows": 0.9}, COULOMB), near, DATA, NOISE)
+    assert not admissible(
+        at_both({"windows": 1.1}, STRONG | {"windows": 0.9}, COULOMB), near, MEASURED, NOISE
+    )
 
 
 @pytest.mark.parametrize(
@@ -141,8 +143,8 @@ def test_free_runs_that_training_data_see_the_other_way_round_distinguish_nothin
 def test_parameters_of_predictions_need_not_suit_free_runs():
     """A candidate whose predictions gain is not refused for the free runs of its predictor's parameters."""
     worse = GOOD | {"windows": 12.0}
-    assert not admissible(at_both(worse, NOTHING, COULOMB), FAR, DATA, NOISE)
-    assert admissible(at_both(worse, STRONG, COULOMB), FAR, DATA, NOISE)
+    assert not admissible(at_both(worse, NOTHING, COULOMB), FAR, MEASURED, NOISE)
+    assert admissible(at_both(worse, STRONG, COULOMB), FAR, MEASURED, NOISE)
 
 
 def test_what_both_horizons_want_wins():
@@ -150,7 +152,7 @@ def test_what_both_horizons_want_wins():
     predicts = at_both(GOOD | {"held_out": 400.0}, STRONG | {"held_out": 10.0}, ARM)
     both = at_both(GOOD | {"held_out": 300.0}, STRONG | {"held_out": 38.0}, COULOMB)
     runs = at_both(GOOD | {"held_out": 20.0}, STRONG, DRAG)
-    assert choose([predicts, both, runs], FAR, DATA, NOISE)[0] is both
+    assert choose([predicts, both, runs], FAR, MEASURED, NOISE)[0] is both
 
 
 @pytest.mark.parametrize(
@@ -177,25 +179,25 @@ def test_what_both_horizons_want_wins():
     ],
 )
 def test_one_doubt_is_enough_to_refuse(spoilt):
-    assert admissible(trial(COULOMB, **GOOD), BASE, DATA, NOISE)
-    assert not admissible(trial(COULOMB, **GOOD | spoilt), BASE, DATA, NOISE)
+    assert admissible(trial(COULOMB, **GOOD), BASE, MEASURED, NOISE)
+    assert not admissible(trial(COULOMB, **GOOD | spoilt), BASE, MEASURED, NOISE)
 
 
 def test_near_the_noise_free_runs_need_not_get_better():
     near = trial(None, windows=1.1)
     same = {**GOOD, "windows": 1.1 * np.exp(0.5 * selection.WINDOWS_WORSE)}
-    assert admissible(trial(COULOMB, **same), near, DATA, NOISE)
+    assert admissible(trial(COULOMB, **same), near, MEASURED, NOISE)
     worse = {**GOOD, "windows": 1.1 * np.exp(2 * selection.WINDOWS_WORSE)}
-    assert not admissible(trial(COULOMB, **worse), near, DATA, NOISE)
+    assert not admissible(trial(COULOMB, **worse), near, MEASURED, NOISE)
 
 
 def test_the_likeliest_on_held_out_data_wins():
     best = trial(DRAG, **GOOD | {"held_out": 400.0, "train": 300.0})
     # More on the training data is not what counts.
     other = trial(EffectLocation("quadratic_drag", "arm"), **GOOD | {"train": 900.0}, seed=2)
-    assert choose([other, best], BASE, DATA, NOISE)[0] is best
-    assert choose([trial(ARM, held_out=-1.0)], BASE, DATA, NOISE) == (None, [])
-    assert choose([], BASE, DATA, NOISE) == (None, [])
+    assert choose([other, best], BASE, MEASURED, NOISE)[0] is best
+    assert choose([trial(ARM, held_out=-1.0)], BASE, MEASURED, NOISE) == (None, [])
+    assert choose([], BASE, MEASURED, NOISE) == (None, [])
 
 
 def test_what_cannot_be_told_apart_is_named_together():
@@ -205,13 +207,13 @@ def test_what_cannot_be_told_apart_is_named_together():
     assert paired_gain(best.blocks, close.blocks)[0] == pytest.approx(10.0)
     far = trial(EffectLocation("gravity", "arm"), **GOOD | {"held_out": 100.0, "train": 100.0}, seed=3)
     refused = trial(EffectLocation("dead_zone", "input"), **GOOD | {"train": 0.0}, seed=4)
-    winner, rivals = choose([far, close, refused, best], BASE, DATA, NOISE)
+    winner, rivals = choose([far, close, refused, best], BASE, MEASURED, NOISE)
     assert winner is best and rivals == [close]
     # The same difference without scatter is beyond doubt, where both leave little more than noise.
     near = GOOD | {"windows": 1.5}
     best = trial(DRAG, **near | {"held_out": 210.0, "train": 210.0}, seed=1)
     steady = trial(HARDENING, **near | {"held_out": 200.0, "train": 200.0}, seed=1)
-    assert choose([steady, best], BASE, DATA, NOISE) == (best, [])
+    assert choose([steady, best], BASE, MEASURED, NOISE) == (best, [])
 
 
 def test_of_what_cannot_be_told_apart_dry_friction_goes_first():
@@ -219,24 +221,24 @@ def test_of_what_cannot_be_told_apart_dry_friction_goes_first():
     drag = trial(DRAG, **GOOD | {"held_out": 210.0, "train": 210.0}, seed=1)
     close = GOOD | {"held_out": 200.0, "train": 200.0, "scatter": 3.0}
     friction = trial(ARM, **close, seed=2, numbers=4)
-    assert choose([drag, friction], BASE, DATA, NOISE) == (friction, [drag])
+    assert choose([drag, friction], BASE, MEASURED, NOISE) == (friction, [drag])
     # Where the parameters of predictions make its runs a tenth worse, it may be a stand-in.
     for share, first in ((0.99, True), (1.01, False)):
         windows = 5.0 * np.exp(share * selection.WINDOWS_APART)
         slower = trial(ARM, **close | {"windows": windows}, seed=2)
-        assert (choose([drag, slower], BASE, DATA, NOISE)[0] is slower) is first
+        assert (choose([drag, slower], BASE, MEASURED, NOISE)[0] is slower) is first
 
 
 def test_a_rival_need_not_pass_what_the_winner_passed():
     """Small effects: the winner just passes, the truth just fails, and nothing tells the two apart."""
     best = trial(DRAG, **GOOD | {"held_out": 30.0, "train": 30.0, "scatter": 1.0}, seed=1)
     missed = trial(ARM, **GOOD | {"held_out": 4.0, "train": 25.0, "scatter": 1.0}, seed=2)
-    assert not admissible(missed, BASE, DATA, NOISE)
-    assert choose([missed, best], BASE, DATA, NOISE) == (best, [missed])
+    assert not admissible(missed, BASE, MEASURED, NOISE)
+    assert choose([missed, best], BASE, MEASURED, NOISE) == (best, [missed])
     # One that gains nothing is none, nor one whose free runs are clearly worse.
-    assert choose([trial(ARM, held_out=-4.0, train=25.0, scatter=1.0), best], BASE, DATA, NOISE)[1] == []
+    assert choose([trial(ARM, held_out=-4.0, train=25.0, scatter=1.0), best], BASE, MEASURED, NOISE)[1] == []
     far = trial(ARM, **GOOD | {"held_out": 4.0, "train": 25.0, "scatter": 1.0, "windows": 5.0 * 1.2}, seed=2)
-    assert choose([far, best], BASE, DATA, NOISE) == (best, [])
+    assert choose([far, best], BASE, MEASURED, NOISE) == (best, [])
 
 
 def test_both_sides_tell_apart():
@@ -252,17 +254,17 @@ def test_the_simpler_effect_wins_unless_the_richer_earns_it():
     """Stribeck friction contains Coulomb friction."""
     plain = trial(COULOMB, **GOOD, seed=1)
     little = trial(STRIBECK, **GOOD | {"held_out": 206.0, "train": 206.0}, seed=1, numbers=3)
-    winner, rivals = choose([little, plain], BASE, DATA, NOISE)
+    winner, rivals = choose([little, plain], BASE, MEASURED, NOISE)
     assert winner is plain and rivals == []  # nor is it named as a rival of itself
     much = trial(STRIBECK, **GOOD | {"held_out": 300.0, "train": 300.0}, seed=1, numbers=3)
-    winner, rivals = choose([plain, much], BASE, DATA, NOISE)
+    winner, rivals = choose([plain, much], BASE, MEASURED, NOISE)
     assert winner is much and rivals == []
     # At another port it is another effect, which must gain as much with as many parameters.
     elsewhere = trial(ARM, **GOOD, seed=1, numbers=3)
-    assert choose([elsewhere, little], BASE, DATA, NOISE)[0] is little
+    assert choose([elsewhere, little], BASE, MEASURED, NOISE)[0] is little
     # Where the simpler one is refused, the richer stands alone.
     weak = trial(COULOMB, **GOOD | {"windows": 11.0}, seed=1)
-    assert choose([weak, little], BASE, DATA, NOISE)[0] is little
+    assert choose([weak, little], BASE, MEASURED, NOISE)[0] is little
 
 
 # -- held-out recordings --------------------------------------------------------------------------
@@ -319,7 +321,7 @@ def test_friction_that_is_there_is_admitted_and_friction_that_is_not_is_refused(
         more = dataclasses.replace(h, locations=(*h.locations, sp.HUB), free=(*h.free, i), z=z)
         more = levenberg_marquardt(train, [more])[0]
         added = dataclasses.replace(validate(validation, more), location=sp.HUB, parameter_count=1)
-        assert admissible(added, validate(validation, h), train.dataset.data, sp.NOISE) is expected
+        assert admissible(added, validate(validation, h), train.measured_values, sp.NOISE) is expected
 
 
 def test_errors_of_windows_leave_out_what_a_model_has_seen(sides):
@@ -342,13 +344,13 @@ def test_runs_that_diverge_are_worse_than_all_others() -> None:
     gained = {"held_out": 100.0, "train": 100.0}
     diverged = dataclasses.replace(of_free_runs(windows=np.inf), parameter_count=9)
     steady = at_both({"windows": 5.0}, {"windows": 5.0}, DAHL)
-    assert not admissible(diverged, FAR, DATA, NOISE)
-    assert not better_in_place(diverged, steady, DATA)
+    assert not admissible(diverged, FAR, MEASURED, NOISE)
+    assert not better_in_place(diverged, steady, MEASURED)
     for prediction, free_run in ((np.inf, 5.0), (5.0, np.inf)):
         half = at_both(gained | {"windows": prediction}, gained | {"windows": free_run}, COULOMB)
         assert best_window_rmse(half) == pytest.approx(5.0 * NOISE)
     both = at_both(gained | {"windows": np.inf}, gained | {"windows": np.inf}, COULOMB)
-    assert not admissible(both, FAR, DATA, NOISE)
+    assert not admissible(both, FAR, MEASURED, NOISE)
     assert not runs_clearly_better(both.window_rmse, both.window_rmse)
     assert runs_clearly_better(steady.window_rmse, both.window_rmse)
     assert "free runs diverge; fitted to free runs they diverge" in describe(both, FAR)
@@ -359,12 +361,12 @@ def test_of_two_that_nothing_distinguishes_the_one_with_fewer_parameters_leads()
     many = trial(ARM, held_out=210.0, **close, seed=2, numbers=2)
     few = trial(COULOMB, held_out=200.0, **close, numbers=1)
     assert not distinguished(many, few)
-    winner, rivals = choose([many, few], BASE, DATA, NOISE)
+    winner, rivals = choose([many, few], BASE, MEASURED, NOISE)
     assert winner is few and rivals == [many]
     # As many parameters: the larger gain. Beyond doubt better: the better one, whatever it takes.
-    assert choose([many, dataclasses.replace(few, parameter_count=2)], BASE, DATA, NOISE)[0] is many
+    assert choose([many, dataclasses.replace(few, parameter_count=2)], BASE, MEASURED, NOISE)[0] is many
     better = trial(ARM, held_out=400.0, train=400.0, windows=5.0, scatter=3.0, seed=2, numbers=2)
-    assert distinguished(better, few) and choose([better, few], BASE, DATA, NOISE) == (better, [])
+    assert distinguished(better, few) and choose([better, few], BASE, MEASURED, NOISE) == (better, [])
 
 
 @pytest.mark.parametrize(
@@ -377,9 +379,9 @@ def test_a_model_that_leaves_much_does_not_distinguish_effects_that_gain_nearly_
     strong = trial(ARM, held_out=1000.0, train=1000.0, windows=windows)
     weak = trial(COULOMB, held_out=1000.0 * share, train=1000.0 * share, windows=windows)
     assert distinguished(strong, weak)
-    assert choose([strong, weak], BASE, DATA, NOISE) == (strong, [weak] if alike else [])
+    assert choose([strong, weak], BASE, MEASURED, NOISE) == (strong, [weak] if alike else [])
     few = dataclasses.replace(strong, parameter_count=2), weak
-    assert choose([*few], BASE, DATA, NOISE)[0] is few[alike]
+    assert choose([*few], BASE, MEASURED, NOISE)[0] is few[alike]
 
 
 # What decides about a limit is so far from it, as a share of it.
@@ -394,7 +396,7 @@ def scatter_for(z: float, nats: float) -> float:
 
 
 def admitted(base=BASE, numbers: int = 1, **changes: float) -> bool:
-    return admissible(trial(COULOMB, **PLENTY | changes, numbers=numbers), base, DATA, NOISE)
+    return admissible(trial(COULOMB, **PLENTY | changes, numbers=numbers), base, MEASURED, NOISE)
 
 
 @SIDES
@@ -453,12 +455,12 @@ def of_free_runs(windows: float = 5.0, z: float = 50.0, train_z: float = 50.0):
 @SIDES
 @pytest.mark.parametrize("which", ["z", "train_z"])
 def test_free_runs_alone_are_two_and_a_half_deviations_sure(side: float, which: str) -> None:
-    assert admissible(of_free_runs(**{which: 2.5 * side}), FAR, DATA, NOISE) is (side > 1)
+    assert admissible(of_free_runs(**{which: 2.5 * side}), FAR, MEASURED, NOISE) is (side > 1)
 
 
 @SIDES
 def test_free_runs_alone_fall_by_a_tenth(side: float) -> None:
-    assert admissible(of_free_runs(windows=10.0 * np.exp(-0.1 * side)), FAR, DATA, NOISE) is (side > 1)
+    assert admissible(of_free_runs(windows=10.0 * np.exp(-0.1 * side)), FAR, MEASURED, NOISE) is (side > 1)
 
 
 @SIDES
@@ -483,7 +485,7 @@ def richer_wins(**changes: float) -> bool:
     plain = trial(COULOMB, held_out=2000.0, train=2000.0, windows=5.0)
     lead = {"held_out": 2000.0 + given["held_out"], "train": 2000.0 + given["train"]}
     rich = trial(STRIBECK, **lead, windows=given["windows"], scatter=given["scatter"], numbers=3)
-    return choose([plain, rich], BASE, DATA, NOISE)[0] is rich
+    return choose([plain, rich], BASE, MEASURED, NOISE)[0] is rich
 
 
 @SIDES
@@ -506,7 +508,7 @@ def test_the_richer_effect_has_three_thousandths_of_the_gain(side: float) -> Non
     plain = trial(COULOMB, held_out=10_000.0, train=10_000.0, windows=5.0)
     more = 10_000.0 * 0.003 * side / (1 - 0.003 * side)
     rich = trial(STRIBECK, held_out=10_000.0 + more, train=10_100.0, windows=5.0, numbers=3)
-    assert (choose([plain, rich], BASE, DATA, NOISE)[0] is rich) is (side > 1)
+    assert (choose([plain, rich], BASE, MEASURED, NOISE)[0] is rich) is (side > 1)
 
 
 @SIDES
@@ -529,13 +531,13 @@ def not_quite_sure(z: float, **changes: float) -> dict[str, float]:
 def test_uncertain_free_runs_are_enough_where_predictions_run_a_tenth_better(side: float) -> None:
     predictions = not_quite_sure(3.0, windows=10.0 * np.exp(-0.1 * side))
     found = at_both(predictions, {"windows": 10.0}, COULOMB)
-    assert admissible(found, FAR, DATA, NOISE) is (side > 1)
+    assert admissible(found, FAR, MEASURED, NOISE) is (side > 1)
 
 
 @SIDES
 def test_or_where_predictions_are_three_and_a_half_deviations_sure(side: float) -> None:
     found = at_both(not_quite_sure(3.5 * side, windows=10.0 * np.exp(-0.05)), {"windows": 10.0}, COULOMB)
-    assert admissible(found, FAR, DATA, NOISE) is (side > 1)
+    assert admissible(found, FAR, MEASURED, NOISE) is (side > 1)
 
 
 @SIDES
@@ -544,7 +546,7 @@ def test_far_from_the_noise_a_rival_with_nine_tenths_of_the_gain_is_alike(side: 
     strong = trial(ARM, held_out=1000.0, train=1000.0, windows=5.0)
     weak = trial(COULOMB, held_out=900.0 * side, train=900.0, windows=5.0)
     assert distinguished(strong, weak)
-    assert (choose([strong, weak], BASE, DATA, NOISE)[1] == [weak]) is (side > 1)
+    assert (choose([strong, weak], BASE, MEASURED, NOISE)[1] == [weak]) is (side > 1)
 
 
 @SIDES
@@ -605,7 +607,7 @@ def test_a_law_takes_the_place_of_another_one_where_both_horizons_prefer_it(side
     given = {"held_out": 100.0, "train": 100.0, "windows": 3.0, "scatter": 0.0} | {what: limits[what]}
     found = at_both({"windows": 5.0}, {"windows": 5.0}, COULOMB)
     rival = dataclasses.replace(at_both(given, {"windows": 5.0, **AHEAD}, DAHL), parameter_count=2)
-    assert better_in_place(rival, found, DATA) is (side > 1)
+    assert better_in_place(rival, found, MEASURED) is (side > 1)
 
 
 @pytest.mark.parametrize("kind", ["held_out", "train"])
@@ -616,7 +618,7 @@ def test_a_law_that_free_runs_speak_against_takes_no_place(kind: str) -> None:
     for lead, taken in ((1.0, True), (-1.0, False)):
         runs = {"windows": 5.0, **AHEAD, kind: lead}
         rival = dataclasses.replace(at_both(given, runs, DAHL), parameter_count=2)
-        assert better_in_place(rival, found, DATA) is taken
+        assert better_in_place(rival, found, MEASURED) is taken
 
 
 @SIDES
@@ -637,7 +639,7 @@ def test_a_law_takes_the_place_where_free_runs_insist_and_predictions_do_not_obj
         runs |= {what: limits[what]}
     found = at_both({"windows": 5.0}, {"windows": 5.0}, COULOMB)
     rival = dataclasses.replace(at_both(predictions, runs, DAHL), parameter_count=9)
-    assert better_in_place(rival, found, DATA) is (side > 1)
+    assert better_in_place(rival, found, MEASURED) is (side > 1)
 
 
 @SIDES
@@ -671,29 +673,29 @@ def lead(a: ValidatedHypothesis, b: ValidatedHypothesis = BASE) -> tuple[float, 
 @pytest.mark.parametrize(
     ("name", "value", "decides", "expected"),
     [
-        ("HELD_OUT_NATS", lead(NOT_SURE)[0], lambda: admissible(NOT_SURE, BASE, DATA, NOISE), UNTIL),
-        ("HELD_OUT_Z", lead(NOT_SURE)[1], lambda: admissible(NOT_SURE, BASE, DATA, NOISE), UNTIL),
+        ("HELD_OUT_NATS", lead(NOT_SURE)[0], lambda: admissible(NOT_SURE, BASE, MEASURED, NOISE), UNTIL),
+        ("HELD_OUT_Z", lead(NOT_SURE)[1], lambda: admissible(NOT_SURE, BASE, MEASURED, NOISE), UNTIL),
         (
             "TRAIN_Z",
             paired_gain(NOT_SURE.hypothesis.blocks, BASE.hypothesis.blocks)[1],
-            lambda: admissible(NOT_SURE, BASE, DATA, NOISE),
+            lambda: admissible(NOT_SURE, BASE, MEASURED, NOISE),
             UNTIL,
         ),
         ("HELD_OUT_Z", 3.25, lambda: helps(HorizonGain(10.0, 3.25, 1.0)), UNTIL),
         (
             "FREE_RUN_Z",
             lead(RUNS.free_run, FAR.free_run)[1],
-            lambda: admissible(RUNS, FAR, DATA, NOISE),
+            lambda: admissible(RUNS, FAR, MEASURED, NOISE),
             UNTIL,
         ),
-        ("FREE_RUN_BETTER", np.log(10 / 8), lambda: admissible(RUNS, FAR, DATA, NOISE), None),
+        ("FREE_RUN_BETTER", np.log(10 / 8), lambda: admissible(RUNS, FAR, MEASURED, NOISE), None),
         (
             "PREDICTION_Z",
             min(
                 lead(UNSURE_RUNS, FAR)[1],
                 paired_gain(UNSURE_RUNS.hypothesis.blocks, FAR.hypothesis.blocks)[1],
             ),
-            lambda: admissible(UNSURE_RUNS, FAR, DATA, NOISE),
+            lambda: admissible(UNSURE_RUNS, FAR, MEASURED, NOISE),
             UNTIL,
         ),
         (
@@ -717,7 +719,7 @@ def lead(a: ValidatedHypothesis, b: ValidatedHypothesis = BASE) -> tuple[float, 
         (
             "WINDOWS_BETTER",
             -float(np.mean(np.log(trial(COULOMB, **GOOD).window_rmse / BASE.window_rmse))),
-            lambda: admissible(trial(COULOMB, **GOOD), BASE, DATA, NOISE),
+            lambda: admissible(trial(COULOMB, **GOOD), BASE, MEASURED, NOISE),
             UNTIL,
         ),
         (
@@ -747,14 +749,14 @@ def test_exactly_twice_the_noise_is_near_it() -> None:
     base = trial(None, windows=2.0)
     assert admitted(base, windows=2.0)  # far from it the error would have to fall
     strong, weak = (trial(p, n, n, 2.0) for p, n in ((ARM, 1000.0), (COULOMB, 950.0)))
-    assert choose([strong, weak], BASE, DATA, NOISE) == (strong, [])
+    assert choose([strong, weak], BASE, MEASURED, NOISE) == (strong, [])
 
 
 def test_a_rival_gains_something_on_either_side() -> None:
     best = trial(DRAG, **GOOD | {"held_out": 30.0, "train": 30.0, "scatter": 1.0})
     for nothing in ({"held_out": 0.0, "train": 25.0}, {"held_out": 25.0, "train": 0.0}):
         none = trial(ARM, **GOOD | nothing | {"scatter": 0.0}, seed=2)
-        assert choose([none, best], BASE, DATA, NOISE) == (best, [])
+        assert choose([none, best], BASE, MEASURED, NOISE) == (best, [])
 
 
 # -- rivals in the place of an effect of a model that leaves much -----------------------------------------
@@ -775,7 +777,7 @@ def in_place(location=DAHL, z=4.0, windows=10.0, numbers=3, better=False, **lead
 
 def remains(other: ValidatedHypothesis, left: float = LEFT) -> bool:
     found = dataclasses.replace(at_both({"windows": 20.0}, {"windows": 10.0}, STRIBECK), parameter_count=3)
-    return selection.undecided(found, other, left, DATA)
+    return selection.undecided(found, other, left, MEASURED)
 
 
 @SIDES

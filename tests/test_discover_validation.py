@@ -51,4 +51,4 @@ def test_a_model_that_diverges_on_held_out_data_is_refused(sides):
     lost = validate(validation, dataclasses.replace(h, z=z))
     lost = dataclasses.replace(lost, location=sp.HUB, parameter_count=1)
     assert not np.isfinite(lost.window_rmse).all() and np.isfinite(lost.blocks).all()
-    assert not admissible(lost, validate(validation, h), train.dataset.data, sp.NOISE)
+    assert not admissible(lost, validate(validation, h), train.measured_values, sp.NOISE)

@@ -66,7 +66,7 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
         laws = [p for p in s.other_laws(location) if p not in state.current.hypothesis.locations]
         known = _as_found(state, location)
         fitted = _in_place(state, location, laws)
-        better = [v for v in fitted if better_in_place(v, known, state.problem.dataset.data)]
+        better = [v for v in fitted if better_in_place(v, known, state.problem.measured_values)]
         better = [v for v in better if not _shape_at_bound(s, v, known)]
         if not better:
             continue
@@ -125,8 +125,10 @@ def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLoca
             state.say(f"  in the place of {location}, " + describe(rival, final))
         # One that is refitted at its line has passed already beside the models of its round.
         remaining[location] = [p for p in rivals if CATALOG[p.effect].line]
-        data = state.problem.dataset.data
-        remaining[location] += [t.location for t in fitted if t.location and undecided(known, t, left, data)]
+        measured = state.problem.measured_values
+        remaining[location] += [
+            t.location for t in fitted if t.location and undecided(known, t, left, measured)
+        ]
     return remaining
 
 

@@ -243,10 +243,10 @@ def find_pair(
         return None, []
     say("looking one step further, refitting " + ", ".join(_named(a.locations) for a, _ in pairs))
     problem = horizons.prediction.problem
-    data, noise, s = problem.dataset.data, problem.noise, problem.supermodel
+    measured, noise, s = problem.measured_values, problem.noise, problem.supermodel
     tried = validated_pairs(horizons, current, pairs, is_plausible)
     _say_gains(tried, current, say)
-    able = {p: v for p, v in tried.items() if admissible(v, current, data, noise)}
+    able = {p: v for p, v in tried.items() if admissible(v, current, measured, noise)}
     everyone = list(tried.values())
     if not able:
         return None, everyone
@@ -261,7 +261,7 @@ def find_pair(
                 everyone.append(fitted[left])
             less = fitted[left]
             count = parameter_count(s, found.hypothesis, p)
-            if not admissible(dataclasses.replace(found, parameter_count=count), less, data, noise):
+            if not admissible(dataclasses.replace(found, parameter_count=count), less, measured, noise):
                 say(f"  {_named(pair)}: no better than without {p}")
                 break
             members[p] = less

@@ -291,7 +291,10 @@ class ScoreTest:
         found = []
         for i, a in enumerate(by_shape):
             for b in by_shape[i + 1 :]:
-                if a and b and not _contain_each_other(a[0][0].candidate, b[0][0].candidate):
+                if not (a and b):
+                    continue
+                one, other = a[0][0].candidate.location, b[0][0].candidate.location
+                if not (one.contains(other) or other.contains(one)):
                     found.append(self._best_pair(gram, a, b, alone))
         return found
 
@@ -379,12 +382,6 @@ class _Gram(NamedTuple):
         )
         a[keep] = np.minimum(a[keep], most[keep] * size[keep])  # without slope there is no amplitude
         return a / np.where(keep, size, 1.0), float(-a @ b - 0.5 * a @ G @ a)
-
-
-def _contain_each_other(a: Candidate, b: Candidate) -> bool:
-    """Whether one of two candidates is the other and something more."""
-    (first, port), (second, other) = a.location, b.location
-    return port == other and (first in CATALOG[second].contains or second in CATALOG[first].contains)
 
 
 def promising_at_both(prediction: list[Score], free_run: list[Score], most: int) -> list[tuple[Score, Score]]:

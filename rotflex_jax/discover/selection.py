@@ -23,10 +23,8 @@ from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.score_test import Score, promising
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
-from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.effects.labels import law_of
-from rotflex_jax.fit.dataset import StackedRecordings
 
 # An effect must gain this on validation data [nat], beyond this many standard deviations of the block gains,
 # and this on the training data after half a log N per parameter, beyond as many standard deviations.
@@ -133,7 +131,7 @@ def mean_log_ratio(a: Float[np.ndarray, " C"], b: Float[np.ndarray, " C"]) -> fl
 def admissible(
     candidate: ValidatedHypothesis,
     current: ValidatedHypothesis,
-    data: StackedRecordings,
+    measured: float,
     noise: Float[np.ndarray, " C"],
 ) -> bool:
     """Whether what a candidate adds is there beyond doubt.
@@ -141,12 +139,12 @@ def admissible(
     Args:
         candidate: The richer hypothesis.
         current: Without what it adds.
-        data: Training recordings.
+        measured: How many values of training recordings were measured.
         noise: Standard deviation of the sensor noise of each channel.
     """
     nats, z = paired_gain(candidate.blocks, current.blocks)
     train, train_z = _training_gain(candidate, current)
-    needed = _needed(candidate.parameter_count, data)
+    needed = needed_gain(candidate.parameter_count, measured)
     # Likelihood is about the next samples, a user's free runs are about many: both must agree. Far from the
     # sensor noise, an effect that leaves free runs as they were is flexibility, not a discovery.
     far = is_poor(current, noise)
@@ -191,7 +189,7 @@ def shares_of_gain(
 def choose(
     candidates: list[ValidatedHypothesis],
     current: ValidatedHypothesis,
-    data: StackedRecordings,
+    measured: float,
     noise: Float[np.ndarray, " C"],
 ) -> tuple[ValidatedHypothesis | None, list[ValidatedHypothesis]]:
     """The best admissible candidate and those not distinguished from it; arguments as in `admissible`.
@@ -201,7 +199,7 @@ def choose(
     A rival need not pass every test that the winner passed: where the effect is small, which of the two
     passes is chance. It is enough that it gains something and that nothing distinguishes it from the winner.
     """
-    able = [t for t in candidates if admissible(t, current, data, noise)]
+    able = [t for t in candidates if admissible(t, current, measured, noise)]
     if not able:
         return None, []
     shares = {t.location: share for t, share in zip(able, shares_of_gain(able, current), strict=True)}
@@ -234,9 +232,7 @@ def _plausibility(t: ValidatedHypothesis) -> tuple[bool, int]:
     return law_of(t.location.effect) != DRY_FRICTION, t.parameter_count
 
 
-def undecided(
-    found: ValidatedHypothesis, rival: ValidatedHypothesis, left: float, data: StackedRecordings
-) -> bool:
+def undecided(found: ValidatedHypothesis, rival: ValidatedHypothesis, left: float, measured: float) -> bool:
     """Whether a rival in the place of an effect of a poor model remains possible.
 
     What such a model lacks suits one of two laws better than the other. It cannot make the whole difference
@@ -248,9 +244,9 @@ def undecided(
         found: The model that was found; `parameter_count` is that of the effect.
         rival: The same with the rival in the place of the effect.
         left: What predictions of training and validation data leave above the sensor noise [nat].
-        data: Training recordings.
+        measured: How many values of training recordings were measured.
     """
-    if _contained(found, rival) and not (_is_worth(rival, found, data) or _leads(rival, found)):
+    if _contained(found, rival) and not (_is_worth(rival, found, measured) or _leads(rival, found)):
         return False
     lost = paired_gain(found.blocks, rival.blocks)[0] + _training_gain(found, rival)[0]
     if predictions_apart(found, rival) and lost > left:
@@ -258,7 +254,7 @@ def undecided(
     return _free_run_certainty(found, rival) < FREE_RUN_Z or log_best_ratio(rival, found) < LAWS_APART
 
 
-def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, data: StackedRecordings) -> bool:
+def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, measured: float) -> bool:
     """Whether a rival is to take the place of an effect.
 
     Predictions prefer it beyond doubt, and free runs by a tenth over training and over validation data; or
@@ -267,13 +263,13 @@ def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, data
     Args:
         rival: The model with the rival in the place of the effect.
         found: The model that was found; `parameter_count` is that of the effect.
-        data: Training recordings.
+        measured: How many values of training recordings were measured.
     """
     if _free_runs_insist(rival, found) and not predictions_apart(found, rival):
         return True
     more = max(rival.parameter_count - found.parameter_count, 0)
     gains = paired_gain(rival.blocks, found.blocks)[0], _training_gain(rival, found)[0]
-    enough = gains[0] > HELD_OUT_NATS and gains[1] > _needed(more, data)
+    enough = gains[0] > HELD_OUT_NATS and gains[1] > needed_gain(more, measured)
     return enough and predictions_apart(rival, found) and free_runs_apart(rival, found)
 
 
@@ -286,22 +282,21 @@ def _leads(rich: ValidatedHypothesis, simple: ValidatedHypothesis) -> bool:
     return min(certainty) > SEPARATE_Z or _free_run_certainty(rich, simple) > SEPARATE_Z
 
 
-def _is_worth(rich: ValidatedHypothesis, simple: ValidatedHypothesis, data: StackedRecordings) -> bool:
+def _is_worth(rich: ValidatedHypothesis, simple: ValidatedHypothesis, measured: float) -> bool:
     """Whether predictions of validation data prefer a generalisation, and of training data after the penalty.
 
     Args:
         rich: The generalisation.
         simple: What it contains.
-        data: Training recordings.
+        measured: How many values of training recordings were measured.
     """
     more = rich.parameter_count - simple.parameter_count
     gain = rich.log_likelihood - simple.log_likelihood
-    return gain > 0 and _training_gain(rich, simple)[0] > _needed(more, data)
+    return gain > 0 and _training_gain(rich, simple)[0] > needed_gain(more, measured)
 
 
-def _needed(parameter_count: int, data: StackedRecordings) -> float:
+def needed_gain(parameter_count: int, measured: float) -> float:
     """Gain on training data that so many more parameters have to bring [nat]."""
-    measured = float(np.sum(data.seen)) * data.y.shape[-1]
     return TRAIN_NATS + 0.5 * parameter_count * float(np.log(measured))
 
 
@@ -336,7 +331,7 @@ def replaced_by(
     lost = [
         p
         for p in share
-        if share[p] >= REPLACED_SHARE and p not in tried and not _is_in(winner, p) and p != winner
+        if share[p] >= REPLACED_SHARE and p not in tried and not p.contains(winner) and p != winner
     ]
     return sorted(lost, key=lambda p: -share[p])[:REPLACED]
 
@@ -400,12 +395,7 @@ def _alike(
 def _related(a: ValidatedHypothesis, b: ValidatedHypothesis) -> bool:
     """Whether one of two effects is a special case of the other."""
     assert a.location and b.location
-    return related(a.location, b.location)
-
-
-def related(a: EffectLocation, b: EffectLocation) -> bool:
-    """Whether one of two effects is a special case of the other."""
-    return _is_in(a, b) or _is_in(b, a)
+    return a.location.contains(b.location) or b.location.contains(a.location)
 
 
 def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
@@ -428,11 +418,7 @@ def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
     """Whether `large` has the effect of `small` as a special case."""
     a, b = small.location, large.location
     assert a and b
-    return _is_in(a, b)
-
-
-def _is_in(small: EffectLocation, large: EffectLocation) -> bool:
-    return small.port == large.port and small.effect in CATALOG[large.effect].contains
+    return b.contains(a)
 
 
 def _clearly_better(

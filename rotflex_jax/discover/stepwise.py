@@ -28,12 +28,12 @@ from rotflex_jax.discover.likelihood import (
 from rotflex_jax.discover.selection import (
     FREE_RUN_BETTER,
     FREE_RUN_Z,
-    TRAIN_NATS,
     TRAIN_Z,
     WINDOWS_BETTER,
     distinguished,
     log_best_ratio,
     mean_log_ratio,
+    needed_gain,
     paired_gain,
     runs_clearly_better,
 )
@@ -156,9 +156,7 @@ def refit_candidates(
         (i, replacing(s, refitted[j], [b.location], a, AMPLITUDE_SHARES[-1]))
         for i, a in enumerate(starts)
         for j, b in enumerate(starts)
-        if a.location.port == b.location.port
-        and b.location.effect in CATALOG[a.location.effect].contains
-        and refitted[i].log_likelihood < refitted[j].log_likelihood
+        if a.location.contains(b.location) and refitted[i].log_likelihood < refitted[j].log_likelihood
     ]
     return refit_from(problem, refitted, below)
 
@@ -244,7 +242,7 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
         rivals = refit(problem, [without(s, h, p) for p in tested], alternations=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
         count = {p: parameter_count(s, h, p) for p in worth}
-        needed = {p: TRAIN_NATS + 0.5 * count[p] * np.log(problem.measured_values) for p in worth}
+        needed = {p: needed_gain(count[p], problem.measured_values) for p in worth}
         surplus = {p: worth[p] - needed[p] for p in worth}
         for p, r in zip(tested, rivals, strict=True):
             if p in s.calibrations:
@@ -427,8 +425,7 @@ def merge_effects(
         for simple in order
         if simple not in calibrations
         for rich in s.candidates
-        if calibrations and rich.port == simple.port
-        if simple.effect in CATALOG[rich.effect].contains and rich not in order
+        if calibrations and rich.contains(simple) and rich not in order
         if CATALOG[rich.effect].state_part != "memory"
     ]
     if not pairs:

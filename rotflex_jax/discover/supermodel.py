@@ -86,6 +86,10 @@ class EffectLocation(NamedTuple):
     def __str__(self) -> str:
         return f"{self.effect} at {self.port}"
 
+    def contains(self, other: "EffectLocation") -> bool:
+        """Whether another effect is a special case of this one."""
+        return self.port == other.port and other.effect in CATALOG[self.effect].contains
+
 
 class ErrorLine(NamedTuple):
     """A line in the spectrum of a model's errors that the input has not.
