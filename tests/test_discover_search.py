@@ -12,7 +12,7 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import Discovery, forward_selection, search_state
-from rotflex_jax.discover.verdict import NEAR_FLOOR, Assessment, in_noise
+from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS, Assessment, in_noise
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import check_apart, shared_samples
 from rotflex_jax.runtime.persistent_jit import program_counts, release_programs
@@ -96,6 +96,25 @@ def test_without_known_noise_the_criterion_says_so() -> None:
     for remaining in ({"theta": NAN, "alpha": 2.0}, {"alpha": 2.0, "theta": NAN}):
         assert Assessment({}, remaining, 0.0).criterion.startswith("the error of alpha in short")
     assert in_noise({"theta": 1.2, "alpha": NAN}) == "theta 1.20, alpha an unknown number of"
+
+
+@pytest.mark.parametrize("torque_constant", [0.4, 1.6])
+def test_the_error_of_a_coarse_integration_is_no_missing_physics(torque_constant: float) -> None:
+    """Sliding that stops within a sample of 5 ms, whatever the motor's constant that the user starts from.
+
+    With the step of the search, the predictor asks for random torques worth 0.1 nat per value.
+    """
+    made = make_record([("coulomb", "hub")], kind="noise", seed=3, seconds=12.0, fs=200.0)
+    train, validation = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"]).split(0.7)
+    joint = rf.joints.paper()
+    name = "hub.motor.torque_constant"
+    known = dict(zip(joint.parameter_names, joint.values, strict=True))[name]
+    started = joint.with_values({name: torque_constant * known})
+    candidates = [(fx.Coulomb, "hub"), (fx.Gravity, "hub")]
+    found = rf.discover(started, train, validation, candidates=candidates, rounds=1)
+    assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
+    assert found.verdict == "found", found.sentence
+    assert abs(found.assessment.torque_nats) < TORQUE_NATS / 3
 
 
 def test_a_calibration_has_its_gain_at_either_horizon(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ No choice of effects rests on anything here.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -185,6 +186,8 @@ def evaluate(
 ) -> Stage:
     """What is reported of a hypothesis: estimates with intervals, its free runs and their errors.
 
+    What process torques gain is asked of predictions; `summary` adds it.
+
     Args:
         problem: With the training recordings.
         validation: The validation recordings.
@@ -209,7 +212,7 @@ def evaluate(
         windowed=runs.windows,
         window_seconds=validation.window_seconds,
         process_noise=h.process_noise,
-        process_noise_nats=0.0 if problem.free_run else process_noise_gain(problem, h),
+        process_noise_nats=math.nan,
         log_likelihood=validated.log_likelihood,
         horizon="free_run" if problem.free_run else "prediction",
         of_validation=tuple(Model(m, solver) for m in of_each),
@@ -219,9 +222,11 @@ def evaluate(
 def process_noise_gain(problem: LikelihoodProblem, h: Hypothesis) -> float:
     """Log-likelihood per measured value that process torques gain over a free run [nat].
 
-    The parameters are the same.
+    The parameters are the same. The free run has the least process torques, a share of those of the motor as
+    it was fitted: the values that a user starts from do not matter.
     """
-    free_run = problem.with_process_noise(h, dict.fromkeys(problem.ports, problem.process_noise_range[0]))
+    least = dict.fromkeys(problem.ports, problem.least_process_noise(h))
+    free_run = problem.with_process_noise(h, least)
     with_noise, without = problem.log_likelihoods([h, free_run])
     return (with_noise - without) / problem.measured_values
 

@@ -17,7 +17,7 @@ from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions,
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener, fit_whitener
 from rotflex_jax.discover.supermodel import SuperModel
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows
+from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows, torque_scale
 from rotflex_jax.mechanism import Exponential, Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
@@ -130,6 +130,12 @@ class LikelihoodProblem:
         """
         unit = self.dataset.torque_scale**2 * float(self.dataset.data.Ts[0])
         return MIN_PROCESS_NOISE_SHARE * unit, MAX_PROCESS_NOISE_SHARE * unit
+
+    def least_process_noise(self, h: Hypothesis) -> float:
+        """The least intensity by the motor of a hypothesis, not by that of the user's model [(N m)^2 s]."""
+        s, data = self.supermodel, self.dataset.data
+        torque = torque_scale(s.clean(h.mean_values(s), ()), data)
+        return MIN_PROCESS_NOISE_SHARE * torque**2 * float(data.Ts[0])
 
     def with_process_noise(self, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
         """The hypothesis with the gains of another process noise."""

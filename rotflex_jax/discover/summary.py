@@ -20,7 +20,7 @@ from rotflex_jax.discover.evaluation import (
 )
 from rotflex_jax.discover.final_fit import Refused, fit_to_all
 from rotflex_jax.discover.hypothesis import Hypothesis, without
-from rotflex_jax.discover.likelihood import choose_process_noise, refit
+from rotflex_jax.discover.likelihood import choose_process_noise, finer_integration, refit
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
 from rotflex_jax.discover.result import (
@@ -96,7 +96,7 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
 
     def stage(k: int) -> Stage:
         found = evaluate(problem, built, model.solver, validated[k], order[:k])
-        found = _with_process_noise(state, found, validated[k].hypothesis)
+        found = _with_process_noise(state, found, validated[k].hypothesis, corrected=k == len(models) - 1)
         return evaluation.of_stage(found, validated[k], order[:k])
 
     stages = on_threads(stage, range(len(models)))
@@ -240,16 +240,24 @@ def _resumed(count: int) -> tuple[str, ...]:
     )
 
 
-def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis) -> Stage:
-    """A stage with the process noise that predictions with its parameters ask for."""
+def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis, corrected: bool) -> Stage:
+    """A stage with the process noise that predictions with its parameters ask for, and what it gains.
+
+    Args:
+        state: What was found.
+        stage: The model.
+        h: Its hypothesis.
+        corrected: Whether its parameters are those of a finer integration (`correct_discretisation_bias`). So
+            are its predictions then: the error of the coarser one would count as a random torque.
+    """
     problem = state.problem
-    if stage.horizon == "prediction":
-        return stage
-    near = state.current.hypothesis
-    # First states that were fitted: a run from measured ones drifts, which would count as random torque.
-    fitted = dataclasses.replace(h, x0=near.initial_state_for(problem.supermodel, h.locations))
-    h = choose_process_noise(problem, fitted, wide=True)
-    gain = process_noise_gain(problem, h)
+    if stage.horizon == "free_run":
+        near = state.current.hypothesis
+        # First states that were fitted: a run from measured ones drifts, which would count as random torque.
+        fitted = dataclasses.replace(h, x0=near.initial_state_for(problem.supermodel, h.locations))
+        h = choose_process_noise(problem, fitted, wide=True)
+    finer = finer_integration(problem, h) if corrected else None
+    gain = process_noise_gain(finer or problem, h)
     return dataclasses.replace(stage, process_noise=h.process_noise, process_noise_nats=gain)
 
 
