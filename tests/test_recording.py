@@ -54,8 +54,10 @@ def test_defaults_are_those_of_the_joint() -> None:
     np.testing.assert_allclose(recording.t[[0, 1, -1]], [0.0, 0.002, 7.998])
     np.testing.assert_array_equal(recording.channel("alpha"), y[:, 1])
     assert recording.findings == ()
-    with pytest.raises(InputError, match="no channel 'beta'; it has theta, alpha"):
-        recording.channel("beta")
+    assert recording.unit("alpha") == recording.units[1]
+    for asked in (recording.channel, recording.unit):
+        with pytest.raises(InputError, match="no channel 'beta'; it has theta, alpha"):
+            asked("beta")
 
 
 @pytest.mark.parametrize(

@@ -256,7 +256,7 @@ class Identified:
                 f"The filter {self.run.status} of its run, so its weights make no model; "
                 "give a smaller step size."
             )
-        unit = self.recording.units[self.recording.channels.index(self.channel)]
+        unit = self.recording.unit(self.channel)
         return Series(
             self.basis, self.run.weights, self.channel, self.recording.Ts, self.recording.input_unit, unit
         )

@@ -52,7 +52,7 @@ def simulate(
         saved = Saved(model, fitted.parameters, fitted.covariance, fitted.free_names, first.Ts, first.n_init)
     y, y_hat = model.measured(recording), model.simulate(recording)
     rmse = rf.metrics.rmse(y, y_hat, recording.n_init).tolist()
-    units = {name: terminal.unit_of(recording, name) for name in model.mechanism.channels}
+    units = {name: recording.unit(name) for name in model.mechanism.channels}
     errors = dict(zip(units, rmse, strict=True))
     console = terminal.output()
     console.print(terminal.error_table([("RMS error of the free run", errors)], units))

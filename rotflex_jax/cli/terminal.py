@@ -161,7 +161,7 @@ def print_discovery(result: Any) -> None:
     from rotflex_jax.effects.labels import with_titles
 
     console = output()
-    units = {name: unit_of(result.validation[0], name) for name in result.baseline.held_out_rmse}
+    units = {name: result.validation[0].unit(name) for name in result.baseline.held_out_rmse}
     console.print(result.verdict.label.upper(), style="bold", markup=False)
     console.print(with_titles(result.sentence), markup=False)
     console.print(f"What decided: {result.assessment.criterion}.", markup=False)
@@ -260,11 +260,6 @@ def print_recording(recording: Any) -> None:
 def message(text: str, *, error: bool = False) -> None:
     """One line for a person."""
     SafeConsole(stderr=error, highlight=False).print(text, markup=False, soft_wrap=True)
-
-
-def unit_of(recording: Any, channel: str) -> str:
-    """Unit of a channel."""
-    return recording.units[recording.channels.index(channel)]
 
 
 def save_simulation(file: Path, recording: Any, simulated: Mapping[str, Real[np.ndarray, " N"]]) -> None:

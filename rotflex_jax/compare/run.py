@@ -164,7 +164,7 @@ def _with_model_channels(recording: Recording, model: Model) -> Recording:
         recording,
         y=y,
         channels=wanted,
-        units=tuple(recording.units[recording.channels.index(c)] for c in wanted),
+        units=tuple(recording.unit(c) for c in wanted),
         resolution={c: recording.resolution[c] for c in wanted},
         accept=ACCEPTABLE,
     )

@@ -152,7 +152,7 @@ class SearchState:
     def units(self) -> dict[str, str]:
         """Channel -> its own unit."""
         channels, recording = self.model.mechanism.channels, self.validation.problem.dataset.recordings[0]
-        return {c: recording.units[recording.channels.index(c)] for c in channels}
+        return {c: recording.unit(c) for c in channels}
 
     @property
     def reported(self) -> SearchHorizon:

@@ -257,7 +257,7 @@ def _meanings(models: Sequence[Model]) -> dict[str, str]:
 def channel_units(discovery: SearchResult) -> dict[str, str]:
     """Channel of the model -> its unit."""
     first = discovery.validation[0]
-    return {c: first.units[first.channels.index(c)] for c in discovery.baseline.held_out_rmse_windows}
+    return {c: first.unit(c) for c in discovery.baseline.held_out_rmse_windows}
 
 
 def noise_ratios(discovery: SearchResult) -> dict[str, float]:

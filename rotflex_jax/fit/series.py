@@ -238,8 +238,7 @@ def least_squares(
     if solution.rank < basis.size:
         status += f", minimum norm (rank {solution.rank} of {basis.size})"
     first = listed[0]
-    unit = first.units[first.channels.index(channel)]
-    series = Series(basis, solution.w, channel, first.Ts, first.input_unit, unit)
+    series = Series(basis, solution.w, channel, first.Ts, first.input_unit, first.unit(channel))
     return series_fit(series, solution, rows, status, penalty)
 
 
@@ -319,8 +318,7 @@ def forward_regression(
     w = np.zeros(basis.size)
     w[order] = solution.w
     first = listed[0]
-    unit = first.units[first.channels.index(channel)]
-    series = Series(basis, w, channel, first.Ts, first.input_unit, unit)
+    series = Series(basis, w, channel, first.Ts, first.input_unit, first.unit(channel))
     err = {basis.names[k]: ratio for k, ratio in zip(order, ratios, strict=True)}
     return series_fit(series, solution, rows, status, err=err, columns=np.array(order, int))
 

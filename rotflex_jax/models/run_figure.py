@@ -40,8 +40,7 @@ def run_figure(
         2 * len(channels), 1, sharex=True, squeeze=False, height_ratios=(1.7, 1.0) * len(channels)
     )[:, 0]
     for c, channel in enumerate(channels):
-        unit = recording.units[recording.channels.index(channel)]
-        scale, read = readable(1.0, unit)
+        scale, read = readable(1.0, recording.unit(channel))
         _channel(
             axes[2 * c], axes[2 * c + 1], recording, channel, [(n, y[:, c]) for n, y in runs], scale, read
         )
@@ -111,7 +110,7 @@ def run_view(
     """The same as `run_figure` to pan and zoom."""
     panels = list[LinePanel]()
     for c, channel in enumerate(channels):
-        scale, read = readable(1.0, recording.units[recording.channels.index(channel)])
+        scale, read = readable(1.0, recording.unit(channel))
         lines = [
             Line(name, colour, scale * y[:, c])
             for (name, y), colour in zip(runs, _colours(len(runs)), strict=True)

@@ -178,7 +178,7 @@ class Explorer:
         self._drawn = self._train[0]
         self._test = listed(recordings if test is None else test)
         self._seconds = window_seconds
-        self._units = {c: self._drawn.units[self._drawn.channels.index(c)] for c in bare.channels}
+        self._units = {c: self._drawn.unit(c) for c in bare.channels}
         self._base, self._factors, self._silent = bare, {}, False
         self._said, self._earlier = "", []
         self.switches: dict[str, Any] = {}

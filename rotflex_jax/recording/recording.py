@@ -207,11 +207,26 @@ class Recording:
         return np.column_stack([self.u, *(self.signals[name] for name in signals)])
 
     def channel(self, name: str) -> Float[np.ndarray, " N"]:
-        """One output by name."""
-        if not isinstance(name, str) or name not in self.channels:
-            given = repr(name) if isinstance(name, str) else shown(name)
+        """One output by name.
+
+        Raises:
+            InputError: The recording has no such channel.
+        """
+        return self.y[:, self._column(name)]
+
+    def unit(self, channel: str) -> str:
+        """The unit of one output by name.
+
+        Raises:
+            InputError: The recording has no such channel.
+        """
+        return self.units[self._column(channel)]
+
+    def _column(self, channel: str) -> int:
+        if not isinstance(channel, str) or channel not in self.channels:
+            given = repr(channel) if isinstance(channel, str) else shown(channel)
             raise InputError(f"The recording has no channel {given}; it has {', '.join(self.channels)}.")
-        return self.y[:, self.channels.index(name)]
+        return self.channels.index(channel)
 
     def slice(self, i: int, j: int) -> "Recording":
         """The samples from `i` up to, but without, `j`.

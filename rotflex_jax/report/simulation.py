@@ -53,7 +53,7 @@ class Simulation:
     def units(self) -> dict[str, str]:
         """Channel of the model -> its unit."""
         r = self.recording
-        return {c: r.units[r.channels.index(c)] for c in self.model.mechanism.channels}
+        return {c: r.unit(c) for c in self.model.mechanism.channels}
 
     def errors(self) -> dict[str, dict[str, float]]:
         """Channel -> root mean square error, largest error [unit of the channel], fit [%]."""

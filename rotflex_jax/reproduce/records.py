@@ -281,7 +281,7 @@ def _decimated(s: Settings, recording: Recording, name: str) -> list[Recording]:
             f"that; set Ts={max(1, k) * recording.Ts:g}."
         )
     y = recording.channel(name)[:, None]
-    unit = recording.units[recording.channels.index(name)]
+    unit = recording.unit(name)
     one = dataclasses.replace(
         recording,
         y=y,

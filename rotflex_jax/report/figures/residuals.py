@@ -139,5 +139,5 @@ def responses(discovery: SearchResult, explanation: Explanation) -> Figure | Non
         return None
     r = tests.recording
     mechanism = discovery.baseline.model.mechanism
-    units = {c: r.units[r.channels.index(c)] for c in mechanism.channels}
+    units = {c: r.unit(c) for c in mechanism.channels}
     return response_figure(tests.measured, tests.simulated, units, r.input_unit)
