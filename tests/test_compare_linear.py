@@ -11,6 +11,7 @@ from rotflex_jax.basis import Volterra
 from rotflex_jax.basis.bank import Averages
 from rotflex_jax.compare import ARX, AdaptiveSeries, BatchSeries, LinearStateSpace, Subspace
 from rotflex_jax.compare.linear_models import refined, subspace
+from rotflex_jax.compare.method import require_one_sampling_period
 from rotflex_jax.compare.series import bank_outputs, monomials
 from rotflex_jax.models.linear_system import LinearSystem
 from rotflex_jax.recording import Recording
@@ -74,6 +75,18 @@ def test_a_linear_system_says_which_signal_a_recording_lacks() -> None:
     system = subspace([driven_by_two()], 20, (4,))[4]
     with pytest.raises(rf.InputError, match=r"signal 'base \[m/s\^2\]' is needed.* has 'wind \[m/s\]';"):
         system.simulate(driven().with_signals({"wind [m/s]": driven().u}))
+
+
+def test_sampling_periods_may_differ_by_rounding_alone() -> None:
+    record = driven()
+    system = subspace([record], 20, (4,))[4]
+    near, other = (dataclasses.replace(record, Ts=Ts * factor) for factor in (1 + 1e-12, 1 + 1e-5))
+    np.testing.assert_array_equal(system.simulate(near), system.simulate(record))
+    require_one_sampling_period([record, near], "a sampled system")
+    with pytest.raises(rf.InputError, match="different sampling periods, but a sampled system has one"):
+        require_one_sampling_period([record, other], "a sampled system")
+    with pytest.raises(rf.InputError, match=r"system holds for a sampling period of 0\.01 s, but .* of that"):
+        system.simulate(other)
 
 
 def test_linear_methods_compare_with_the_signals_that_recordings_have() -> None:

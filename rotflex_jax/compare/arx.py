@@ -17,6 +17,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import common_signals
+from rotflex_jax.recording.samples import require_period
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,11 +64,7 @@ class DifferenceEquation:
                 f"The equation looks back {n} samples, but may look at only {m} of the recording; "
                 "give the recording a larger n_init, or choose a lower order."
             )
-        if abs(recording.Ts / self.Ts - 1) > 1e-6:
-            raise InputError(
-                f"The equation holds for a sampling period of {self.Ts:g} s, but the recording has "
-                f"{recording.Ts:g} s; fit it to a recording of that period."
-            )
+        require_period(self.Ts, recording.Ts, "The equation holds")
         out = np.zeros((N, len(self.B)))
         out[:m] = recording.y[:m]
         lags = _lags(recording.inputs(self.signals).astype(float), n)

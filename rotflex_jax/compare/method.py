@@ -17,6 +17,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
+from rotflex_jax.recording.samples import of_one_period
 
 Progress = Callable[[str], None]
 
@@ -347,9 +348,9 @@ def require_one_sampling_period(recordings: Sequence[Recording], what: str) -> N
     """Refuse recordings of different sampling periods, for which no single sampled model holds.
 
     Raises:
-        InputError: Their sampling periods differ.
+        InputError: Their sampling periods differ by more than rounding.
     """
-    if len({r.Ts for r in recordings}) > 1:
+    if not of_one_period(r.Ts for r in recordings):
         raise InputError(
             f"The recordings have different sampling periods, but {what} has one; decimate them to the same."
         )

@@ -12,10 +12,10 @@ from rotflex_jax.basis import Orthonormal, Volterra
 from rotflex_jax.basis.bank import Averages, Bank
 from rotflex_jax.compare.linear_models import chosen_system, refined
 from rotflex_jax.compare.method import Fitted, Progress, require_one_sampling_period
-from rotflex_jax.errors import InputError
 from rotflex_jax.fit.linear import factor, solve
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.samples import require_period
 
 BankKind = Literal["delays", "laguerre", "kautz", "poles"]
 
@@ -147,11 +147,7 @@ class SeriesModel:
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """Free run from the input and the first `n_init` samples of the outputs."""
         Ts, m = self.channels[0].Ts, recording.n_init
-        if abs(recording.Ts / Ts - 1) > 1e-6:
-            raise InputError(
-                f"The series holds for a sampling period of {Ts:g} s, but the recording has "
-                f"{recording.Ts:g} s; fit it to a recording of that period."
-            )
+        require_period(Ts, recording.Ts, "The series holds")
         u = recording.u.astype(float)
         return np.stack([c.simulate(u, recording.y[:m, i]) for i, c in enumerate(self.channels)], axis=1)
 

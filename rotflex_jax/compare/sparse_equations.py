@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rotflex_jax.errors import InputError
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.samples import require_period
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
@@ -112,11 +112,7 @@ class SparseEquations:
         return np.concatenate([y[:1], ahead[0, :-1, 1, :C]])
 
     def _check(self, recording: Recording) -> None:
-        if abs(recording.Ts / self.Ts - 1) > 1e-6:
-            raise InputError(
-                f"The equations were fitted at a sampling period of {self.Ts:g} s, but the recording has "
-                f"{recording.Ts:g} s; fit it to a recording of that period."
-            )
+        require_period(self.Ts, recording.Ts, "The equations hold")
 
     def _start(self, u: np.ndarray, y: np.ndarray) -> Float[np.ndarray, " n"]:
         """First state by Gauss-Newton, from a parabola through the samples."""

@@ -12,6 +12,7 @@ from rotflex_jax.checks import whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import listed
+from rotflex_jax.recording.samples import of_one_period
 
 # Singular values below this share of the largest one are rounding: the columns depend on each other.
 DEPENDENT_COLUMN_SHARE = 1e-12
@@ -166,7 +167,7 @@ def checked_recordings(
     """
     found = list(listed(recordings))
     periods = sorted({r.Ts for r in found})
-    if periods[-1] / periods[0] - 1 > 1e-6:
+    if not of_one_period(periods):
         raise InputError(
             f"The recordings have the sampling periods {', '.join(f'{p:g} s' for p in periods)}, but a "
             "series has one; decimate them to the same."

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Inexact
 
-from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.samples import require_period
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,11 +59,7 @@ class LinearSystem:
 
     def start(self, recording: Recording) -> Float[np.ndarray, " n"]:
         """First state, by least squares on the first `n_init` samples."""
-        if abs(recording.Ts / self.Ts - 1) > 1e-6:
-            raise InputError(
-                f"The system holds for a sampling period of {self.Ts:g} s, but the recording has "
-                f"{recording.Ts:g} s; fit it to a recording of that period."
-            )
+        require_period(self.Ts, recording.Ts, "The system holds")
         m = recording.n_init
         head = recording.slice(0, m)
         forced = self._run(head, np.zeros(self.order), np.zeros_like(self.K))

@@ -10,7 +10,7 @@ from rotflex_jax.basis import Basis
 from rotflex_jax.basis.bank import require_basis
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.samples import sampling_period
+from rotflex_jax.recording.samples import require_period, sampling_period
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,11 +79,7 @@ class Series:
         Raises:
             InputError: The sampling period is another one.
         """
-        if abs(recording.Ts / self.Ts - 1) > 1e-6:
-            raise InputError(
-                f"The series holds for a sampling period of {self.Ts:g} s, but the recording has "
-                f"{recording.Ts:g} s; fit it to a recording of that period."
-            )
+        require_period(self.Ts, recording.Ts, "The series holds")
         phi = self.basis.regressors(recording.u)
         return (phi @ self.weights.astype(phi.dtype))[:, None]
 

@@ -3,7 +3,7 @@
 import math
 import numbers
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,8 @@ from jaxtyping import Float, Real
 from rotflex_jax.checks import entries, positive, real, shown
 from rotflex_jax.errors import InputError
 
+# Relative difference of two sampling periods that is rounding.
+SAME_PERIOD = 1e-6
 # Longest step that resampling bridges, in median steps.
 LONGEST_STEP = 5.0
 
@@ -133,6 +135,36 @@ but is 'fast'; give for instance 0.002.
             f"{label} must be a positive number of seconds, but is {what}; give for instance 0.002."
         )
     return float(value.item())
+
+
+def of_one_period(periods: Iterable[float]) -> bool:
+    """Whether sampling periods [s] are the same, to rounding."""
+    found = list(periods)
+    return max(found) / min(found) - 1 <= SAME_PERIOD
+
+
+def require_period(period: float, recorded: float, what: str) -> None:
+    """Refuses a recording of another sampling period than that of a sampled model.
+
+    Args:
+        period: For which the model holds [s].
+        recorded: Sampling period of the recording [s].
+        what: Which model holds for it, such as "The system holds".
+
+    Raises:
+        InputError: The two differ by more than rounding.
+
+    >>> require_period(0.002, 0.01, "The system holds")
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: The system holds for a sampling period of 0.002 s, but the recording has \
+0.01 s; fit it to a recording of that period.
+    """
+    if not of_one_period((period, recorded)):
+        raise InputError(
+            f"{what} for a sampling period of {period:g} s, but the recording has {recorded:g} s; "
+            "fit it to a recording of that period."
+        )
 
 
 def even_spacing(t: Real[np.ndarray, " N"], label: str, where: str = "sample", first: int = 0) -> float:
