@@ -20,9 +20,9 @@ from rotflex_jax.discover.spline_map import (
     MapEquations,
     Term,
     _smoother,
-    candidates,
     penalties,
     read_formula,
+    terms_to_try,
 )
 from rotflex_jax.effects import CATALOG, LearnedTorque, QuadraticDrag
 from rotflex_jax.errors import InputError
@@ -215,9 +215,9 @@ def test_terms_name_themselves():
     assert text == "-0.03 sign(w) + 0.012 w |w| - 0.002"
     assert str(Formula(())) == "0"
     assert Term("w |w|", 0.0).unit == "N m s^2/rad^2"
-    small = candidates(np.linspace(-0.1, 0.1, 9), np.linspace(-1, 1, 9))
+    small = terms_to_try(np.linspace(-0.1, 0.1, 9), np.linspace(-1, 1, 9))
     assert any(t.name == "sin(12 q)" for t in small) and not any(t.name == "sin(2 q)" for t in small)
-    assert {t.function for t in candidates(np.linspace(-3, 3, 9), np.linspace(-1, 1, 9))} == set(FUNCTIONS)
+    assert {t.function for t in terms_to_try(np.linspace(-3, 3, 9), np.linspace(-1, 1, 9))} == set(FUNCTIONS)
 
 
 # -- through the simulator -----------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import rotflex_jax as rf
 from rotflex_jax.discover import likelihood as refit_module
 from rotflex_jax.discover.likelihood import (
     EXTRA_ALTERNATIONS,
-    MAX_COORDINATE_STEP,
     SUBSTEP_FACTOR,
     LikelihoodProblem,
     _grid,
@@ -26,6 +25,7 @@ from rotflex_jax.effects import Delay, Heating, Lag
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.mechanism import Exponential
+from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP
 from rotflex_jax.parameters import Transform
 from rotflex_jax.runtime.xla import double_precision
 
@@ -250,8 +250,8 @@ def test_one_step_is_no_longer_than_allowed(rough):
     found = levenberg_marquardt(rough, [far], max_steps=1)[0]
     free = list(far.free)
     longest = np.abs(found.z[free] - far.z[free]).max()
-    assert longest == pytest.approx(MAX_COORDINATE_STEP)
-    assert np.abs(found.local_z - far.local_z).max() <= MAX_COORDINATE_STEP * (1 + 1e-9)
+    assert longest == pytest.approx(LARGEST_STEP)
+    assert np.abs(found.local_z - far.local_z).max() <= LARGEST_STEP * (1 + 1e-9)
     held = [i for i in range(len(far.z)) if i not in far.free]
     np.testing.assert_array_equal(found.z[held], far.z[held])
 

@@ -20,7 +20,7 @@ from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows, torque_scale
 from rotflex_jax.mechanism import Exponential, Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
-from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
+from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, minimise
 from rotflex_jax.runtime.persistent_jit import make_ahead
 from rotflex_jax.runtime.xla import on_threads
 
@@ -287,8 +287,6 @@ MIN_DECREASE_NATS = 0.3
 REFIT_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-4, least=1e-9, increase=20, largest=100)
 # Steps tried of each fit.
 MAX_STEPS = 12
-# Largest step of an unconstrained coordinate: a factor e of a positive parameter.
-MAX_COORDINATE_STEP = 1.0
 # Alternations of a refit beyond the usual number, and what such a one has to gain [nat].
 EXTRA_ALTERNATIONS, EXTRA_ALTERNATION_NATS = 5, 10.0
 
@@ -328,7 +326,7 @@ def _fitted(problem: LikelihoodProblem, h: Hypothesis, max_steps: int = MAX_STEP
         linearise,
         _Point(h),
         REFIT_RULES,
-        limit=coordinates.step_limit(MAX_COORDINATE_STEP),
+        limit=coordinates.step_limit(LARGEST_STEP),
         move=lambda p, step: _Point(coordinates.moved(p.hypothesis, step)),
         max_steps=max_steps,
     )
@@ -462,7 +460,7 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
         linearise,
         h,
         CORRECTION_RULES,
-        limit=coordinates.step_limit(MAX_COORDINATE_STEP),
+        limit=coordinates.step_limit(LARGEST_STEP),
         move=coordinates.moved,
         max_steps=MAX_CORRECTION_STEPS,
     )

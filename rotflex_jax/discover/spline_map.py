@@ -10,10 +10,10 @@ import scipy
 from jaxtyping import Float, Int, Real
 
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.likelihood import MAX_COORDINATE_STEP, LikelihoodProblem, choose_process_noise
+from rotflex_jax.discover.likelihood import LikelihoodProblem, choose_process_noise
 from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, after_trial, begin
+from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, after_trial, begin
 
 # A step that lowers the penalised cost by less is the last with its process noise [nat].
 MIN_STEP_NATS = 0.3
@@ -223,7 +223,7 @@ def _step(
     penalised = NormalEquations(np.array([before]), free.T @ g, free.T @ H @ free)
     # Outputs are linear in the weights but not in the physics.
     limit = np.full(free.shape[1], np.inf)
-    limit[np.searchsorted(rest, equations.physics)] = MAX_COORDINATE_STEP
+    limit[np.searchsorted(rest, equations.physics)] = LARGEST_STEP
     progress = begin(before, MAP_RULES._replace(damping=damping))
     for _ in range(TRIALS_PER_STEP):
         step, _ = penalised.step(float(progress.damping), limit)
@@ -329,7 +329,7 @@ class Formula:
         return " + ".join(map(str, self.terms)).replace("+ -", "- ") or "0"
 
 
-def candidates(position: Float[np.ndarray, " N"], speed: Float[np.ndarray, " N"]) -> list[Term]:
+def terms_to_try(position: Float[np.ndarray, " N"], speed: Float[np.ndarray, " N"]) -> list[Term]:
     """Terms worth trying on samples of this size; waves only where the port travels far enough."""
     turning, span = float(np.sqrt(np.mean(speed**2))), float(np.ptp(position))
     waves = [float(n) for n in range(1, 13) if n * span > 2.0]
@@ -371,7 +371,7 @@ def read_formula(
     b = H @ z - slope
     whole = fitted.equations.H[np.ix_(fitted.equations.weights, fitted.equations.weights)]
     ridge = 1e-6 * np.trace(Phi.T @ Phi) / Phi.shape[1] * np.eye(Phi.shape[1])
-    terms = candidates(q, w)
+    terms = terms_to_try(q, w)
     F = np.stack([t(q, w) for t in terms], axis=1)
     D = np.linalg.solve(Phi.T @ Phi + ridge, Phi.T @ F)
     G, r = D.T @ H @ D, D.T @ b

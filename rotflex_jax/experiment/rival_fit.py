@@ -22,7 +22,7 @@ from rotflex_jax.fit.linear import factor
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.models.model import Model
-from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, Status, minimise
+from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, Status, minimise
 from rotflex_jax.parameters import Transform
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -156,8 +156,6 @@ def with_calibrations(m: Mechanism) -> Mechanism:
 # A fit has converged when a further step promises less than this share of what is left, or this much [nat].
 GAIN_SHARE_TOLERANCE, GAIN_TOLERANCE = 2e-3, 0.01
 MAX_STEPS = 25
-# Largest step of an unconstrained coordinate.
-LARGEST_STEP = 1.0
 # Directions weaker than this share of the strongest do not count in the exact projection.
 RANK_TOLERANCE = 1e-7
 # A short recording determines some of the unknowns hardly at all, and most steps are nearly exact: little

@@ -17,11 +17,11 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from rotflex_jax.experiment.rival_fit import LARGEST_STEP, MAX_STEPS, RULES, with_calibrations
+from rotflex_jax.experiment.rival_fit import MAX_STEPS, RULES, with_calibrations
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.models.model import Model
-from rotflex_jax.optimise.damped_least_squares import NormalEquations, minimise
+from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, minimise
 from rotflex_jax.parameters import Transform
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision

@@ -133,12 +133,18 @@ class FitCoordinates:
                 x0[r, k, : self.states] += step[self.state_columns(r, k)]
         return dataclasses.replace(h, z=z, local_z=local_z, x0=x0)
 
-    def step_limit(self, largest: float) -> Float[np.ndarray, " M"]:
-        """Largest step of each coordinate: parameters have one, first states do not."""
+    def step_limit(self, largest: float | Float[np.ndarray, " P"]) -> Float[np.ndarray, " M"]:
+        """Largest step of each coordinate: parameters have one, first states do not.
+
+        Args:
+            largest: One for all parameters, or that of each shared one, then of each that recordings have for
+                themselves.
+        """
+        each = np.broadcast_to(largest, self.shared + self.local)
         most = np.full(self.size, np.inf)
-        most[: self.shared] = largest
+        most[: self.shared] = each[: self.shared]
         for r in range(len(self.windows.counts)):
-            most[self.local_columns(r)] = largest
+            most[self.local_columns(r)] = each[self.shared :]
         return most
 
     def orthogonal_to(self, W: Float[np.ndarray, "D R N C"]) -> "Projection":

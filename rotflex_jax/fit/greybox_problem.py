@@ -14,7 +14,6 @@ from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, Windows, process_noise_ports
 from rotflex_jax.fit.plausibility import AT_BOUND
 from rotflex_jax.fit.problem import (
-    LARGEST_STEP,
     LikelihoodEquations,
     RunLayout,
     likelihood_equations,
@@ -23,7 +22,14 @@ from rotflex_jax.fit.problem import (
 from rotflex_jax.mechanism import kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.models.model import Model
-from rotflex_jax.optimise.damped_least_squares import Minimum, Progress, Rules, Status, minimise
+from rotflex_jax.optimise.damped_least_squares import (
+    LARGEST_STEP,
+    Minimum,
+    Progress,
+    Rules,
+    Status,
+    minimise,
+)
 from rotflex_jax.optimise.restarts import FAR, NEAR, enough, misses_something, moved_by_chance
 from rotflex_jax.parameters import Transform
 
@@ -479,14 +485,10 @@ class GreyBoxProblem:
 
     def _limit(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
         """Largest step of each coordinate: a parameter with a bound by a factor of e."""
-        c, specs = self.coordinates(point, windows), self.model.mechanism.parameter_specifications
+        specs = self.model.mechanism.parameter_specifications
         bounded = np.array([bool(np.isfinite(s.lower) or np.isfinite(s.upper)) for s in specs])
         most = np.where(bounded, LARGEST_STEP, np.inf)
-        limit = np.full(c.size, np.inf)
-        limit[: c.shared] = most[list(point.free)]
-        for r in range(len(point.local_z)):
-            limit[c.local_columns(r)] = most[list(point.local)]
-        return limit
+        return self.coordinates(point, windows).step_limit(most[[*point.free, *point.local]])
 
     def _minimum(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"], tolerance: float

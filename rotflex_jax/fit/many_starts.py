@@ -23,12 +23,13 @@ from rotflex_jax.fit.dataset import (
     with_common_constants,
 )
 from rotflex_jax.fit.plausibility import check_signs
-from rotflex_jax.fit.problem import LARGEST_STEP, directions, normal_equations
+from rotflex_jax.fit.problem import directions, normal_equations
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import (
+    LARGEST_STEP,
     NormalEquations,
     Rules,
     bounded_solution,

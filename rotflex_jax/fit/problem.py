@@ -97,10 +97,6 @@ def each_recording(run: Callable[..., Any], in_axes: tuple[int | None, ...], out
     return mapped
 
 
-LARGEST_STEP = 1.0
-"""Largest step of the unconstrained coordinate of a parameter with a bound: a factor of e."""
-
-
 def normal_equations(
     structure: Mechanism,
     solver: Solver,

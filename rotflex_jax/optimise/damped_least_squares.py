@@ -34,6 +34,8 @@ SHORT = 1e-3
 """Damping above which a step is held short and says nothing of what is left to gain."""
 RIDGE = 1e-14
 """Damping that is always added, against rounding, as a share of the diagonal."""
+LARGEST_STEP = 1.0
+"""Most that an unconstrained coordinate moves in one step: of a logarithm, a factor of e."""
 LEAST_CURVATURE = 1e-12
 """Least entry of the diagonal that the damping is scaled by, as a share of the largest entry."""
 

@@ -6,10 +6,10 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP
+
 Values = tuple[Float[np.ndarray, " S"], Float[np.ndarray, "S n"]]
 
-LARGEST_PARAMETER_STEP = 1.0
-"""Most that one parameter moves in one step; of a logarithm, a factor of e."""
 SMALLEST_STEP = 1e-5
 """Steps below this end a descent."""
 GRADIENT_TOLERANCE = 1e-4
@@ -96,9 +96,7 @@ class _Search:
         direction = -self.g if self.H is None else -self.H @ self.g
         if float(direction @ self.g) >= 0:
             self.H, direction = None, -self.g
-        self.direction = direction * min(
-            1.0, LARGEST_PARAMETER_STEP / max(float(np.max(np.abs(direction))), 1e-300)
-        )
+        self.direction = direction * min(1.0, LARGEST_STEP / max(float(np.max(np.abs(direction))), 1e-300))
         self.share = 1.0
         self.trial = self.x + self.direction
 
