@@ -292,9 +292,9 @@ def test_a_model_that_lacks_nothing_stays_as_it_is(small_map):
 
 @pytest.mark.slow
 def test_a_map_that_does_not_gain_surely_enough_is_told_in_plain_json(small_map, monkeypatch):
-    monkeypatch.setattr(learned, "MAP_GAIN_Z", np.inf)
+    monkeypatch.setattr(learned, "HELD_OUT_Z", np.inf)
     found = taught({("coulomb", "hub"): {"level": 0.03}})
-    assert found.held_out_gain_nats > learned.MAP_GAIN_NATS and not found.kept
+    assert found.held_out_gain_nats > learned.HELD_OUT_NATS and not found.kept
     assert json.loads(json.dumps(found.to_dict()))["kept"] is False  # as a report writes it beside its page
 
 

@@ -36,7 +36,7 @@ def shown() -> list[type[Effect]]:
     """All effects of the catalogue, kind by kind, and the learned torque."""
     order = [kind.kind_label for kind in KINDS]
     classes = [cls for cls in CATALOG.values() if cls.__module__.startswith("rotflex_jax.")]
-    return sorted([*classes, LearnedTorque], key=lambda cls: (order.index(cls.kind()), cls.name))
+    return sorted([*classes, LearnedTorque], key=lambda cls: (order.index(cls.kind_label), cls.name))
 
 
 def pages() -> dict[str, str]:
@@ -68,7 +68,7 @@ def overview(on_site: bool = False) -> str:
     for kind in KINDS:
         lines += [f"## {kind.kind_label.capitalize()}", "", kind.kind_meaning, ""]
         lines += ["| effect | what it is | equation | searched at |", "|---|---|---|---|"]
-        for cls in (c for c in shown() if c.kind() == kind.kind_label):
+        for cls in (c for c in shown() if c.kind_label == kind.kind_label):
             where = ", ".join(f"`{place}`" for place in cls.searched) or "no"
             file = f"../{cls.__module__.replace('.', '/')}.py"
             link = f"effects/{cls.name}.rst" if on_site else file
@@ -92,13 +92,13 @@ def _page(cls: type[Effect]) -> str:
     lines += [f"   :canonical: {cls.__module__}.{cls.__qualname__}", "", first, ""]
     for line in equation(cls).split(r", \quad "):
         lines += [".. math::", "", f"   {line}", ""]
-    caption = OWN_CAPTIONS.get(cls.name) or CAPTIONS.get(cls.kind(), "")
+    caption = OWN_CAPTIONS.get(cls.name) or CAPTIONS.get(cls.kind_label, "")
     about = plain(f"Figure of the equation of {cls.title}")
     lines += [f".. figure:: {cls.name}.svg", f"   :alt: {about}", "   :width: 34em", "", f"   {caption}", ""]
     for paragraph in prose:
         lines += [paragraph, ""]
     lines += _parameters(cls)
-    lines += [f":Kind: {cls.kind()}", f":Searched at: {_places(cls)}"]
+    lines += [f":Kind: {cls.kind_label}", f":Searched at: {_places(cls)}"]
     if cls.amplitudes:
         absent = " and ".join(f"``{name}``" for name in cls.amplitudes)
         lines.append(f":Absent where: {absent} {'are' if len(cls.amplitudes) > 1 else 'is'} zero")

@@ -36,15 +36,6 @@ def line_styles(comparison: Comparison) -> list[tuple[Row, Style]]:
     return [(row, (COLOURS[k % 6], DASHES[k % 6], MARKERS[k % 6])) for k, row in enumerate(rows)]
 
 
-def _units(comparison: Comparison) -> dict[str, str]:
-    first = comparison.test[0]
-    return dict(zip(first.channels, first.units, strict=True))
-
-
-def _longest_recording(comparison: Comparison) -> int:
-    return max(range(len(comparison.test)), key=lambda k: comparison.test[k].N)
-
-
 def _ranks_caption(comparison: Comparison) -> str:
     return (
         "Dots: one free run over all held-out data. Diamonds: free runs that are restarted every "
@@ -62,7 +53,7 @@ def _ranks_caption(comparison: Comparison) -> str:
 def ranks(comparison: Comparison) -> Figure:
     """Error of every method relative to the standard deviation of the measurement."""
     rows = [row for row in comparison.rows if row.status == "ok"]
-    by_channel = _units(comparison)
+    by_channel = comparison.units
     figure = blank(10.0, 0.9 + 0.23 * len(rows))
     axes = figure.subplots(1, len(by_channel), sharey=True, squeeze=False)[0]
     places = -np.arange(len(rows))
@@ -110,7 +101,7 @@ def ranks(comparison: Comparison) -> Figure:
 )
 def overlays(comparison: Comparison) -> Figure:
     """Measured and simulated outputs of the best method of each family, with their errors."""
-    i, by_channel = _longest_recording(comparison), _units(comparison)
+    i, by_channel = comparison.longest_test, comparison.units
     r, shown = comparison.test[i], line_styles(comparison)
     part = slice(0, drawn(r))
     figure = blank(10.0, 3.3 * len(by_channel) + 0.6)
@@ -176,7 +167,7 @@ def _within(ax: Axes, y: np.ndarray, margin: float) -> None:
 )
 def horizons(comparison: Comparison) -> Figure:
     """Error of free runs against how far they have gone, of the best method of each family."""
-    by_channel, figure = _units(comparison), blank(10.0, 3.6)
+    by_channel, figure = comparison.units, blank(10.0, 3.6)
     axes = figure.subplots(1, len(by_channel), squeeze=False)[0]
     for ax, (channel, unit) in zip(axes, by_channel.items(), strict=True):
         scale, read = readable(1.0, unit)
@@ -213,7 +204,7 @@ def horizons(comparison: Comparison) -> Figure:
 )
 def spectra(comparison: Comparison) -> Figure:
     """Amplitude spectral density of the held-out error of the best method of each family."""
-    i, by_channel = _longest_recording(comparison), _units(comparison)
+    i, by_channel = comparison.longest_test, comparison.units
     r, figure = comparison.test[i], blank(10.0, 3.6)
     axes = figure.subplots(1, len(by_channel), squeeze=False)[0]
     for c, (ax, (channel, unit)) in enumerate(zip(axes, by_channel.items(), strict=True)):
@@ -256,14 +247,14 @@ def render(comparison: Comparison) -> str:
 
 def content(comparison: Comparison) -> dict[str, Any]:
     """What the template fills in; plain text that the template escapes."""
-    units = dict(zip(comparison.test[0].channels, comparison.test[0].units, strict=True))
+    units = comparison.units
     good = [row for row in comparison.rows if row.status == "ok"]
     colours = {row.method: style[0] for row, style in line_styles(comparison)}
     return {
         "summary": _summary(comparison),
         "seconds": f"{comparison.window_seconds:g}",
         "headings": [f"{c} [{readable(1.0, u)[1]}]" for c, u in units.items()],
-        "rows": [_row(row, comparison, units, good, colours) for row in good],
+        "rows": [_row(row, units, good, colours) for row in good],
         "noise": [plain_number(readable(comparison.noise_floor[c], u)[0]) for c, u in units.items()],
         "bad": [
             (row.method, row.title, row.status, together(row.reason))
@@ -291,7 +282,7 @@ def _summary(comparison: Comparison) -> str:
     best = comparison.best
     if best is None:
         return "No method gave a result: each failed, or its free run left the measured range."
-    units = dict(zip(comparison.test[0].channels, comparison.test[0].units, strict=True))
+    units = comparison.units
     said = []
     for c, u in units.items():
         value, read = readable(best.rmse[c], u)
@@ -306,9 +297,7 @@ def _summary(comparison: Comparison) -> str:
     )
 
 
-def _row(
-    row: Row, comparison: Comparison, units: dict[str, str], good: list[Row], colours: dict[str, str]
-) -> dict[str, Any]:
+def _row(row: Row, units: dict[str, str], good: list[Row], colours: dict[str, str]) -> dict[str, Any]:
     def cells(name: str, marked: bool = True) -> list[dict[str, Any]]:
         made = []
         for c, u in units.items():

@@ -25,8 +25,9 @@ def candidate_banks(kind: BankKind, count: int, train: Sequence[Recording]) -> l
 
     Args:
         kind: `delays` are means over stretches, `laguerre` share one real pole, `kautz` one pair, `poles`
-            are those of a linear model that is identified first, repeated until there are `count`.
-        count: Columns of each.
+            are those of a linear model that is identified first, all repeated until there are at least
+            `count`.
+        count: Columns of each; the least number for `poles`.
         train: Training recordings, whose length bounds the memory.
     """
     longest = max(r.N for r in train)
@@ -46,7 +47,7 @@ def candidate_banks(kind: BankKind, count: int, train: Sequence[Recording]) -> l
 
 
 def _decaying_poles(train: Sequence[Recording], count: int) -> list[complex]:
-    """Poles of an identified linear model that decay within the recordings, slow ones first."""
+    """At least `count` poles of an identified linear model that decay within recordings, slow ones first."""
     start = chosen_system(train, (4, 6), (16, 64), 0.7, lambda _: None)[0]
     slowest = np.exp(-20 / max(r.N for r in train))
     poles = [p for p in refined(start, train).poles.tolist() if 0.5 < abs(p) < slowest]

@@ -18,7 +18,7 @@ from rotflex_jax.text.numbers import digits, json_number, json_numbers, readable
 
 def cells(comparison: "Comparison") -> list[list[str]]:
     """The table in words: headings, the methods that came through, the sensor noise."""
-    units = dict(zip(comparison.test[0].channels, comparison.test[0].units, strict=True))
+    units = comparison.units
     head = ["method"]
     for what in (f"{comparison.window_seconds:g} s rms", "rms", "worst"):
         head += [f"{c} {what} [{readable(0.0, unit)[1]}]" for c, unit in units.items()]
@@ -169,6 +169,17 @@ class Comparison:
     def best(self) -> Row | None:
         """The method with the smallest error of one free run (geometric mean over the channels)."""
         return self.rows[0] if self.rows and self.rows[0].status == "ok" else None
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Channel -> its unit."""
+        first = self.test[0]
+        return dict(zip(first.channels, first.units, strict=True))
+
+    @property
+    def longest_test(self) -> int:
+        """Number of the longest test recording, the first of several."""
+        return max(range(len(self.test)), key=lambda k: self.test[k].N)
 
     def __getitem__(self, method: str) -> Row:
         """The row of a method."""

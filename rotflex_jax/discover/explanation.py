@@ -49,7 +49,7 @@ def model_tests(found: SearchResult) -> ModelTests:
     Residuals are those of predictions, with the process noise that the data ask for: where a model is right
     they are white and independent of the input. Frequency responses are of free runs over the recording.
     """
-    i = max(range(len(found.validation)), key=lambda k: found.validation[k].N)
+    i = found.longest_validation
     recording = found.validation[i]
     stages = {"baseline": found.baseline} | ({"final model": found.final} if found.rounds else {})
     measured = np.asarray(found.baseline.model.measured(recording), float)
@@ -268,7 +268,7 @@ def remaining_failures(found: SearchResult) -> tuple[Where, ...]:
     """Where the final model fails on the longest held-out recording, if something is left unexplained."""
     if found.verdict != Verdict.UNEXPLAINED or not found.rounds:
         return ()
-    i = max(range(len(found.validation)), key=lambda k: found.validation[k].N)
+    i = found.longest_validation
     recording, final = found.validation[i], found.final
     mechanism = final.model.mechanism
     return locate(

@@ -11,7 +11,7 @@ from rotflex_jax import checks
 from rotflex_jax.discover.evaluation import evaluate
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.result import Stage
-from rotflex_jax.discover.selection import paired_gain
+from rotflex_jax.discover.selection import HELD_OUT_NATS, HELD_OUT_Z, WINDOWS_WORSE, paired_gain
 from rotflex_jax.discover.spline_map import Formula, Term, fit_map, position_differences, read_formula
 from rotflex_jax.discover.stepwise import fit_baseline
 from rotflex_jax.discover.supermodel import build, scales
@@ -35,8 +35,6 @@ MAP_CELLS, MIN_CELL_SAMPLES = 30, 3
 SPLINES = (8, 15)
 # Share of the usual speed below which the map is even in it.
 EVEN_SPEED_SHARE = 0.1
-# The map is kept if validation data gain this [nat], beyond this many standard deviations of the block gains.
-MAP_GAIN_NATS, MAP_GAIN_Z = 5.0, 1.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,7 +162,7 @@ def columns(
 def learn_torque(
     model: Mechanism | Model,
     train: Recording | Sequence[Recording],
-    test: Recording | Sequence[Recording],
+    validation: Recording | Sequence[Recording],
     at: str = "hub",
     *,
     window_seconds: float = 2.0,
@@ -181,7 +179,7 @@ def learn_torque(
     Args:
         model: The model so far, with the effects that were found.
         train: Recordings to fit.
-        test: Validation recordings, which no fit sees.
+        validation: Recordings that no fit sees, which decide whether the map is kept.
         at: Port of the torque.
         window_seconds: Length of the windows of the short validation runs [s].
         progress: Called with a line of text at each stage.
@@ -194,7 +192,8 @@ def learn_torque(
     """
     clear_compilation_caches()
     model, say = Model.of(model), checks.progress(progress)
-    trained, held_back = listed(train, "train", SHORTEST_TO_FIT), listed(test, "test", SHORTEST_TO_FIT)
+    trained = listed(train, "train", SHORTEST_TO_FIT)
+    held_back = listed(validation, "validation", SHORTEST_TO_FIT)
     checks.positive(window_seconds, "window_seconds")
     reason = "a map is kept only where data that no fit has seen become likelier; give other recordings, or "
     reason += "the two parts of recording.split(0.7)"
@@ -209,29 +208,30 @@ def learn_torque(
     ports = tuple(process_noise_ports(whole, 1.0))
     problem = LikelihoodProblem.of(s, model.solver, dataset, ports)
     other = LikelihoodProblem.of(s, model.solver, prepare(model, held_back, like=dataset), ports)
-    validation = ValidationSet(other, window_seconds)
+    unseen = ValidationSet(other, window_seconds)
     say("learned torque: fitting the model as it is")
-    current = validate(validation, fit_baseline(problem))
+    current = validate(unseen, fit_baseline(problem))
     say("learned torque: fitting the map")
     weights = [s.mechanism.parameter_names.index(n) for n in names]
     physics = _own_terms(model.mechanism, at)
     excluded = effect.design(position, speed).T @ columns(physics, position, speed)
     size = torque / effect.scale
     fitted = fit_map(problem, current.hypothesis, effect, weights, excluded, size)
-    candidate = validate(validation, fitted.hypothesis)
+    candidate = validate(unseen, fitted.hypothesis)
     if effect.count[0] > 1 and not fitted.flat:
         # Where validation data lie beyond the positions seen, a map of speed alone may be the better one.
         excluded = np.hstack([excluded, position_differences(effect).T])
         flat = fit_map(problem, current.hypothesis, effect, weights, excluded, size)
-        of_speed = validate(validation, flat.hypothesis)
+        of_speed = validate(unseen, flat.hypothesis)
         if of_speed.log_likelihood > candidate.log_likelihood:
             fitted, candidate = flat, of_speed
     gain, z = paired_gain(candidate.blocks, current.blocks)
-    runs_as_well = np.all(candidate.window_rmse < 1.02 * current.window_rmse)
-    kept = bool(gain > MAP_GAIN_NATS and z > MAP_GAIN_Z and runs_as_well)
+    runs_as_well = np.all(candidate.window_rmse < (1 + WINDOWS_WORSE) * current.window_rmse)
+    # As an effect of the catalogue is.
+    kept = bool(gain > HELD_OUT_NATS and z > HELD_OUT_Z and runs_as_well)
     say(f"learned torque: {gain:.0f} nat on validation data, {'kept' if kept else 'not kept'}")
-    before = _without_map(evaluate(problem, validation, model.solver, current, s.calibrations), at)
-    after = evaluate(problem, validation, model.solver, candidate, s.calibrations) if kept else before
+    before = _without_map(evaluate(problem, unseen, model.solver, current, s.calibrations), at)
+    after = evaluate(problem, unseen, model.solver, candidate, s.calibrations) if kept else before
     effect = effect.replace(weights=tuple((effect.scale * candidate.hypothesis.z[weights] * kept).tolist()))
     return LearnedTorqueResult(
         at=at,

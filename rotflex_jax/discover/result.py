@@ -569,6 +569,11 @@ class SearchResult:
         return (self.baseline, *(r.stage for r in self.rounds))
 
     @property
+    def longest_validation(self) -> int:
+        """Number of the longest validation recording, the first of several."""
+        return max(range(len(self.validation)), key=lambda k: self.validation[k].N)
+
+    @property
     def assessment(self) -> Assessment:
         """What is explained, what remains in units of the noise, and which criterion decided."""
         return assess_stages(self.baseline, self.final, self.noise_floor)

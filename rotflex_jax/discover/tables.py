@@ -285,7 +285,7 @@ def next_steps(discovery: SearchResult) -> list[str]:
         steps.append(
             "Take what was found for provisional: what is missing may take its place once it is in the model."
         )
-    i = max(range(len(discovery.validation)), key=lambda k: discovery.validation[k].N)
+    i = discovery.longest_validation
     final = discovery.final
     coloured = coloured_sensors(final.model, discovery.validation[i], np.asarray(final.simulated[i], float))
     return [*advice(coloured), *steps]

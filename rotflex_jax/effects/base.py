@@ -323,7 +323,7 @@ class Effect(abc.ABC):
         return {
             "name": cls.name,
             "class": cls.__name__,
-            "kind": cls.kind(),
+            "kind": cls.kind_label,
             "title": cls.title,
             "equation": cls.equation,
             "ports": list(cls.ports),
@@ -332,11 +332,6 @@ class Effect(abc.ABC):
                 for n, s in cls.declared().items()
             },
         }
-
-    @classmethod
-    def kind(cls) -> str:
-        """Name of the kind, for instance 'dry friction'."""
-        return cls.kind_label
 
 
 # -- kinds ---------------------------------------------------------------------------------------------

@@ -80,7 +80,7 @@ def squared_error(R: Float[np.ndarray, "K columns"], w: Float[np.ndarray, " P"])
 
 def cross_validated_ridge(
     parts: list[Float[np.ndarray, "K K"]], count: int = 31
-) -> tuple[float, Float[np.ndarray, " G"], Float[np.ndarray, " G"]]:
+) -> tuple[float, Float[np.ndarray, " G"]]:
     """The ridge with the least error on blocks left out in turn.
 
     Args:
@@ -88,7 +88,7 @@ def cross_validated_ridge(
         count: Ridges to try, from rounding to the mean eigenvalue.
 
     Returns:
-        The ridge, all ridges, their squared errors summed over the blocks.
+        The ridge, and all ridges.
     """
     P = parts[0].shape[1] - 1
     power = sum(np.sum(R[:, :-1] ** 2) for R in parts) / P
@@ -100,7 +100,7 @@ def cross_validated_ridge(
         U, s, Vt = np.linalg.svd(R[:, :-1], full_matrices=False)
         filtered = s[:, None] / (s[:, None] ** 2 + ridges) * (U.T @ R[:, -1])[:, None]
         errors += np.sum((held[:, -1:] - held[:, :-1] @ (Vt.T @ filtered)) ** 2, axis=0)
-    return float(ridges[np.argmin(errors)]), ridges, errors
+    return float(ridges[np.argmin(errors)]), ridges
 
 
 @dataclasses.dataclass(frozen=True)

@@ -228,7 +228,7 @@ def least_squares(
                 "instance blocks=10, or the ridge as a number."
             )
         parts = [factor(joined[block == k]) for k in range(block[-1] + 1)]
-        penalty, ridges, _ = cross_validated_ridge(parts)
+        penalty, ridges = cross_validated_ridge(parts)
         R = factor(np.concatenate(parts))
         end = "at the least that was tried" if penalty == ridges[0] else "by cross-validation"
         status = f"converged, ridge {end}"

@@ -46,7 +46,7 @@ class GearConstants(NamedTuple):
         flight: Constants of the step while the rotor is in flight.
         line: Response of the m linear states to the teeth's torque on the port: one column for a constant
             torque, one for a torque that grows from 0 to 1 over the step.
-        moments: The same for a torque with the first, second or third moment in_flight.
+        moments: The same for a torque with the first, second or third moment alone.
         correction: Constant and growing torque that cancel an error of the rotor's angle and speed.
         mass: Effective inertia of an impact of the teeth [kg m^2].
         teeth: Stiffness and damping of elastic teeth, None where they are rigid.

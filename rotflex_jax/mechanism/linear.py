@@ -188,21 +188,31 @@ def kalman_gains(
     return gains
 
 
+NOISE_DOUBLINGS = 14
+"""How often a sample is halved for a first step, whose covariance is doubled as often."""
+
+
 def process_covariance(
-    A: Float[np.ndarray, "m m"], push: Float[np.ndarray, "*batch n"], n: int, Ts: float, doublings: int = 14
+    A: Float[np.ndarray, "m m"], push: Float[np.ndarray, "*batch n"], n: int, Ts: float
 ) -> Float[np.ndarray, "*batch m m"]:
     """Covariance of the state after one sample of a white torque of unit intensity; of several at once.
 
     `Q(2 h) = Q(h) + E Q(h) E'` from a Simpson rule over the smallest step; this has, in contrast to the
     usual block exponential, no growing mode, so a fast electrical pole costs no accuracy.
+
+    Args:
+        A: State matrix.
+        push: What the torque adds to the slopes of the speeds.
+        n: Number of coordinates; their speeds are the states from n on.
+        Ts: Sampling period [s].
     """
     g = np.zeros((*np.shape(push)[:-1], len(A)))
     g[..., n : 2 * n] = push
-    h = Ts / 2**doublings
+    h = Ts / 2**NOISE_DOUBLINGS
     half = _exponential(A * (h / 2))
     E = half @ half
     outer = lambda g: g[..., :, None] * g[..., None, :]  # noqa: E731
     Q = h / 6 * (outer(g) + 4 * outer(g @ half.T) + outer(g @ E.T))
-    for _ in range(doublings):
+    for _ in range(NOISE_DOUBLINGS):
         Q, E = Q + E @ Q @ E.T, E @ E
     return Q

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Real
 
 from rotflex_jax import checks
-from rotflex_jax.checks import number, shown, shown as describe
+from rotflex_jax.checks import number, shown
 from rotflex_jax.effects.base import Effect, Linear, Memory, driven_place
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
@@ -51,7 +51,7 @@ def outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
     for channel, pair in each.items():
         if pair is None or len(pair) != 2:
             raise InputError(
-                f"Output {channel!r} was given as {describe(pair)}, but needs a port, or a port and 'speed'; "
+                f"Output {channel!r} was given as {shown(pair)}, but needs a port, or a port and 'speed'; "
                 f'write for instance {{"{channel}": ("drum", "speed")}}.'
             )
     return tuple((k, (v[0], v[1])) for k, v in each.items() if v is not None)
@@ -61,7 +61,7 @@ def effects(given: Any) -> tuple[Effect, ...]:
     """Effects in order."""
     sequence = checks.entries(given)
     if sequence is None and not isinstance(given, Effect | type):
-        raise InputError(f"The effects were given as {describe(given)}, but a list is needed; give one.")
+        raise InputError(f"The effects were given as {shown(given)}, but a list is needed; give one.")
     listed: tuple[Any, ...] = (given,) if sequence is None else sequence
     for e in listed:
         if not isinstance(e, Effect):
@@ -80,7 +80,7 @@ def process_noise_of(mechanism: "Mechanism", given: Any) -> dict[str, float]:
     """Port -> intensity of a process torque, nothing for None; checked."""
     if not (given is None or isinstance(given, Mapping)):
         raise InputError(
-            f"Argument `process_noise` must give an intensity for each port, but is {describe(given)}; write "
+            f"Argument `process_noise` must give an intensity for each port, but is {shown(given)}; write "
             "for instance {'hub': 1e-6}."
         )
     found = {}

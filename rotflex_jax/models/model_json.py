@@ -166,7 +166,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
     return {
         "effect": effect.name,
         "at": effect.at,
-        "kind": cls.kind(),
+        "kind": cls.kind_label,
         "equation": effect.equation,
         "parameters": parameters,
         "settings": _settings(effect),

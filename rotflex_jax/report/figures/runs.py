@@ -57,7 +57,7 @@ class Shown:
 
 def shown(discovery: SearchResult) -> Shown:
     """What the figures of runs are drawn from."""
-    i = max(range(len(discovery.validation)), key=lambda k: discovery.validation[k].N)
+    i = discovery.longest_validation
     recording, base = discovery.validation[i], discovery.baseline
 
     def run(stage: Stage) -> np.ndarray:
