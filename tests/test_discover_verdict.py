@@ -19,14 +19,13 @@ from rotflex_jax.discover.verdict import (
     Verdict,
     assess,
     grade,
-    percent,
 )
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.labels import effect_label, effect_phrase, sentence, with_titles
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.parameters import Estimate, Specification
 from rotflex_jax.report.page import render, tone
-from rotflex_jax.text.numbers import multiple
+from rotflex_jax.text.numbers import multiple, percent_explained
 
 NAN = float("nan")
 
@@ -197,7 +196,7 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
         in dataclasses.replace(below, remaining=below.remaining | unknown).criterion
     )
     assert "error of theta" in dataclasses.replace(end, remaining=end.remaining | unknown).criterion
-    assert [percent(share) for share in (99.99, 99.0, 0.0)] == ["99.99 %", "99.0 %", "0 %"]
+    assert [percent_explained(share) for share in (99.99, 99.0, 0.0)] == ["99.99 %", "99.0 %", "0 %"]
     # Of a baseline without an error nothing can be explained.
     assert np.isnan(assess({"theta": 0.0}, {"theta": 1.0}, {"theta": 1.0}, 0.0).explained["theta"])
 

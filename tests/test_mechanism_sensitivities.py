@@ -21,13 +21,13 @@ from rotflex_jax.mechanism import (
     simulate,
 )
 from rotflex_jax.mechanism.assembly import Layout, motor_voltage, rest_state
+from rotflex_jax.mechanism.inactive_laws import run_responses
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
     RunParameters,
     TangentDirections,
     inactive_sensitivities,
-    linearised_run,
     outputs_with_sensitivities,
 )
 from rotflex_jax.mechanism.simulate import PredictorStep, read_outputs
@@ -143,8 +143,8 @@ def found(case: str) -> np.ndarray:
         present = jnp.array(c.present)
         values, gates = jnp.asarray(c.baseline.values), jnp.ones(len(c.baseline.effects))
         mine = RunParameters(values, gates, c.numbers.x0[present], c.numbers.K[present])
-        linearised = jax.jit(linearised_run, static_argnums=(0, 1), compiler_options=ROUGH)
-        run = linearised(c.baseline.structure, SOLVER, mine, c.samples)
+        responses = jax.jit(run_responses, static_argnums=(0, 1, 2), compiler_options=ROUGH)
+        run = responses(c.baseline.structure, SOLVER, (), mine, c.samples).run
         assert run.A.shape == (N, len(present), len(present))
         along = jax.jit(inactive_sensitivities, static_argnums=(0, 1, 2), compiler_options=ROUGH)
         inactive = tuple(range(len(c.baseline.effects), len(c.full.effects)))

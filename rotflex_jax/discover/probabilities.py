@@ -18,6 +18,7 @@ from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import Horizons, SearchHorizon, ValidatedHypothesis
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
+from rotflex_jax.text.numbers import percent_probable
 
 # Draws of weights of the half seconds, and the seed that makes them the same each time.
 DRAWS, SEED = 2000, 0
@@ -130,13 +131,13 @@ class Probabilities:
         if not self.sets:
             return ""
         named = [s for s in self.sets[:3] if s.probability >= LEAST_NAMED] or [self.sets[0]]
-        first, *others = (f"{set_label(s.effects)} {percent(s.probability)}" for s in named)
+        first, *others = (f"{set_label(s.effects)} {percent_probable(s.probability)}" for s in named)
         rest = f"; then {', '.join(others)}" if others else ""
         if len(self.sets) == 1:
-            return f"One set of effects was fitted: {first}; another one {percent(self.elsewhere)}."
+            return f"One set of effects was fitted: {first}; another one {percent_probable(self.elsewhere)}."
         return (
             f"Most probable of the {len(self.sets)} sets of effects that were fitted: {first}{rest}; "
-            f"none of these {percent(self.elsewhere)}."
+            f"none of these {percent_probable(self.elsewhere)}."
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -179,17 +180,6 @@ def set_label(effects: frozenset[str]) -> str:
 def set_labels(effects: frozenset[str]) -> tuple[str, ...]:
     """The effects of a set in words, one that says so for the model as it was given."""
     return tuple(effect_label(*parts(n)) for n in sorted(effects)) or ("nothing more",)
-
-
-def percent(probability: float) -> str:
-    """A probability as people read it.
-
-    >>> [percent(p) for p in (0.9997, 0.934, 0.0312, 0.0004)]
-    ['> 99 %', '93 %', '3 %', '< 1 %']
-    """
-    if probability < 0.01:
-        return "< 1 %"
-    return f"{100 * probability:.0f} %" if probability <= 0.99 else "> 99 %"
 
 
 def set_probabilities(
@@ -262,7 +252,8 @@ def probabilities(fitted: Sequence[FittedSet], *, misfit: float, rule: EvidenceR
             effects[name] = effects.get(name, 0.0) + s.probability / (1 - elsewhere)
     remarks = [
         "Only sets that the search has fitted have a probability of their own; that the right one is none of "
-        f"them has the probability {percent(elsewhere)}, as often as on simulated machines with such an end.",
+        f"them has the probability {percent_probable(elsewhere)}, as often as on simulated machines with "
+        "such an end.",
     ]
     if misfit > 1:
         remarks.append(

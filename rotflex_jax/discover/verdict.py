@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MUTED
-from rotflex_jax.text.numbers import json_number, json_numbers, multiple, ratio
+from rotflex_jax.text.numbers import json_number, json_numbers, multiple, percent_explained, ratio
 
 # An error of at most this times the sensor noise counts as having reached it.
 NEAR_FLOOR = 1.5
@@ -115,7 +115,7 @@ class Assessment:
     @property
     def explained_text(self) -> str:
         """What is explained of each channel, in words; empty where nothing is."""
-        listed = [f"{c} {percent(share)}" for c, share in self.explained.items() if share > 0]
+        listed = [f"{c} {percent_explained(share)}" for c, share in self.explained.items() if share > 0]
         return f"{', '.join(listed)} of the baseline's squared error is explained" if listed else ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -151,17 +151,6 @@ def assess(
     shares = {c: 100 * (1 - (after[c] / e) ** 2) if 0 < e < math.inf else math.nan for c, e in before.items()}
     remaining = {c: ratio(after[c], floor.get(c)) for c in after}
     return Assessment(shares, remaining, nats)
-
-
-def percent(share: float) -> str:
-    """A share near 100 % with as many digits as what is left of it is worth.
-
-    >>> percent(83.21), percent(99.871), percent(99.99999), percent(-3.0)
-    ('83.2 %', '99.87 %', '> 99.99 %', '0 %')
-    """
-    if share > 99.99:
-        return "> 99.99 %"
-    return f"{share:.2f} %" if share > 99 else f"{share:.1f} %" if share > 0 else "0 %"
 
 
 def in_noise(remaining: Mapping[str, float]) -> str:

@@ -72,6 +72,19 @@ class Stamp(NamedTuple):
     from_voltage: tuple[Scalar, ...] = ()
     torque: tuple[Scalar, ...] = ()
 
+    def static(self) -> "Stamp":
+        """The same with states of its own at the values that they have at constant speed, as numbers.
+
+        A motor damps its port through its current then.
+        """
+        damping, drive = float(self.damping), float(self.drive)
+        if len(self.own):
+            # Not the inverse: a state that nothing brings back has no such value, and adds nothing.
+            through = np.array(self.torque, float) @ np.linalg.pinv(np.array(self.own, float))
+            damping += float(through @ np.array(self.from_speed, float))
+            drive -= float(through @ np.array(self.from_voltage, float))
+        return Stamp(float(self.inertia), damping, float(self.stiffness), drive)
+
 
 # Phase at the ends of the travel of a port, about its middle [rad], below which a law that repeats with the
 # angle is a spring or a constant torque there.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.effects.base import Effect, Linear, Stamp
+from rotflex_jax.effects.base import Effect, Linear
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import second_order_matrices
 from rotflex_jax.mechanism.quantity import Units
@@ -146,18 +146,8 @@ def _only_entries(effect: Effect) -> bool:
 def _entries(m: Mechanism, effects: Sequence[Effect]) -> Float[np.ndarray, " E"]:
     """Mass, damping, stiffness and drive of the linear effects, one after the other."""
     linear = (e for e in effects if _only_entries(e) and isinstance(e, Linear))
-    stamps = [(_static(e.stamp()), m.vector(e)) for e in linear]
+    stamps = [(e.stamp().static(), m.vector(e)) for e in linear]
     return np.concatenate([np.ravel(part) for part in second_order_matrices(stamps, len(m.coordinates))])
-
-
-def _static(stamp: Stamp) -> Stamp:
-    """Inertia, damping, stiffness and drive, a motor's through its current at constant speed too."""
-    damping, drive = float(stamp.damping), float(stamp.drive)
-    if len(stamp.own):
-        through = np.array(stamp.torque, float) @ np.linalg.inv(np.array(stamp.own, float))
-        damping += float(through @ np.array(stamp.from_speed, float))
-        drive -= float(through @ np.array(stamp.from_voltage, float))
-    return Stamp(float(stamp.inertia), damping, float(stamp.stiffness), drive)
 
 
 def _kind_sizes(m: Mechanism, entries: Float[np.ndarray, " E"]) -> Float[np.ndarray, " E"]:

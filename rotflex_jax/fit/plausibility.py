@@ -60,7 +60,7 @@ def physical_ranges(m: Mechanism) -> tuple[Float[np.ndarray, " P"], Float[np.nda
     """
     low, high = [], []
     for effect in m.effects:
-        others = sum(_static_damping(e) for e in m.effects if e is not effect and e.at == effect.at)
+        others = sum(e.stamp().static().damping for e in m.linear_effects(effect.at) if e is not effect)
         for spec in specifications(effect).values():
             corrects = isinstance(effect, Linear) and spec.unit == _DAMPING
             low.append(spec.physical[0] - (max(others, 0.0) if corrects else 0.0))
@@ -75,18 +75,6 @@ def physical_ranges(m: Mechanism) -> tuple[Float[np.ndarray, " P"], Float[np.nda
         for inside, end, none in ends
     )
     return lowest, highest
-
-
-def _static_damping(effect: Effect) -> float:
-    """Damping of a linear effect at its port, a motor's through its current at constant speed too."""
-    if not isinstance(effect, Linear):
-        return 0.0
-    stamp = effect.stamp()
-    through = 0.0
-    if len(stamp.own):
-        own, torque = np.array(stamp.own, float), np.array(stamp.torque, float)
-        through = float(torque @ np.linalg.pinv(own) @ np.array(stamp.from_speed, float))
-    return float(stamp.damping) + through
 
 
 # Moves over each of these shares of the recording, of at most so many samples, are compared.

@@ -28,12 +28,11 @@ from rotflex_jax.effects.base import Actuation, Gear, Memory
 from rotflex_jax.mechanism.assembly import effects_of, motor_inputs, stamped
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.repetition import without_repetition
-from rotflex_jax.mechanism.scan import directional, forcing, state_jacobians, states, tangent_recursion
+from rotflex_jax.mechanism.scan import directional, forcing, states, tangent_recursion
 from rotflex_jax.mechanism.simulate import (
     FreeStep,
     PredictorStep,
     Solver,
-    prepared_run,
     read_outputs,
     restarts,
     started_again,
@@ -97,25 +96,6 @@ class LinearisedRun(NamedTuple):
     A: Float[Array, "*batch N n n"]
 
 
-def linearised_run(
-    structure: Mechanism, solver: Solver, parameters: RunParameters, samples: RecordingSamples
-) -> LinearisedRun:
-    """States of a predictor run, and the Jacobians of its steps.
-
-    Args:
-        structure: Without the inactive effects; static.
-        solver: Integration rule; static.
-        parameters: Of this structure.
-        samples: The recording.
-    """
-    step = PredictorStep(structure, solver)
-    _, v, c = prepared_run(structure, solver, parameters.values, parameters.gates, samples.u, samples.Ts)
-    x0, measured = samples.started_at(parameters.x0)
-    inputs, constants = (v, *measured), (c, parameters.K)
-    X = states(step, x0, inputs, constants)
-    return LinearisedRun(X, state_jacobians(step, X, inputs, constants))
-
-
 def inactive_sensitivities(
     structure: Mechanism,
     solver: Solver,
@@ -139,7 +119,7 @@ def inactive_sensitivities(
         parameters: Every inactive effect at zero amplitude, or with its gate closed.
         samples: The recording.
         active: Places of the states that do not belong to inactive effects.
-        run: From `linearised_run` without the inactive effects.
+        run: Without the inactive effects, from `inactive_laws.run_responses`.
         dvalues: Directions in the parameter values.
         dgates: Directions in the gates.
     """

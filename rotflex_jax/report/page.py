@@ -24,7 +24,7 @@ from rotflex_jax.discover.tables import (
     stage_labels,
     status_sentence,
 )
-from rotflex_jax.discover.verdict import FAR_FLOOR, NEAR_FLOOR, Grade, grade, percent
+from rotflex_jax.discover.verdict import FAR_FLOOR, NEAR_FLOOR, Grade, grade
 from rotflex_jax.effects.labels import effect_label, effect_title, sentence
 from rotflex_jax.latent import LatentTorque
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
@@ -35,6 +35,7 @@ from rotflex_jax.text.markup import as_json, fill_template, write_files
 from rotflex_jax.text.numbers import (
     equation,
     multiple,
+    percent_explained,
     plain_number,
     ratio,
     readable,
@@ -107,7 +108,7 @@ def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
         text = f"{multiple(times)} × the sensor noise" if math.isfinite(times) else f"error on {data} data"
         if discovery.rounds and 0 < first[channel] < math.inf:
             share = 100 * (1 - (last[channel] / first[channel]) ** 2)
-            text += f" · {percent(share)} of the squared error explained"
+            text += f" · {percent_explained(share)} of the squared error explained"
         tiles.append(
             {
                 "channel": channel,

@@ -11,7 +11,7 @@ from rotflex_jax.reproduce.experiment import Reproduction
 from rotflex_jax.reproduce.figures import FIGURES
 from rotflex_jax.reproduce.records import PulseRun
 from rotflex_jax.text.markup import as_json, fill_template, write_files
-from rotflex_jax.text.numbers import digits, readable
+from rotflex_jax.text.numbers import digits, percent_left, readable
 from rotflex_jax.text.plotting import Picture, by_section
 
 
@@ -41,13 +41,13 @@ def summary(result: Reproduction) -> str:
     lms, linear, physical = (result.row(name).held_out for name in names(result))
     quadratic = result.row(f"M={result.settings.memory} quadratic").held_out
     paper = (
-        f"the paper's model leaves {percent(lms)} of the variance unexplained"
+        f"the paper's model leaves {percent_left(lms)} of the variance unexplained"
         if math.isfinite(lms)
         else "the paper's model is worth nothing, since its filter ran away"
     )
     first = (
         f"On data it has not seen, {paper}; a linear model identified from the same data leaves "
-        f"{percent(linear)}, the linearised joint {percent(physical)}."
+        f"{percent_left(linear)}, the linearised joint {percent_left(physical)}."
     )
     gain = 1 - quadratic / linear
     worth = "nothing here" if gain < 0.005 else f"{gain:.0%} of the linear model's error"
@@ -61,17 +61,6 @@ def names(result: Reproduction) -> tuple[str, str, str]:
     return f"{M} quadratic, LMS", f"{M} linear", "linearised joint"
 
 
-def percent(fraction: float) -> str:
-    """A fraction in percent, for people.
-
-    >>> percent(0.0152), percent(0.608), percent(1.59)
-    ('1.5 %', '61 %', '159 %')
-    """
-    if not math.isfinite(fraction):
-        return "–"
-    return f"{100 * fraction:.1f} %" if fraction < 0.1 else f"{100 * fraction:.0f} %"
-
-
 def online(result: Reproduction) -> list[str]:
     """The a-priori error, and what it is not."""
     a = result.adaptation
@@ -79,19 +68,19 @@ def online(result: Reproduction) -> list[str]:
         return [f"The filter {a.status}: its step sizes are too large for this input."]
     frozen, stability = result.row(names(result)[0]).held_out, a.prediction.stability
     texts = [
-        f"While it learns, the filter's a-priori errors are {percent(a.online)} of the variance (last half "
-        f"of the run); the weights it ends with leave {percent(frozen)} on data they have not seen. Only "
-        "the second is an error of a model: online, the weights follow the record.",
+        f"While it learns, the filter's a-priori errors are {percent_left(a.online)} of the variance (last "
+        f"half of the run); the weights it ends with leave {percent_left(frozen)} on data they have not "
+        "seen. Only the second is an error of a model: online, the weights follow the record.",
         f"The step sizes are {_sizes(result)}. By theory they are {stability.sentence}, and cost "
-        f"{percent(stability.misadjustment)} of the smallest error in the end.",
+        f"{percent_left(stability.misadjustment)} of the smallest error in the end.",
     ]
     if result.short_memory is not None:
         t = result.short_memory
         texts.append(
             f"How far the two can part: at a sampling interval of {1e3 * t.Ts:g} ms, where "
             f"{result.settings.memory} samples span next to nothing of the joint, the a-priori error falls "
-            f"to {percent(t.online)}, while the frozen weights leave {percent(t.frozen)} and least squares "
-            f"{percent(t.least_squares)}."
+            f"to {percent_left(t.online)}, while the frozen weights leave {percent_left(t.frozen)} and least "
+            f"squares {percent_left(t.least_squares)}."
         )
     return texts
 

@@ -160,6 +160,39 @@ def multiple(times: float) -> str:
     return f"{times:.2f}" if times < 100 else f"{times:.0f}" if times < 10_000 else "over 10,000"
 
 
+def percent_explained(percent: float) -> str:
+    """A share near 100 % with as many digits as what is left of it is worth.
+
+    >>> [percent_explained(p) for p in (83.21, 99.871, 99.99999, -3.0)]
+    ['83.2 %', '99.87 %', '> 99.99 %', '0 %']
+    """
+    if percent > 99.99:
+        return "> 99.99 %"
+    return f"{percent:.2f} %" if percent > 99 else f"{percent:.1f} %" if percent > 0 else "0 %"
+
+
+def percent_left(fraction: float) -> str:
+    """What is left of something, as a fraction of it; may be more than all of it.
+
+    >>> [percent_left(f) for f in (0.0152, 0.608, 1.59)]
+    ['1.5 %', '61 %', '159 %']
+    """
+    if not math.isfinite(fraction):
+        return "–"
+    return f"{100 * fraction:.1f} %" if fraction < 0.1 else f"{100 * fraction:.0f} %"
+
+
+def percent_probable(probability: float) -> str:
+    """A probability as people read it.
+
+    >>> [percent_probable(p) for p in (0.9997, 0.934, 0.0312, 0.0004)]
+    ['> 99 %', '93 %', '3 %', '< 1 %']
+    """
+    if probability < 0.01:
+        return "< 1 %"
+    return f"{100 * probability:.0f} %" if probability <= 0.99 else "> 99 %"
+
+
 def as_read(value: float, unit: str) -> tuple[float, str]:
     """A value in the unit that people read: degrees for angles, millimetres for lengths.
 

@@ -8,14 +8,14 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 
-from rotflex_jax.discover.probabilities import LEAST_NAMED, parts, percent, set_labels
+from rotflex_jax.discover.probabilities import LEAST_NAMED, parts, set_labels
 from rotflex_jax.discover.result import NEAR_FLOOR, SearchResult
 from rotflex_jax.discover.tables import Outcome, channel_units, noise_ratios, outcomes, stage_labels
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.report.figures.registry import figure
 from rotflex_jax.text.colours import FINAL, INK, MEASURED, MUTED, NOISE, stage_colours
-from rotflex_jax.text.numbers import plain_number, readable
+from rotflex_jax.text.numbers import percent_probable, plain_number, readable
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks
 
 MOST_BARS = 14
@@ -50,7 +50,9 @@ def probabilities(discovery: SearchResult) -> Figure | None:
     for ax, bars, name in ((axes[0], sets, "set of effects [–]"), (axes[1], effects, "effect [–]")):
         for k, (_, p, is_reported) in enumerate(bars):
             ax.barh(k, p, 0.62, color=FINAL if is_reported else MEASURED, alpha=1.0 if is_reported else 0.75)
-            ax.annotate(percent(p), (p, k), (5, 0), textcoords="offset points", va="center", fontsize=8)
+            ax.annotate(
+                percent_probable(p), (p, k), (5, 0), textcoords="offset points", va="center", fontsize=8
+            )
         ax.set_yticks(range(len(bars)), [label for label, _, _ in bars])
         for text, (_, _, is_reported) in zip(ax.get_yticklabels(), bars, strict=True):
             text.set_fontweight("bold" if is_reported else "normal")
