@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rotflex_jax.effects.base import Actuation, Period, Probe, Scale, register
+from rotflex_jax.effects.base import Actuation, Period, Probe, Scale, register, within
 from rotflex_jax.parameters import parameter
 
 
@@ -83,9 +83,7 @@ class Saturation(Actuation):
 
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
         """Voltage [V] at the motor."""
-        # Not `clip`, which splits the derivative between the two branches on the limit itself.
-        above = jnp.where(voltage > self.limit, self.limit, voltage)
-        return jnp.where(voltage < -self.limit, -self.limit, above)
+        return within(voltage, -self.limit, self.limit)
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:

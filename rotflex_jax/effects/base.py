@@ -40,6 +40,15 @@ EffectType = TypeVar("EffectType", bound="Effect")
 _SIGNAL_MARK = ": "
 
 
+def within(x: Scalar, low: Scalar, high: Scalar) -> Real[Array, "..."]:
+    """`x` held within limits; beyond them its derivative is that of the limit, however large its own.
+
+    Not `clip`, which splits the derivative between the branches on a limit itself: of a band without a width
+    it would halve the derivative by the width.
+    """
+    return jnp.where(x < low, low, jnp.where(x > high, high, x))
+
+
 def driven_place(port: str, signal: str) -> str:
     """The place of an effect that a signal drives at a port.
 

@@ -4,9 +4,7 @@ import dataclasses
 import math
 from typing import ClassVar
 
-import jax.numpy as jnp
-
-from rotflex_jax.effects.base import Force, Linear, Probe, Scalar, Scale, Stamp, register
+from rotflex_jax.effects.base import Force, Linear, Probe, Scalar, Scale, Stamp, register, within
 from rotflex_jax.parameters import parameter
 
 
@@ -168,9 +166,7 @@ class JointPlay(Force):
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
         """Torque [N m] on the port."""
-        # Not `clip`: at no play it would halve the derivative with respect to the play.
-        above = jnp.where(position > self.play, self.play, position)
-        return self.stiffness * jnp.where(position < -self.play, -self.play, above)
+        return self.stiffness * within(position, -self.play, self.play)
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:

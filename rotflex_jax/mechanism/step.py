@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, Float, Real
 
 from rotflex_jax.checks import one_of, real, shown, whole
-from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar
+from rotflex_jax.effects.base import DryFriction, Force, Linear, Memory, Scalar, within
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Constants, Layout, constants, effects_of, equations, own_states
 from rotflex_jax.mechanism.elastic_teeth import elastic_step
@@ -389,13 +389,6 @@ def advance_memories(
     if not np.isfinite(limits).any():
         return after
     return within(after, *(expand_axes(jnp.asarray(each, z.dtype), z) for each in limits.T))
-
-
-def within(
-    z: Float[Array, "*S"], low: Float[ArrayLike, "*#S"], high: Float[ArrayLike, "*#S"]
-) -> Float[Array, "*S"]:
-    """States held within limits; beyond them derivatives are zero, however large those of the states."""
-    return jnp.where(z < low, low, jnp.where(z > high, high, z))
 
 
 def exponential_euler(
