@@ -211,6 +211,9 @@ HELPS = HorizonGain(1.0, 2.0, 0.5)
 NEAR = 1.5  # times the noise of the sensor
 
 
+RANKED = [("coulomb", "hub"), ("quadratic_drag", "hub"), ("viscous", "arm"), ("dead_zone", "input")]
+
+
 def told(
     *,
     before: float = 100.0,
@@ -219,6 +222,7 @@ def told(
     rounds: tuple[tuple[str, ...], ...] = (),
     excited: int = 4,
     candidates: int = 4,
+    imitated: int = 0,
 ) -> tuple[Verdict, str]:
     """Verdict and sentence of a search that ended so near to the noise, with equivalents of each round."""
     floor = {"theta": 5e-4, "alpha": 2e-3}
@@ -232,7 +236,12 @@ def told(
         for others in rounds
         for noun in ("dry friction" if others else "Coulomb friction",)
     ]
-    ranking: Any = [SimpleNamespace(excited=k < excited) for k in range(candidates)]
+    ranking: Any = [
+        SimpleNamespace(
+            excited=k < excited, location=(name, port), orthogonal_fraction=0.001 if k < imitated else 0.5
+        )
+        for k, (name, port) in zip(range(candidates), RANKED * candidates, strict=False)
+    ]
     return end_state(baseline, found, final, floor, ranking)
 
 
@@ -502,6 +511,11 @@ FOUND = "Coulomb friction at the hub"
 REACHED = "the held-out error over 2 s is theta 1.00, alpha 1.00 times the sensor noise"
 SHARE = "; theta > 99.99 %, alpha > 99.99 % of the baseline's squared error is explained"
 REMAINS = "something remains that no candidate explains"
+DRAG, DAMPING = "quadratic drag at the hub", "viscous damping at the arm"
+LOOK = (
+    "look like other values of the fitted parameters here (to 99 %): a motion with more reversals, "
+    "speeds and amplitudes tells them apart"
+)
 TORQUE = "predictions still ask for a random torque (0.1 nat per measured value, at most 0.03)"
 
 
@@ -510,6 +524,11 @@ TORQUE = "predictions still ask for a random torque (0.1 nat per measured value,
     [
         ({}, f"Nothing is missing: {REACHED}."),
         ({"excited": 3}, f"Nothing is missing: {REACHED}; 1 of 4 candidates could not have shown."),
+        ({"imitated": 1}, f"Nothing is missing: {REACHED}; but {FOUND} would {LOOK}."),
+        (
+            {"imitated": 4, "excited": 4},
+            f"Nothing is missing: {REACHED}; but {FOUND}, {DRAG}, {DAMPING} and 1 more would {LOOK}.",
+        ),
         ({"rounds": ((),)}, f"{FOUND} explains the recording: {REACHED}{SHARE}."),
         ({"rounds": ((),), "before": 1.0}, f"{FOUND} explains the recording: {REACHED}."),
         (

@@ -30,6 +30,9 @@ from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.fit.coordinates import orthogonal_to
 from rotflex_jax.recording import Recording
 
+# Share of its trace in the outputs below which a candidate has next to nothing that the model cannot imitate.
+IMITATED = 0.01
+
 
 def end_state(
     baseline: Stage,
@@ -74,7 +77,20 @@ def end_state(
             f"recording: move the machine more, over more speeds and voltages."
         )
     hidden = f"; {invisible} of {len(ranking)} candidates could not have shown" if invisible else ""
-    return Verdict.NOTHING_MISSING, f"Nothing is missing: {reached}{hidden}."
+    return Verdict.NOTHING_MISSING, f"Nothing is missing: {reached}{hidden}{_imitated(visible)}."
+
+
+def _imitated(visible: Sequence[Score]) -> str:
+    """Clause on candidates that the fitted parameters would hide by their values; empty where none would."""
+    alike = [effect_phrase(*s.location) for s in visible if s.orthogonal_fraction < IMITATED]
+    if not alike:
+        return ""
+    named = ", ".join(alike[:3]) + (f" and {len(alike) - 3} more" if len(alike) > 3 else "")
+    share = f"{100 * (1 - IMITATED):.0f} %"
+    return (
+        f"; but {named} would look like other values of the fitted parameters here (to {share}): a motion with "
+        "more reversals, speeds and amplitudes tells them apart"
+    )
 
 
 Found = TypeVar("Found", bound=SearchResult)
