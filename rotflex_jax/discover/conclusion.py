@@ -88,8 +88,8 @@ def _imitated(visible: Sequence[Score]) -> str:
     named = ", ".join(alike[:3]) + (f" and {len(alike) - 3} more" if len(alike) > 3 else "")
     share = f"{100 * (1 - IMITATED):.0f} %"
     return (
-        f"; but {named} would look like other values of the fitted parameters here (to {share}): a motion with "
-        "more reversals, speeds and amplitudes tells them apart"
+        f"; but {named} would look like other values of the fitted parameters here (to {share}): a motion "
+        "with more reversals, speeds and amplitudes tells them apart"
     )
 
 
