@@ -11,8 +11,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Float
@@ -20,8 +18,8 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.effects.base import Memory
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
-from rotflex_jax.fit.problem import RunLayout, runs_with_slopes
+from rotflex_jax.fit.dataset import sensor_noise
+from rotflex_jax.fit.problem import RunLayout, free_run_slopes
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism, linearise
 from rotflex_jax.mechanism.assembly import Layout, effects_of
@@ -30,7 +28,6 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed, single
-from rotflex_jax.runtime.xla import double_precision
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import plain_number, readable
 
@@ -329,7 +326,7 @@ def _run(
 
     def run(state: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
         """Outputs; slopes by parameters, positions, speeds, and by shares of what no sensor shows."""
-        y_hat, J = _slopes(model, m, recording, state[None], free)
+        y_hat, J = _slopes(model, m, recording, state, free)
         with np.errstate(over="ignore", invalid="ignore"):  # of a run that diverges, which is refused below
             return y_hat, np.concatenate([J[..., : F + moving], J[..., F + moving :] @ unseen], axis=-1)
 
@@ -516,26 +513,10 @@ def _slopes(
     model: Model, m: Mechanism, recording: Recording, start: np.ndarray, free: np.ndarray
 ) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
     """Outputs of a free run, and slopes by parameters [their units], then by the first state."""
-    states, C, N = Layout.of(m.structure).size, len(m.channels), recording.N
-    with double_precision():
-        data = StackedRecordings(
-            jnp.asarray(model.inputs(recording)[None]),
-            jnp.zeros((1, N, C)),
-            jnp.ones((1, N)),
-            jnp.asarray(np.array([float(recording.Ts)])),
-        )
-        y, J = runs_with_slopes(
-            RunLayout(m.structure, model.solver, states),
-            jnp.asarray(m.values[None]),
-            jnp.ones((1, len(m.values))),
-            jnp.asarray(free),
-            jnp.asarray(start),
-            data,
-            jnp.zeros((1, Layout.of(m.structure).size, C)),
-            None,
-        )
-        y, J = jax.device_get((y, J))
-    return np.array(y[0]), np.array(J[0])
+    layout = RunLayout(m.structure, model.solver, Layout.of(m.structure).size)
+    u, Ts = model.inputs(recording), float(recording.Ts)
+    y, J = free_run_slopes(layout, m.values, np.ones(len(m.values)), free, start, u, Ts)
+    return np.array(y), np.array(J)
 
 
 def _process_variance(

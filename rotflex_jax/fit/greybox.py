@@ -37,12 +37,6 @@ if TYPE_CHECKING:
 FirstState = Literal["fitted", "measured"]
 
 
-def _common_values(m: Mechanism, values: Float[np.ndarray, "R P"]) -> Float[np.ndarray, " P"]:
-    """Means over recordings; what is trusted is the mechanism's own, whatever a recording knows of it."""
-    free = np.array([name not in m.trusted for name in m.parameter_names])
-    return np.where(free, values.mean(axis=0), m.values)
-
-
 def report(
     problem: GreyBoxProblem,
     end: FitAttempt,
@@ -68,7 +62,7 @@ def report(
     deviation = np.sqrt(np.mean(residual**2, axis=0))
     scale = np.maximum(deviation, LEAST_SCALE * problem.dataset.noise)
     values, stretch = problem.physical(point)
-    common = _common_values(m, values)
+    common = problem.common(values)
     at_end = problem.at_ends(point)
     moves = ~problem.held_by_ends(point, windows)
     place = np.cumsum(moves) - 1

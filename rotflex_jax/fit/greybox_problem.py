@@ -214,6 +214,12 @@ class GreyBoxProblem:
         values = np.where(held, m.values, values)
         return np.where(known, self.dataset.constants, values), np.where(known | held, 0.0, slopes)
 
+    def common(self, values: Float[np.ndarray, "R P"]) -> Float[np.ndarray, " P"]:
+        """Means over recordings; what is trusted is the mechanism's own, whatever a recording knows of it."""
+        m = self.model.mechanism
+        free = np.array([name not in m.trusted for name in m.parameter_names])
+        return np.where(free, values.mean(axis=0), m.values)
+
     def coordinates(self, point: FitPoint, windows: Windows) -> FitCoordinates:
         """What moves."""
         return FitCoordinates(len(point.free), len(point.local), self.layout.states, windows)

@@ -13,15 +13,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import StackedRecordings, prepare
-from rotflex_jax.fit.problem import RunLayout, runs_with_slopes
+from rotflex_jax.fit.dataset import prepare
+from rotflex_jax.fit.problem import RunLayout, free_run_slopes
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.fit.structural_identifiability import (
     Direction,
@@ -35,14 +33,12 @@ from rotflex_jax.fit.structural_identifiability import (
     reduced,
 )
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.mechanism import ROTOR
 from rotflex_jax.mechanism.quantity import Quantity
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, single
-from rotflex_jax.runtime.xla import double_precision
 from rotflex_jax.text.markup import bullets, card, paragraph
 from rotflex_jax.text.numbers import json_numbers
 
@@ -383,29 +379,11 @@ class Runs:
         m = self.sensors.all_outputs(self.model.mechanism)
         names, states = m.parameter_names, 2 * len(m.coordinates)
         free = np.array([names.index(n) for n in m.free_names])
-        N, C = len(self.u), len(m.channels)
         typical = np.array([s.typical for s in m.parameter_specifications])
         shares = np.maximum(np.abs(self.values), self.least_share * typical)
-        with double_precision():
-            data = StackedRecordings(
-                jnp.asarray(self.u[None]),
-                jnp.zeros((1, N, C)),
-                jnp.ones((1, N)),
-                jnp.asarray(np.array([float(self.Ts)])),
-            )
-            start = np.zeros(states) if self.start is None else self.start
-            y, J = runs_with_slopes(
-                RunLayout(m.structure, self.model.solver, states),
-                jnp.asarray(self.values[None]),
-                jnp.asarray(shares[None]),
-                jnp.asarray(free),
-                jnp.asarray(start[None]),
-                data,
-                jnp.zeros((1, Layout.of(m.structure).size, C)),
-                None,
-            )
-            y, J = jax.device_get((y, J))
-        return y[0], J[0]
+        layout = RunLayout(m.structure, self.model.solver, states)
+        start = np.zeros(states) if self.start is None else self.start
+        return free_run_slopes(layout, self.values, shares, free, start, self.u, self.Ts)
 
     def scaled(self) -> Float[np.ndarray, "N C K"]:
         """Slopes by shares of the parameters, each channel by the size of its own signal."""

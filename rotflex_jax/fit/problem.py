@@ -26,7 +26,7 @@ from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.fit.inference import RecordingSlopes, curvature, nats_that_count
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
-from rotflex_jax.mechanism.assembly import rest_state, whole_state
+from rotflex_jax.mechanism.assembly import Layout, rest_state, whole_state
 from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
     RunParameters,
@@ -37,7 +37,7 @@ from rotflex_jax.mechanism.sensitivities import (
 from rotflex_jax.mechanism.simulate import first_predictions
 from rotflex_jax.optimise.damped_least_squares import RIDGE, NormalEquations, solution_within
 from rotflex_jax.runtime.persistent_jit import persistent_jit
-from rotflex_jax.runtime.xla import spread
+from rotflex_jax.runtime.xla import double_precision, spread
 
 
 def predicted(
@@ -203,6 +203,40 @@ def runs_with_slopes(
     samples = tuple(data) if window is None else (*data, window)
     rows = (values, slopes, x0, K, samples)
     return spread(lambda rows: jax.lax.map(one, rows), layout.mesh)(rows)
+
+
+def free_run_slopes(
+    layout: RunLayout,
+    values: Float[np.ndarray, " P"],
+    scale: Float[np.ndarray, " P"],
+    free: Int[np.ndarray, " F"],
+    start: Float[np.ndarray, " n"],
+    u: Float[np.ndarray, "N *c"],
+    Ts: float,
+) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
+    """Outputs of one free run, and their slopes by the free parameters, then by the first state.
+
+    Args:
+        layout: What is run, and how many entries of the first state have slopes.
+        values: Parameters.
+        scale: Change of each parameter that its slope is per.
+        free: Indices of the free ones.
+        start: First state.
+        u: Input, signals beside it.
+        Ts: Sampling period [s].
+    """
+    N, C = len(u), len(layout.structure.channels)
+    with double_precision():
+        arrays = u[None], np.zeros((1, N, C)), np.ones((1, N)), np.array([float(Ts)])
+        y, J = runs_with_slopes(
+            layout,
+            *map(jnp.asarray, (values[None], scale[None], free, start[None])),
+            StackedRecordings(*map(jnp.asarray, arrays)),
+            jnp.zeros((1, Layout.of(layout.structure).size, C)),
+            None,
+        )
+        y, J = jax.device_get((y, J))
+    return y[0], J[0]
 
 
 def channel_scale(

@@ -154,11 +154,8 @@ class HeldProblem(GreyBoxProblem):
 
     def at(self, point: FitPoint) -> tuple[float, Float[np.ndarray, " P"]]:
         """Value of the quantity, and the values of all parameters, means over recordings."""
-        m = self.model.mechanism
-        each = self.physical(point)[0]
-        free = np.array([name not in m.trusted for name in m.parameter_names])
-        common = np.where(free, each.mean(axis=0), m.values)
-        return float(self.along.function(dict(zip(m.parameter_names, common.tolist(), strict=True)))), common
+        common, names = self.common(self.physical(point)[0]), self.model.mechanism.parameter_names
+        return float(self.along.function(dict(zip(names, common.tolist(), strict=True)))), common
 
     def slopes(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
         """Derivative of the walked coordinate of the quantity by the coordinates of the fit."""
