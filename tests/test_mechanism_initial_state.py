@@ -125,6 +125,30 @@ def test_what_is_not_measured_is_told_by_the_motion(truth):
     np.testing.assert_allclose(found[:, 2:], true[:, 2:], atol=2e-2)
 
 
+class Flexure(fx.Spring):
+    """A spring of a user, with a name of its own."""
+
+    name = "flexure"
+
+
+class Flywheel(fx.Inertia):
+    """An inertia of a user."""
+
+    name = "flywheel"
+
+
+def test_springs_and_inertias_of_a_user_are_what_they_say():
+    """From the angle of the arm alone: a spring at the joint is relaxed, whatever its name is."""
+    plain = dataclasses.replace(paper(), outputs={"arm": "arm"})
+    own = plain.without("spring", "joint") + Flexure("joint", 1.2)
+    y = 0.3 + np.zeros((1, 20, 1))
+    for mechanism in (plain, own):
+        np.testing.assert_allclose(rough_states(mechanism.structure, y, 0.01)[0], [0.3, 0, 0, 0], atol=1e-12)
+    loose = plain.without("spring", "joint")
+    assert rough_states(loose.structure, y, 0.01)[0][1] == pytest.approx(0.15)
+    assert (plain.without("inertia", "hub") + Flywheel("hub", 0.002)).has_inertia("hub")
+
+
 def test_a_measured_speed_is_read_as_a_speed():
     mechanism = dataclasses.replace(paper(), outputs={"omega": ("hub", "speed"), "alpha": "joint"})
     t = np.arange(20) * 0.01

@@ -369,6 +369,10 @@ class Linear(Effect):
     state_part: ClassVar[StatePart | None] = "linear"
     is_linear: ClassVar[bool] = True
     exact_step: ClassVar[bool] = True
+    # True for an inertia that turns with its port.
+    inertial: ClassVar[bool] = False
+    # True for what pulls its port back to zero.
+    elastic: ClassVar[bool] = False
     # True for what turns voltage into torque at its port.
     motor: ClassVar[bool] = False
     # True for a motor that has a `torque_per_current`, so that its torque says its current.

@@ -25,6 +25,7 @@ class Inertia(Linear):
     """
 
     name: ClassVar[str] = "inertia"
+    inertial: ClassVar[bool] = True
     title: ClassVar[str] = "moment of inertia"
     equation: ClassVar[str] = "T = 1/2 * inertia * speed^2"
     amplitudes: ClassVar[tuple[str, ...]] = ("inertia",)

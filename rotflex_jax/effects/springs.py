@@ -25,6 +25,7 @@ class Spring(Linear):
     """
 
     name: ClassVar[str] = "spring"
+    elastic: ClassVar[bool] = True
     title: ClassVar[str] = "linear spring"
     equation: ClassVar[str] = "tau = -stiffness * position"
     amplitudes: ClassVar[tuple[str, ...]] = ("stiffness",)

@@ -6,7 +6,8 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from rotflex_jax.mechanism.assembly import Layout, motor_inputs, rest_state
+from rotflex_jax.effects.base import Linear
+from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_inputs, rest_state
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import states
 from rotflex_jax.mechanism.simulate import FreeStep, Solver, read_outputs
@@ -45,7 +46,7 @@ def rough_states(structure: Mechanism, y: Float[np.ndarray, "W N C"], Ts: float)
     rows = np.array(layout.output_rows)
     n, is_position = layout.n, np.array([q.is_position for q in structure.quantities])
     positions, speeds = rows[is_position, :n], rows[~is_position, n:]
-    ports = {e.at for e in structure.effects if e.name == "spring"}
+    ports = {e.at for _, e in effects_of(structure, Linear) if e.elastic}
     springs = np.array([structure.port_vectors[p] for p in sorted(ports)]).reshape(-1, n)
     relaxed = springs, np.zeros((len(springs), W))
     q = _lexicographic_fit([(positions, start[is_position]), relaxed], n)

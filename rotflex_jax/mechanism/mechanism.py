@@ -341,7 +341,7 @@ class Mechanism:
 
     def has_inertia(self, port: str) -> bool:
         """Whether an inertia is entered at the port."""
-        return any((e.name, e.at) == ("inertia", port) for e in self.effects)
+        return any(e.inertial for e in self.linear_effects(port))
 
     def with_signals(self, names: Sequence[str]) -> "Mechanism":
         """The mechanism with these signals, and those that its effects take, to drive effects."""
