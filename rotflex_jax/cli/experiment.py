@@ -67,6 +67,12 @@ def experiment(
         first = any(given.was_given(context, name) for name in FIRST_COMMAND)
         _continued(go_on, recording, columns, save, json_file, first)
         return
+    if between is not None and (option := next((text for text in between if text.startswith("-")), None)):
+        # An option that takes two values takes whatever follows it.
+        raise InputError(
+            f"--between was given {option} in the place of an effect, but needs two effects; write for "
+            "instance --between delay@input lag@input."
+        )
     if recording is not None:
         raise InputError(
             f"{recording} was given as what was recorded, but that belongs to --continue; name the state too."
