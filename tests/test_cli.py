@@ -17,6 +17,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.cli import app, main, terminal
+from rotflex_jax.cli.arguments import check_writable
 from rotflex_jax.data.datasets import DATASETS
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.verdict import Verdict, assess
@@ -161,6 +162,11 @@ REFUSED = {
     "discover {run} --json {tmp}/missing/r.json": "missing",
     "discover {run} --json {tmp}": "folder",
     "discover {run} --report {run}": "file",
+    "demo --report {run}/page": "cannot be written to",
+    "discover {run} --report {run}/page": "page cannot be written to (Not a directory), but the report needs "
+    "a folder of its own; name another",
+    "compare {run} --report {run}/page": "cannot be written to",
+    "simulate {run} --report {run}/page": "cannot be written to",
     "simulate {run} --add colomb@hub": "coulomb",
     "simulate {run} --add coulomb": "hub",
     "simulate {run} --add coulomb@elbow": "elbow",
@@ -193,6 +199,23 @@ def test_bad_arguments_are_refused_with_one_sentence(line, run, recorded, tmp_pa
     assert (status, out) == (2, "")
     assert_one_sentence(err, REFUSED[line])
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_folder_for_a_report_is_tried_and_left_as_it_was(tmp_path, monkeypatch) -> None:
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "report.html").write_text("<html>")
+    for folder in ("old", "new", "several/new/ones"):
+        check_writable(folder=tmp_path / folder)
+    assert [path.name for path in tmp_path.rglob("*")] == ["old", "report.html"]
+
+    def full(dir: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
+    for folder in ("old", "several/new/ones"):
+        with pytest.raises(rf.InputError, match=r"No space left on device.*name another"):
+            check_writable(folder=tmp_path / folder)
+    assert [path.name for path in tmp_path.rglob("*")] == ["old", "report.html"]
 
 
 def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:

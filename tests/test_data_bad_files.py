@@ -508,6 +508,10 @@ def test_file_is_written_through_a_link_and_into_a_device(tmp_path: Path) -> Non
     write_file(os.devnull, b"gone")
     refused(lambda: write_file("/dev/full", "x"), "/dev/full cannot be written")
     refused(lambda: write_file(tmp_path, "x"), "cannot be written")
+    refused(
+        lambda: Model(paper()).save(tmp_path / "none" / "a.json"),
+        "a.json cannot be written, since the folder .*none does not exist; create it or name another",
+    )
 
 
 # -- at random ------------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """Every option of the command line with its help, and the checks that several commands share."""
 
+import contextlib
 import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -366,5 +368,26 @@ def check_writable(*, json_file: Path | None = None, folder: Path | None = None)
                 f"{json_file} cannot be written, since the folder {json_file.parent} does not "
                 "exist; create it or name another."
             )
-    if folder is not None and folder.exists() and not folder.is_dir():
+    if folder is not None:
+        _check_folder(folder)
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written to; what is made to see that is taken away again."""
+    if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, but the report needs a folder; name another.")
+    place = folder.absolute()
+    missing = [part for part in (place, *place.parents) if not part.exists()]
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{folder} cannot be written to ({error.strerror or error}), but the report needs a folder of "
+            "its own; name another."
+        ) from error
+    finally:
+        for part in missing:
+            with contextlib.suppress(OSError):
+                part.rmdir()

@@ -58,6 +58,11 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
             part.unlink(missing_ok=True)
             UNFINISHED.discard(part)
     except OSError as error:
+        if not place.parent.exists():
+            raise InputError(
+                f"{path} cannot be written, since the folder {path.parent} does not exist; create it or name "
+                "another."
+            ) from error
         raise InputError(
             f"{path} cannot be written ({error.strerror or error}); make space or name another place."
         ) from error
