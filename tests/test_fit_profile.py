@@ -157,7 +157,7 @@ def test_a_profile_is_shown_and_written():
     assert json.loads(json.dumps(p.to_dict()))["shape"] == "closed"
     assert CONSTANT in p._repr_html_() and "Wald" in str(p)
     ax = p.plot().axes[0]
-    assert "N m/A" in ax.get_xlabel()
+    assert "N m/A" in ax.get_xlabel() and ax.get_ylabel().endswith("[-]")
     open_below = made([0.5, 0.4, 0.1, 0.0, 1.0, 4.0, 9.0])
     assert json.loads(json.dumps(open_below.to_dict()))["interval95"][0] is None
     assert "deg" in open_below._repr_html_()
@@ -210,6 +210,9 @@ def test_what_makes_no_sense_is_refused():
         rf.profile(fitted(), recording(), lambda values: values["nothing"])
     with pytest.raises(rf.InputError, match="gives nan"):
         rf.profile(fitted(), recording(), lambda values: float("nan"))
+    for fixed in (lambda values: 1.0, lambda values: values[INERTIA]):  # the inertia is trusted
+        with pytest.raises(rf.InputError, match="whatever the fitted parameters are, but a profile needs"):
+            rf.profile(fitted(), recording(), fixed)
     local = rf.fit(axis(CONSTANT), [recording(), recording()], local=[CONSTANT])
     with pytest.raises(rf.InputError, match="for 2 recordings, but 1 were given"):
         rf.profile(local, recording(), CONSTANT)

@@ -81,7 +81,8 @@ class Along:
         """A parameter by its name, or a function.
 
         Raises:
-            InputError: A name that is no free parameter, or a function that gives no finite number.
+            InputError: A name that is no free parameter, or a function that gives no finite number or is the
+                same whatever the free parameters are.
         """
         m = fitted.model.mechanism
         if isinstance(of, str):
@@ -121,7 +122,14 @@ class Along:
             )
         name = getattr(of, "__name__", "quantity")
         name = "quantity" if name == "<lambda>" else name
-        positive = value > 0 and _stays_positive(of, m, fitted.free_names)
+        drawn = _about(of, m, fitted.free_names)
+        if len(drawn) > 1 and len(set(drawn)) == 1:
+            raise InputError(
+                f"The function of the parameters gives {value:.6g} whatever the fitted parameters are, but a "
+                f"profile needs a quantity that depends on one of them; use {fitted.free_names[0]!r} or "
+                "another of `free_names` in it."
+            )
+        positive = value > 0 and not any(v <= 0 for v in drawn)
         return cls(name, "", of, (0.0 if positive else -np.inf, np.inf), positive)
 
     def walked(self, value: float) -> float:
@@ -319,7 +327,8 @@ def profile(
         Profile with `interval(level)`, `shape`, `wald` and a figure.
 
     Raises:
-        InputError: No such parameter, a function that gives no number, or other recordings than were fitted.
+        InputError: No such parameter, a function that gives no number or that no fitted parameter moves, or
+            other recordings than were fitted.
 
     Source: S. A. Murphy and A. W. van der Vaart, J. Am. Stat. Assoc. 95, 2000; A. Raue et al., Bioinformatics
     25, 2009; the factor: R. E. Chandler and S. Bate, Biometrika 94, 2007.
@@ -355,17 +364,17 @@ def profile(
     )
 
 
-def _stays_positive(of: Callable[[Mapping[str, float]], float], m: Mechanism, free: Sequence[str]) -> bool:
-    """Whether a function is positive at random parameters, as a ratio is and a difference is not."""
+def _about(of: Callable[[Mapping[str, float]], float], m: Mechanism, free: Sequence[str]) -> list[float]:
+    """A function at random parameters: a ratio is positive at all, a constant the same."""
     rng, transform = np.random.default_rng(0), Transform.of(m.parameter_specifications)
     z, moves = transform.unconstrain(m.values), np.isin(m.parameter_names, free)
+    found = []
     for _ in range(DRAWS):
         values = transform.physical(np.where(moves, z + AWAY * rng.standard_normal(len(z)), z))[0]
         # Where it fails, the parameters are outside of what it is for.
         with contextlib.suppress(TypeError, ValueError, ArithmeticError), np.errstate(all="ignore"):
-            if of(dict(zip(m.parameter_names, values.tolist(), strict=True))) <= 0:
-                return False
-    return True
+            found.append(float(of(dict(zip(m.parameter_names, values.tolist(), strict=True)))))
+    return found
 
 
 def _distinct(values: list[float]) -> list[bool]:

@@ -38,7 +38,7 @@ def profile_figure(profiles: Sequence[Profile]) -> Figure:
         ax.set_xlabel(f"{p.name} [{unit}]" if unit else p.name)
         ax.locator_params(axis="x", nbins=5)
     for ax in grid[::columns]:
-        ax.set_ylabel("2 x loss of log-likelihood / factor")
+        ax.set_ylabel("2 x loss of log-likelihood / factor [-]")
     for ax in grid[len(profiles) :]:
         ax.set_visible(False)
     legend_above(figure, grid[: len(profiles)])
