@@ -211,6 +211,40 @@ class Estimate:
         half = HALF_WIDTH_95 * std
         return cls(name, value, std, (value - half, value + half), spec.unit, note="; ".join(remarks))
 
+    @property
+    def decimals(self) -> tuple[int, int] | None:
+        """Decimals that show two digits of the interval's half width, and the power of ten behind them.
+
+        None where there is no interval.
+
+        >>> Estimate("a", 1.20012, 2e-5, (1.20008, 1.20016), "N m").decimals
+        (6, 0)
+        """
+        low, high = self.ci95
+        if not (math.isfinite(low) and math.isfinite(high) and high > low):
+            return None
+        largest = max(abs(low), abs(high), abs(self.value))
+        power = 0 if 1e-4 <= largest < 1e5 else math.floor(math.log10(largest))
+        return min(12, max(0, 1 - math.floor(math.log10((high - low) / 2 / 10.0**power)))), power
+
+    @property
+    def texts(self) -> tuple[str, str, str]:
+        """Value and ends of the interval in plain characters, with as many digits as the interval is worth.
+
+        >>> Estimate("a", 0.0300069, 1e-5, (0.029987, 0.030027), "N m").texts
+        ('0.030007', '0.029987', '0.030027')
+        >>> Estimate("a", 2.5e-6, 1e-8, (2.48e-6, 2.52e-6), "N m").texts
+        ('2.500e-06', '2.480e-06', '2.520e-06')
+        """
+        numbers = (self.value, *self.ci95)
+        if self.decimals is None:
+            a, b, c = (f"{x:.6g}" for x in numbers)
+        else:
+            count, power = self.decimals
+            kind = "e" if power else "f"
+            a, b, c = (f"{x:.{count}{kind}}" for x in numbers)
+        return a, b, c
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types; `given` only where the interval depends on trusted constants."""
         return {
@@ -229,4 +263,5 @@ class Estimate:
                 f"{self.name} = {self.value:.6g} {self.unit}  (no interval: {self.note or 'not determined'})"
             )
         given = f"  {self.given_words}" if self.given else ""
-        return f"{self.name} = {self.value:.6g} {self.unit}  [{low:.4g}, {high:.4g}]{given}"
+        value, first, last = self.texts
+        return f"{self.name} = {value} {self.unit}  [{first}, {last}]{given}"

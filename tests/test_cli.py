@@ -505,7 +505,7 @@ def test_discover_splits_each_file(run, search, recorded, tmp_path) -> None:
     for text in (
         "FOUND",
         "the hub meets friction [N m]",
-        "0.028 .. 0.032",
+        "0.0280 .. 0.0320",
         "cannot distinguish it from stribeck at hub",
         "5.73",
         "reversals",

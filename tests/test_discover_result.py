@@ -30,7 +30,7 @@ def test_intervals_exclude_each_other_where_they_have_nothing_in_common(
     assert (max(a.ci95[0], b.ci95[0]) > min(a.ci95[1], b.ci95[1])) is excluded
     if excluded:
         (note,) = conditional_note(found)
-        assert "the model is incomplete" in note and "[0.0198, 0.0202]" in note
+        assert "the model is incomplete" in note and "[0.01980, 0.02020]" in note
         assert found[0].to_dict()["parameter"] == "shaft.inertia.inertia"
 
 

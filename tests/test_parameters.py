@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from rotflex_jax.cli.terminal import estimate_line
 from rotflex_jax.parameters import Estimate, Specification, Transform, parameter
 from rotflex_jax.runtime.xla import double_precision
 
@@ -106,7 +107,7 @@ def test_an_estimate_says_what_it_is(free):
     std, ci = (0.1, (1.8, 2.2)) if free else (nan, (nan, nan))
     estimate = Estimate("hub.coulomb.level", 2.0, std, ci, "N m", free=free)
     assert ("held" in str(estimate)) is not free
-    assert str(estimate).startswith("hub.coulomb.level = 2 N m")
+    assert str(estimate).startswith(f"hub.coulomb.level = {'2.00' if free else '2'} N m")
     told = estimate.to_dict()
     assert told == {
         "value": 2.0,
@@ -114,6 +115,23 @@ def test_an_estimate_says_what_it_is(free):
         "ci95": [1.8, 2.2] if free else None,
         "unit": "N m",
     }
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "shown"),
+    [
+        (1.20012, 2e-5, "1.200120 N m/rad  [1.200080, 1.200160]"),
+        (1.25, 0.1, "1.25 N m/rad  [1.05, 1.45]"),
+        (-431.2, 20.0, "-431 N m/rad  [-471, -391]"),
+        (2.5e-6, 1e-8, "2.500e-06 N m/rad  [2.480e-06, 2.520e-06]"),
+        (1.20012, 0.0, "1.20012 N m/rad  [1.20012, 1.20012]"),
+    ],
+)
+def test_value_and_bounds_have_as_many_digits_as_the_interval_is_worth(value, std, shown):
+    ci = (value - 2 * std, value + 2 * std)
+    estimate = Estimate("joint.spring.stiffness", value, std, ci, "N m/rad")
+    assert str(estimate) == f"joint.spring.stiffness = {shown}"
+    assert estimate_line("stiffness", estimate).startswith(f"stiffness = {shown.split('  ')[0]}   95 %: ")
 
 
 @pytest.mark.parametrize(("value", "word"), [(0.0, "lower"), (10.0, "upper"), (5.0, "")])

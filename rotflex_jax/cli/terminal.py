@@ -148,10 +148,10 @@ def error_table(rows: Sequence[tuple[str, Mapping[str, float]]], units: Mapping[
 
 def estimate_line(name: str, estimate: Any) -> str:
     """One fitted parameter with its 95 % interval."""
-    text = f"{name} = {digits(estimate.value, 4)} {estimate.unit}".rstrip()
-    low, high = estimate.ci95
-    if math.isfinite(low) and math.isfinite(high):
-        text += f"   95 %: {digits(low, 4)} .. {digits(high, 4)}"
+    value, low, high = estimate.texts
+    text = f"{name} = {value} {estimate.unit}".rstrip()
+    if all(map(math.isfinite, estimate.ci95)):
+        text += f"   95 %: {low} .. {high}"
     return f"{text}   {estimate.remark}" if estimate.given else text
 
 

@@ -81,8 +81,8 @@ def conditional_note(found: Sequence[ConditionalInterval]) -> tuple[str, ...]:
 
 
 def _interval(e: Estimate) -> str:
-    low, high = e.ci95
-    return f"[{low:.4g}, {high:.4g}]"
+    _, low, high = e.texts
+    return f"[{low}, {high}]"
 
 
 class RunErrors(NamedTuple):

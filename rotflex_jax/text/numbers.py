@@ -127,16 +127,11 @@ def value_and_interval(estimate: Estimate) -> tuple[str, str]:
     >>> value_and_interval(Estimate("a", 2.6, nan, (nan, nan), "ohm", free=False))
     ('2.6', '')
     """
-    low, high = estimate.ci95
-    if not (math.isfinite(low) and math.isfinite(high) and high > low):
+    if estimate.decimals is None:
         return f"{estimate.value:.6g}".replace("-", "−"), ""
-    largest = max(abs(low), abs(high), abs(estimate.value))
-    half = (high - low) / 2
-    power = 0 if 1e-4 <= largest < 1e5 else math.floor(math.log10(largest))
-    scale = 10.0**power
-    digits = min(12, max(0, 1 - math.floor(math.log10(half / scale))))
+    digits, power = estimate.decimals
     value, low_text, high_text = (
-        f"{x / scale:.{digits}f}".replace("-", "−") for x in (estimate.value, low, high)
+        f"{x / 10.0**power:.{digits}f}".replace("-", "−") for x in (estimate.value, *estimate.ci95)
     )
     if not power:
         return value, f"{low_text} … {high_text}"
