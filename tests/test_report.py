@@ -680,3 +680,25 @@ def test_a_browser_shows_the_page_without_complaint(page, tmp_path) -> None:
     # Text and figures: many tones, in the lower half (where the figures are) too.
     for half in (picture[:1200], picture[1200:]):
         assert len(np.unique(half[..., :3].reshape(-1, 3).round(2), axis=0)) > 100
+
+
+def test_the_share_that_is_a_candidates_own_is_a_plain_number(discovery, undrawn) -> None:
+    first = dataclasses.replace(discovery.ranking[0], unconfounded=0.997)
+    page = render(dataclasses.replace(discovery, ranking=(first, *discovery.ranking[1:])))
+    assert "100 %" in page and "e+02" not in page
+
+
+def test_latent_torques_are_printed_in_words() -> None:
+    told = str(LatentTorqueComparison(photographed(), photographed().given_back()))
+    assert "over 7.5 s of one recording" in told
+    assert (
+        "At the hub the baseline lacks 0.014 N m rms, 7.1 % of the motor's torque, the final model 0.020"
+        in told
+    )
+    assert "The largest torque that the baseline lacks is 0.02 N m at the hub," in told
+    assert "array" not in told and len(told) < 800
+    assert "of recording 1." in str(
+        LatentTorqueComparison(
+            dataclasses.replace(photographed(), recording=np.arange(1500) // 800, Ts=(0.005, 0.005)), None
+        )
+    )

@@ -24,6 +24,7 @@ from rotflex_jax.models.residual_tests import (
     residual_tests,
 )
 from rotflex_jax.recording import Recording
+from rotflex_jax.text.numbers import plain_number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +93,41 @@ class LatentTorqueComparison:
 
     before: LatentTorque
     after: LatentTorque | None
+
+    @property
+    def sentences(self) -> list[str]:
+        """How large the torques are that the models lack, and what they do in time."""
+        lines = []
+        for port in self.before.ports:
+            line = f"At the {port} the baseline lacks {self._size(self.before, port)}"
+            if self.after is not None:
+                line += f", the final model {self._size(self.after, port)}"
+            lines.append(line + ".")
+        return lines + (self.after or self.before).in_time()
+
+    def __str__(self) -> str:
+        b = self.before
+        k, i = np.unravel_index(int(np.argmax(np.abs(b.torque))), b.torque.shape)
+        count = len(b.Ts)
+        which = f" of recording {b.recording[k] + 1}" if count > 1 else ""
+        seconds = float(np.asarray(b.Ts)[b.recording].sum())
+        head = (
+            "Latent torque: what the models would have to be given to follow the measurement, over "
+            f"{seconds:.3g} s of {'one recording' if count == 1 else f'{count} recordings'}"
+        )
+        largest = (
+            f"The largest torque that the baseline lacks is {abs(b.torque[k, i]):.3g} {b.effort} at the "
+            f"{b.ports[i]}, {b.time[k]:.4g} s{which}."
+        )
+        return "\n".join([head, *(f"  {line}" for line in (*self.sentences, largest))])
+
+    def _size(self, torque: LatentTorque, port: str) -> str:
+        """Size of a torque in words, beside that of the motor under the baseline."""
+        size, scale = torque.size(port), self.before.scale
+        if size < 1e-3 * scale:
+            return "nothing that could be seen"
+        share = plain_number(100 * size / scale, 2)
+        return f"{plain_number(size, 2)} {torque.effort} rms, {share} % of the motor's torque"
 
 
 def compare_latent_torques(

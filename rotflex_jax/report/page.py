@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rotflex_jax.discover.explanation import Explanation, LatentTorqueComparison
+from rotflex_jax.discover.explanation import Explanation
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.result import Ranked, SearchResult, Where
 from rotflex_jax.discover.tables import (
@@ -26,7 +26,6 @@ from rotflex_jax.discover.tables import (
 )
 from rotflex_jax.discover.verdict import FAR_FLOOR, NEAR_FLOOR, Grade, grade
 from rotflex_jax.effects.labels import effect_label, effect_title, sentence
-from rotflex_jax.latent import LatentTorque
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures import pictures
@@ -36,6 +35,7 @@ from rotflex_jax.text.numbers import (
     equation,
     multiple,
     percent_explained,
+    percent_left,
     plain_number,
     ratio,
     readable,
@@ -75,7 +75,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "tests": _test_lines(explanation),
         "pictures": by_section(pictures(discovery, explanation).values()),
         "places": _places(discovery.where),
-        "torques": _latent_lines(latent) if latent else [],
+        "torques": [together(line) for line in latent.sentences] if latent else [],
         "learned": _learned_torque(discovery, learned) if learned else None,
         "remaining": _places(remaining),
         "arises": any("arises" in w.statement for w in (*discovery.where, *remaining)),
@@ -207,7 +207,7 @@ def _ranked(r: Ranked, outcome: Outcome) -> dict[str, str]:
         "label": effect_label(r.effect, r.port),
         "title": effect_title(r.effect),
         "score": plain_number(r.score),
-        "own": f"{100 * r.unconfounded:.2g} %",
+        "own": percent_left(r.unconfounded),
         "state": outcome.value,
     }
 
@@ -262,17 +262,6 @@ def _version(package: str) -> str:
         return "(not installed)"
 
 
-def _latent_lines(latent: LatentTorqueComparison) -> list[str]:
-    """How large the torques are that the models lack, in words."""
-    lines = []
-    for port in latent.before.ports:
-        before, after = (None if x is None else x.size(port) for x in (latent.before, latent.after))
-        line = f"At the {port} the baseline lacks {_size(before, latent.before)}"
-        lines.append(line + ("." if after is None else f", the final model {_size(after, latent.before)}."))
-    lines += (latent.after or latent.before).in_time()
-    return lines
-
-
 def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> dict[str, Any]:
     """A learned torque in words: what it is worth and how it reads."""
     falls, unit = [], learned.model.mechanism.units.unit
@@ -296,15 +285,6 @@ def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> di
             for t in learned.formula.terms
         ],
     }
-
-
-def _size(size: float | None, torque: LatentTorque) -> str:
-    if size is None or size < 1e-3 * torque.scale:
-        return "nothing that could be seen"
-    return (
-        together(f"{plain_number(size, 2)} {torque.effort}")
-        + f" rms, {plain_number(100 * size / torque.scale, 2)} % of the motor's torque"
-    )
 
 
 def write(discovery: SearchResult, folder: Path, explanation: Explanation | None = None) -> Path:
