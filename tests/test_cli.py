@@ -403,7 +403,7 @@ class FakeSearch:
             held_out_rmse=rmse,
             held_out_rmse_windows=rmse,
             window_seconds=2.0,
-            calibrate_seconds=2.0,
+            calibrate_seconds=0.5,
             calibrated=RunErrors(rmse, {"theta": 0.2, "alpha": 0.01}),
             test=None,
             test_calibrated=None,
@@ -436,6 +436,7 @@ class FakeSearch:
             report=self.report,
             probabilities=SimpleNamespace(sentence="Most probable: Coulomb friction at hub 93 %."),
             final_fit=None,
+            estimates=(level,),
             assessment=assess({"theta": 0.2}, {"theta": 0.1}, {"theta": 5e-4}, 0.0),
         )
 
@@ -488,7 +489,7 @@ def test_several_files_validate_each_other(run, search, recorded, tmp_path) -> N
     assert [recording.N for recording in train] == [600, 400] and validation == []
     assert [recording.N for recording in search.options["test"]] == [400]
     assert search.options["calibrate_seconds"] == 1.0
-    assert "of its own first 2 s" in out and "11.5" in out  # 0.2 rad
+    assert "of its own first 0.5 s" in out and "11.5" in out  # 0.2 rad
     status, _, err = run("discover", recorded, other, "--test", other)
     assert status == 2
     assert_one_sentence(err, "other.csv", "given twice")

@@ -18,14 +18,15 @@ from matplotlib import image
 from rich.console import Console
 from test_discover_localise import recording as turning, reversals, white
 
+from rotflex_jax.cli import terminal
 from rotflex_jax.discover import locate
 from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.explanation import Explanation, LatentTorqueComparison, remaining_failures
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.probabilities import Probabilities, SetProbability
-from rotflex_jax.discover.result import Ranked, Round, Stage, Where
+from rotflex_jax.discover.result import Ranked, Round, RunErrors, Stage, Where
 from rotflex_jax.discover.spline_map import Formula, Term
-from rotflex_jax.discover.tables import next_steps
+from rotflex_jax.discover.tables import error_lists, next_steps
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import Coulomb, CubicSpring, LearnedTorque
 from rotflex_jax.errors import InputError
@@ -680,6 +681,78 @@ def test_a_browser_shows_the_page_without_complaint(page, tmp_path) -> None:
     # Text and figures: many tones, in the lower half (where the figures are) too.
     for half in (picture[:1200], picture[1200:]):
         assert len(np.unique(half[..., :3].reshape(-1, 3).round(2), axis=0)) > 100
+
+
+def printed(discovery: Discovery, monkeypatch, capsys) -> str:
+    monkeypatch.setattr(terminal, "output", lambda: Console(width=200, soft_wrap=True, highlight=False))
+    terminal.print_discovery(discovery)
+    return capsys.readouterr().out
+
+
+def test_parameters_are_those_of_the_model_to_use(discovery, undrawn, monkeypatch, capsys) -> None:
+    """The interval in which a round found an effect need not hold what the final model says."""
+    final = discovery.final
+    moved = tuple(
+        dataclasses.replace(e, value=0.0312, ci95=(0.0311, 0.0313)) if e.name == "hub.coulomb.level" else e
+        for e in final.estimates
+    )
+    last = dataclasses.replace(
+        discovery.rounds[-1], stage=dataclasses.replace(final, estimates=moved), parameters={}
+    )
+    later = dataclasses.replace(discovery, rounds=(discovery.rounds[0], last))
+    told = printed(later, monkeypatch, capsys)
+    assert "level = 0.03120 N m   95 %: 0.03110 .. 0.03130   (0.03000 when it was found)" in told
+    assert "0.02980" not in told
+    assert "0.02980 … 0.03020 · 0.03120 in the model to use" in read(render(later)).text.replace("\xa0", " ")
+    assert "0.03110 … 0.03130" in later._repr_html_() and "0.02980" not in later._repr_html_()
+    same = printed(discovery, monkeypatch, capsys)
+    assert "level = 0.03000 N m   95 %: 0.02980 .. 0.03020\n" in same
+
+
+def test_an_effect_that_the_model_to_use_lacks_is_said_to_be_left_out(
+    discovery, undrawn, monkeypatch, capsys
+) -> None:
+    kept = tuple(e for e in discovery.final.estimates if e.name != "hub.coulomb.level")
+    last = dataclasses.replace(
+        discovery.rounds[-1], stage=dataclasses.replace(discovery.final, estimates=kept)
+    )
+    without = dataclasses.replace(discovery, rounds=(discovery.rounds[0], last))
+    told = printed(without, monkeypatch, capsys)
+    assert "0.02980 .. 0.03020   when it was found; the model to use is without it" in told
+    assert "· not in the model to use" in read(render(without)).text
+    assert "hub.coulomb.level (not in the model to use)" in without._repr_html_()
+
+
+def test_places_name_the_recording_that_they_are_about(discovery, undrawn, monkeypatch, capsys) -> None:
+    (first, last), (unnamed, _) = (moved(source=name).split(0.7) for name in ("run.csv", ""))
+    for train, validation, words in (
+        (first, last, "the longest fitted recording: run.csv, 0 s to 7 s."),
+        (last, first, "the longest validation recording: run.csv, 0 s to 7 s."),
+        (last, unnamed, "the longest validation recording: 0 s to 7 s."),
+    ):
+        found = dataclasses.replace(discovery, train=(train,), validation=(validation,))
+        assert f"All of this is about {words}" in printed(found, monkeypatch, capsys)
+        assert words in found._repr_html_()
+        assert words in read(render(found)).text.replace("\xa0", " ")
+
+
+def test_offsets_that_all_of_a_recording_gave_are_said_to_be(discovery) -> None:
+    def titles(seconds: float, recordings: tuple[Recording, ...]) -> list[str]:
+        errors = discovery.final.held_out_rmse
+        stages = [
+            dataclasses.replace(s, calibrate_seconds=seconds, calibrated=RunErrors(errors, errors))
+            for s in discovery.stages
+        ]
+        rounds = tuple(
+            dataclasses.replace(r, stage=s) for r, s in zip(discovery.rounds, stages[1:], strict=True)
+        )
+        found = dataclasses.replace(discovery, baseline=stages[0], rounds=rounds, validation=recordings)
+        return [t.title for t in error_lists(found)]
+
+    long, short = moved(1500), moved(600)
+    assert titles(2.0, (long,))[1].endswith("each recording with the offsets of its own first 2 s")
+    assert titles(100.0, (long,))[1].endswith("offsets fitted to all of it, which is no longer than 100 s")
+    assert titles(3.0, (long, short))[1].endswith("its own first 3 s, which is all of it in 1 of 2")
 
 
 def test_the_share_that_is_a_candidates_own_is_a_plain_number(discovery, undrawn) -> None:

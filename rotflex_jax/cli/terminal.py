@@ -156,8 +156,18 @@ def estimate_line(name: str, estimate: Any) -> str:
 
 
 def print_discovery(result: Any) -> None:
-    """Verdict, rounds, errors on validation and test data, and where the model failed."""
-    from rotflex_jax.discover.tables import error_lists, final_fit_sentence, status_sentence
+    """Verdict, rounds, errors on validation and test data, and where the model failed.
+
+    Parameters are those of the model to use.
+    """
+    from rotflex_jax.discover.tables import (
+        error_lists,
+        estimates_in_use,
+        final_fit_sentence,
+        has_moved,
+        status_sentence,
+        where_sentence,
+    )
     from rotflex_jax.effects.labels import with_titles
 
     console = output()
@@ -169,8 +179,14 @@ def print_discovery(result: Any) -> None:
         console.print(f"\nRound {count}: {added.sentence}", markup=False)
         if added.equation:
             console.print(f"  {added.equation}", markup=False)
-        for name, estimate in added.parameters.items():
-            console.print(f"  {estimate_line(name, estimate)}", markup=False)
+        for name, used in estimates_in_use(result, added).items():
+            found = added.parameters[name]
+            line = estimate_line(name, used or found)
+            if used is None:
+                line += "   when it was found; the model to use is without it"
+            elif has_moved(found, used):
+                line += f"   ({found.texts[0]} when it was found)"
+            console.print(f"  {line}", markup=False)
         console.print(f"  {status_sentence(added)}", markup=False)
     if result.probabilities:
         console.print(f"\n{result.probabilities.sentence}", markup=False)
@@ -188,6 +204,7 @@ def print_discovery(result: Any) -> None:
         console.print(f"\n{told}", markup=False)
     if result.where:
         console.print("\nWhere the baseline failed", style="bold")
+        console.print(where_sentence(result), markup=False)
         for place in result.where:
             console.print(f"- {place.statement}", markup=False)
     for note in result.notes:

@@ -23,10 +23,12 @@ from rotflex_jax.discover.tables import (
     channel_headings,
     channel_units,
     error_rows,
+    estimates_in_use,
     final_fit_sentence,
     noise_row,
     outcomes,
     stage_labels,
+    where_sentence,
 )
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects.labels import effect_label, sentence
@@ -211,7 +213,10 @@ class Discovery(SearchResult):
         return page
 
     def _repr_html_(self) -> str:
-        """Verdict, errors of each model, what each round found, and where the baseline failed."""
+        """Verdict, errors of each model, what each round found, and where the baseline failed.
+
+        Parameters are those of the model to use.
+        """
         scale = {c: readable(1.0, unit) for c, unit in channel_units(self).items()}
         heading = {c: f"{c} [{read}]" for c, (_, read) in scale.items()}
         errors = {
@@ -223,10 +228,10 @@ class Discovery(SearchResult):
             rounds.append(
                 (str(k), effect_label(added.effect, added.port), equation(added.equation), added.doubt)
             )
-            parameters += [
-                (f"{added.port}.{added.effect}.{n}", unit_text(e.unit), *value_and_interval(e))
-                for n, e in added.parameters.items()
-            ]
+            for name, used in estimates_in_use(self, added).items():
+                e = used or added.parameters[name]
+                label = e.name if used else f"{e.name} (not in the model to use)"
+                parameters.append((label, unit_text(e.unit), *value_and_interval(e)))
         seconds = f"{self.baseline.window_seconds:g} s"
         headings = channel_headings(self)
         rows = [(r.label, *(c.value for c in (*r.windows, *r.whole))) for r in error_rows(self)]
@@ -235,6 +240,8 @@ class Discovery(SearchResult):
             (effect_label(r.effect, r.port), outcome.value, plain_number(r.score))
             for r, outcome in outcomes(self)[:LISTED_CANDIDATES]
         ]
+        where = bullets(sentence(w.statement) for w in self.where)
+        where = paragraph(where_sentence(self)) + where if where else ""
         return card(
             self.verdict.shown.headline,
             paragraph(sentence(self.sentence)),
@@ -253,7 +260,7 @@ class Discovery(SearchResult):
                 ),
                 rows,
             ),
-            folded("Where the baseline failed", bullets(sentence(w.statement) for w in self.where)),
+            folded("Where the baseline failed", where),
             folded("Ranking before any was added", table(("candidate", "", "score [nat]"), ranked, words=2)),
             bullets([*([told] if (told := final_fit_sentence(self)) else []), *self.notes]),
         )

@@ -460,6 +460,11 @@ class Where:
         }
 
 
+def longest_with_a_say(train: Sequence[Recording], validation: Sequence[Recording]) -> Recording:
+    """The longest training or validation recording, first of several; `SearchResult.where` is about it."""
+    return max((*train, *validation), key=lambda r: r.N)
+
+
 # Name of the file beside a report that holds the input to play next.
 NEXT = "next_experiment.csv"
 
@@ -476,7 +481,7 @@ class SearchResult:
         baseline: The user's model, fitted.
         rounds: What was added, in order.
         ranking: All candidates in the score test of the baseline, best first.
-        where: Where the baseline fails.
+        where: Where the baseline fails on the longest training or validation recording.
         noise_floor: Channel -> standard deviation of the sensor noise.
         elapsed_s: Time taken [s].
         notes: Remarks for a reader.

@@ -8,10 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rotflex_jax.discover.explanation import advice, coloured_sensors
-from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult
+from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, longest_with_a_say
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
 from rotflex_jax.effects.labels import effect_label, effect_phrase
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Estimate
+from rotflex_jax.recording import Recording
 from rotflex_jax.text.numbers import (
     multiple,
     plain_number,
@@ -107,7 +109,10 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
     The fit to all that had a say has errors on test data alone.
     """
     stages, labels, last = discovery.stages, stage_labels(discovery), discovery.final_fit
-    own = f", each recording with the offsets of its own first {stages[0].calibrate_seconds:g} s"
+    own, own_tested = (
+        ", each recording with " + _own_offsets(stages[0].calibrate_seconds, recordings)
+        for recordings in (discovery.validation, discovery.test)
+    )
     chose, no_say = "These recordings chose the model.", "No choice rests on these recordings."
     if not discovery.test:
         chose += " Recordings that had no say (test=) would show its error without favour."
@@ -121,7 +126,7 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
         ),
         ("Validation data" + own, chose, [s.calibrated for s in stages], None),
         ("Test data", no_say, [s.test for s in stages], tested[0]),
-        ("Test data" + own, no_say, [s.test_calibrated for s in stages], tested[1]),
+        ("Test data" + own_tested, no_say, [s.test_calibrated for s in stages], tested[1]),
     ]
     found = []
     for title, note, of_stages, of_fit in listed:
@@ -129,6 +134,15 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
         if errors:
             found.append(NamedErrors(title, note, errors | ({FITTED_TO_ALL: of_fit} if of_fit else {})))
     return found
+
+
+def _own_offsets(seconds: float, recordings: Sequence[Recording]) -> str:
+    """Which part of each recording has given its offsets, in words."""
+    short, count = sum(r.duration <= seconds for r in recordings), len(recordings)
+    if short and short == count:
+        return f"offsets fitted to all of it, which is no longer than {seconds:g} s"
+    ending = f", which is all of it in {short} of {count}" if short else ""
+    return f"the offsets of its own first {seconds:g} s{ending}"
 
 
 def error_tables(discovery: SearchResult) -> tuple[ErrorTable, ...]:
@@ -158,7 +172,7 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         (old, read), (new, _) = (readable(errors[channel], unit) for errors in (before, after))
         shown.append(f"{channel} {plain_number(new)} {read} (of the search: {plain_number(old)})")
     seconds, calibrated = found.fit.options.window_seconds, discovery.final.calibrate_seconds
-    own = f", each with the offsets of its own first {calibrated:g} s" if calibrated else ""
+    own = f", each with {_own_offsets(calibrated, discovery.validation)}" if calibrated else ""
     ending = "" if found.fit.status == "converged" else f" The fit {found.fit.status}."
     remarks = "".join(f" {remark.sentence}." for remark in found.fit.remarks)
     laws = "".join(
@@ -188,6 +202,33 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
         f"measured first states.{left_out}{laws}{friction} Fitted in the same way without the validation "
         f"data, its errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
+    )
+
+
+def estimates_in_use(discovery: SearchResult, added: Round) -> dict[str, Estimate | None]:
+    """Parameters of an effect as the model to use has them, by short name; None for one that it lacks."""
+    known = {e.name: e for e in discovery.estimates}
+    return {name: known.get(f"{added.port}.{added.effect}.{name}") for name in added.parameters}
+
+
+def has_moved(found: Estimate, used: Estimate) -> bool:
+    """Whether an estimate is another one in the model to use, by the digits that its interval is worth."""
+    return dataclasses.replace(found, value=used.value).texts[0] != found.texts[0]
+
+
+def where_sentence(discovery: SearchResult, recording: Recording | None = None) -> str:
+    """Which recording statements of where a model fails are about.
+
+    Args:
+        discovery: The result.
+        recording: One of its recordings; that of the baseline's failures if None.
+    """
+    r = recording or longest_with_a_say(discovery.train, discovery.validation)
+    fitted = any(r is other for other in discovery.train)
+    named = f"{r.source}, " if r.source else ""
+    return (
+        f"All of this is about the longest {'fitted' if fitted else 'validation'} recording: "
+        f"{named}{r.start:g} s to {r.start + r.duration:g} s."
     )
 
 

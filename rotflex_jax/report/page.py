@@ -16,13 +16,16 @@ from rotflex_jax.discover.tables import (
     channel_headings,
     channel_units,
     error_tables,
+    estimates_in_use,
     final_fit_sentence,
+    has_moved,
     next_steps,
     noise_row,
     outcomes,
     parameter_rows,
     stage_labels,
     status_sentence,
+    where_sentence,
 )
 from rotflex_jax.discover.verdict import FAR_FLOOR, NEAR_FLOOR, Grade, grade
 from rotflex_jax.effects.labels import effect_label, effect_title, sentence
@@ -53,6 +56,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
     models = list(zip(labels, colours, strict=True))
     if discovery.final_fit:
         models.append((FITTED_TO_ALL, INK))
+    longest = discovery.validation[discovery.longest_validation]
     latent, learned, remaining = explanation.latent, explanation.learned, explanation.remaining
     return {
         "tone": tone(discovery),
@@ -75,6 +79,8 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "tests": _test_lines(explanation),
         "pictures": by_section(pictures(discovery, explanation).values()),
         "places": _places(discovery.where),
+        "place": together(where_sentence(discovery)),
+        "place_left": together(where_sentence(discovery, longest)),
         "torques": [together(line) for line in latent.sentences] if latent else [],
         "learned": _learned_torque(discovery, learned) if learned else None,
         "remaining": _places(remaining),
@@ -134,7 +140,7 @@ def tone(discovery: SearchResult) -> str:
 
 def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
     added, before = discovery.rounds[k], discovery.stages[k]
-    falls = []
+    falls, used = [], estimates_in_use(discovery, added)
     for channel, unit in channel_units(discovery).items():
         old, read = readable(before.held_out_rmse_windows[channel], unit)
         new, _ = readable(added.stage.held_out_rmse_windows[channel], unit)
@@ -145,7 +151,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         "sentence": sentence(added.sentence),
         "equation": equation(added.equation),
         "parameters": [
-            (name, *_shown(e), together(e.unit), _later(discovery, e), e.note, together(e.given_words))
+            (name, *_shown(e), together(e.unit), _later(e, used[name]), e.note, together(e.given_words))
             for name, e in added.parameters.items()
         ],
         "gain": _with_sign(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
@@ -179,14 +185,11 @@ def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
     ]
 
 
-def _later(discovery: SearchResult, estimate: Estimate) -> str:
-    """The estimate of the same parameter in the final model, where it is another one."""
-    value = value_and_interval(estimate)[0]
-    for last in discovery.final.estimates:
-        if last.name == estimate.name and last.value != estimate.value:
-            text = value_and_interval(last)[0]
-            return text if text != value else ""
-    return ""
+def _later(found: Estimate, used: Estimate | None) -> str:
+    """What became of an estimate in the model to use, where it is another one there."""
+    if used is None:
+        return "not in the model to use"
+    return f"{value_and_interval(used)[0]} in the model to use" if has_moved(found, used) else ""
 
 
 def _with_sign(value: float) -> str:
