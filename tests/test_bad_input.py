@@ -106,7 +106,12 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "named mV": (
         text(edited(0, "t,voltage [mV],theta,alpha")),
         {"input": "voltage [mV]"},
-        "in mv by its name, but volts are needed",
+        "in mV by its name, but volts are needed",
+    ),
+    "mV below the header": (
+        text(lambda lines: [lines[0], "s,mV,rad,rad", *lines[1:]]),
+        {},
+        "'voltage' is in mV by its line of units, but volts are needed",
     ),
     "millivolts": (text(voltage=1000 * GOOD["voltage"]), {}, "looks like millivolts"),
     "degrees": (

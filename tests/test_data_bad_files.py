@@ -355,6 +355,12 @@ BAD_TEXT: dict[str, tuple[bytes, str]] = {
     "UTF-16": (text().encode("utf-16"), "UTF-16"),
     "UTF-16 without mark": (text().encode("utf-16-le"), "UTF-16"),
     "UTF-16 of the other order": (text().encode("utf-16-be"), "UTF-16"),
+    "Latin-1": (
+        text().replace("theta", "theta [°]").encode("latin-1"),
+        "line 1 has the byte 0xb0, .*; save it as UTF-8",
+    ),
+    "Latin-1 below": ((text() + "0,0,0,ü\n").encode("latin-1"), "line 62 has the byte 0xfc, .*as UTF-8"),
+    "no text at all": (b"\x01\xb0\x02" * 99, r"cannot be read as text in UTF-8 \(.*damaged"),
     "zero byte": (text().replace("0.004000", "0.0\0").encode(), "zero byte in line 4"),
     "cut number": (text(end="")[:-2].encode(), r"ends inside line 61, with '-?0\.\d{4}' .* 6 decimals"),
     "cut exponent": (text("%.3e", end="")[:-1].encode(), "ends inside line 61"),

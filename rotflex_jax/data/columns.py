@@ -114,8 +114,9 @@ def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) 
     values = table.column(name, argument)
     label = f"{table.label}: column {name!r}"
     for unit in _words(table, name) & set(wrong):
+        written = _as_written(table, name, unit)
         raise InputError(
-            f"{label} is in {unit} by its {_unit_source(name, unit)}, but {wrong[unit]} are needed; "
+            f"{label} is in {written} by its {_unit_source(name, unit)}, but {wrong[unit]} are needed; "
             + ("pass time_unit='ms'." if unit == "ms" else "convert and rename it.")
         )
     numbers = real_numbers(values, label, table.where, table.first)
@@ -126,6 +127,12 @@ def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) 
 def _words(table: Table, name: str) -> set[str]:
     """The words of a name and of its unit, in small letters."""
     return set(re.split(r"[^a-z°]+", f"{name} {table.units.get(name, '')}".lower()))
+
+
+def _as_written(table: Table, name: str, word: str) -> str:
+    """A word of a name or of its unit with its capitals."""
+    said = re.search(rf"(?<![a-z°]){re.escape(word)}(?![a-z°])", f"{name} {table.units.get(name, '')}", re.I)
+    return said[0] if said else word
 
 
 def _unit_source(name: str, unit: str) -> str:

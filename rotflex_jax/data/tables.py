@@ -269,6 +269,16 @@ def _decoded(path: Path, max_bytes: int) -> str:
         text = data.decode("utf-8-sig")
         if "\0" in text:
             raise ValueError(f"it has a zero byte in line {text[: text.index(chr(0))].count(chr(10)) + 1}")
+    except UnicodeDecodeError as error:
+        # Data that are no text at all have control characters; old text has letters of one byte.
+        if set(data) & (set(range(32)) - set(b"\t\n\v\f\r\x1a")):
+            raise unreadable(path, "text in UTF-8", error) from error
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path.name} cannot be read as text in UTF-8: its line {line} has the byte "
+            f"0x{data[error.start]:02x}, as text in Latin-1 or Windows-1252 has for a degree sign or an "
+            "umlaut; save it as UTF-8."
+        ) from error
     except ValueError as error:
         raise unreadable(path, "text in UTF-8", error) from error
     return text
