@@ -113,6 +113,24 @@ def test_swapped_channels_are_noticed_and_the_cure_works(run, tmp_path) -> None:
     assert np.allclose(found.y, RECORDING.y)
 
 
+# One column alone, under a name of one's own
+
+
+def test_one_column_under_another_name_says_which_sensor_it_is(run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    frame(theta=None, alpha=None, servo=THETA).to_csv(file, index=False)
+    for command in ("check", "discover", "compare"):
+        status, _, err = run(command, file, "--output", "servo")
+        assert status == 2
+        assert_one_sentence(err, "two sensors", "--output theta=servo", "--output alpha=servo")
+    status, out, _ = run("check", file, "--output", "theta=servo")
+    assert status == 0 and "sensors=theta" in out
+    status, longer, _ = run("check", file, "--output", "servo", "--joint", "paper:sensors=theta")
+    assert status == 0 and longer.startswith(out)
+    frame(theta=None, alpha=None, alph=ALPHA).rename(columns={"alph": "alpha"}).to_csv(file, index=False)
+    assert "sensors=alpha" in run("check", file, "--output", "alpha")[1]
+
+
 def test_measured_joints_are_not_called_swapped(measured) -> None:
     for recording in [*measured("rotflex"), *measured("rotary_arm")]:
         assert not {"swapped", "absolute"} & {f.kind for f in recording.findings}

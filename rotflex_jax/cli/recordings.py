@@ -278,6 +278,7 @@ def as_options(sentence: str) -> str:
     sentence = sentence.replace("degrees=True", "--degrees").replace("degrees=False", "no --degrees")
     sentence = sentence.replace("arm_absolute=True", "--arm-absolute")
     sentence = re.sub(r"\btime_unit='(\w+)'", r"--time-unit \1", sentence)
+    sentence = re.sub(r"\btime_unit=(?!')", "--time-unit", sentence)
     sentence = re.sub(r"\bresample='?(\w+)'?", r"--resample \1", sentence)
     sentence = re.sub(r"\bcounts=\{'(\w+)': (\d+)\}", r"--counts \1=\2", sentence)
     sentence = re.sub(r"\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
@@ -304,10 +305,23 @@ def public_name(file: Path) -> str | None:
     return name
 
 
+def _check_one_column(outputs: Sequence[str], joint: str) -> None:
+    """Refuses one column alone of which nothing says what sensor of a joint it is."""
+    if len(outputs) == 1 and "=" not in outputs[0]:
+        raise InputError(
+            f"--output was given {outputs[0]!r} alone, but the joint {joint} has two sensors, and nothing "
+            f"says which of them this is; give --output theta={outputs[0]} for the angle of the hub, "
+            f"--output alpha={outputs[0]} for the deflection, or a second --output."
+        )
+
+
 def joint_for(files: Sequence[Path], joint: str, columns: Columns) -> str:
     """The joint that was given, or that of the public data set where all files are its name.
 
     A joint of which the files have one sensor alone becomes one with that sensor.
+
+    Raises:
+        InputError: One column is named whose name is no sensor's.
     """
     from rotflex_jax.data.registry import DATASETS
 
@@ -315,7 +329,10 @@ def joint_for(files: Sequence[Path], joint: str, columns: Columns) -> str:
     name = names.pop() if len(names) == 1 else None
     if name is not None:
         return DATASETS[name].joint if joint == "paper" else joint
+    if joint.partition(":")[0] not in ONE_SENSOR or "sensors=" in joint:
+        return joint
     sensor = columns.sensor_alone(files[0])
-    if sensor is None or joint.partition(":")[0] not in ONE_SENSOR or "sensors=" in joint:
+    if sensor is None:
+        _check_one_column(columns.outputs or (), joint)
         return joint
     return f"{joint}{',' if ':' in joint else ':'}sensors={sensor}"
