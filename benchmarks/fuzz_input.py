@@ -46,7 +46,10 @@ MEMORY = 1_500_000_000
 MAX_BYTES = 300_000_000
 """Limit that the reader is given [bytes]."""
 
-ALL_FAULTS = ("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped")
+ALL_FAULTS = (
+    *("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped"),
+    *("slow", "wrapped", "outliers", "frozen"),
+)
 """Faults of the signals are accepted, so that what is read gets as far as it can."""
 
 

@@ -54,6 +54,18 @@ def lines(edit: Callable[[list[str]], list[str]]) -> str:
     return str(path)
 
 
+def frozen(x: np.ndarray) -> np.ndarray:
+    """The same value for 0.2 s."""
+    return np.where((np.arange(N) > 100) & (np.arange(N) <= 200), x[100], x)
+
+
+def latin() -> str:
+    header = "t [s],voltage [V],theta [°],alpha [°]"
+    path = Path(lines(lambda rows: [header, *rows[1:]]))
+    path.write_bytes(path.read_text().encode("latin-1"))
+    return str(path)
+
+
 def without(package: str, do: Callable[[], object]) -> object:
     """As on a machine that lacks a package."""
     with pytest.MonkeyPatch.context() as patch:
@@ -139,6 +151,9 @@ RAISED: dict[str, Callable[[], object]] = {
     "degrees by size": lambda: recording(alpha=np.rad2deg(2 * GOOD["alpha"])),
     "millivolts": lambda: recording(voltage=1000 * GOOD["voltage"]),
     "milliseconds": lambda: recording(t=1000 * GOOD["t"]),
+    "slow": lambda: rf.load(pd.DataFrame(GOOD).drop(columns="t"), Ts=2.0),
+    "wrong unit of the time": lambda: rf.load(file(t=1000 * GOOD["t"]), time_unit="us"),
+    "another encoding": lambda: rf.load(latin()),
     "nan": lambda: recording(**at("alpha", 120, np.nan)),
     "gap": lambda: rf.load(lines(lambda rows: rows[:200] + rows[206:])),
     "jitter": lambda: recording(**at("t", 120, GOOD["t"][120] + 0.0003)),
@@ -148,6 +163,9 @@ RAISED: dict[str, Callable[[], object]] = {
     "saturated": clipped,
     "deflection turned round": lambda: turned(1, 1, -1),
     "voltage turned round": lambda: turned(-1, 1, 1),
+    "wrapped": lambda: recording(theta=(GOOD["theta"] * 20 + np.pi) % (2 * np.pi) - np.pi),
+    "outliers": lambda: recording(**at("alpha", 120, -9999.0)),
+    "frozen": lambda: recording(**{name: frozen(GOOD[name]) for name in ("theta", "alpha")}),
     "short": lambda: rf.load(lines(lambda rows: rows[:41])),
     "channels": lambda: rf.Model(rf.joints.paper()).simulate(
         rf.load(file(), outputs={"hub": "theta", "tip": "alpha"})

@@ -131,6 +131,27 @@ def test_one_column_under_another_name_says_which_sensor_it_is(run, tmp_path) ->
     assert "sensors=alpha" in run("check", file, "--output", "alpha")[1]
 
 
+def test_faults_of_samples_and_times_name_options_of_the_command_line(run, tmp_path) -> None:  # noqa: F811
+    file = tmp_path / "run.csv"
+    spike = np.where(np.arange(len(T)) == 700, -9999.0, ALPHA)
+    wrapped = (THETA * 8 + np.pi) % (2 * np.pi) - np.pi
+    for changed, options, words in (
+        ({"alpha": spike}, (), ("outliers", "--accept outliers")),
+        ({"theta": wrapped}, (), ("a whole turn", "numpy.unwrap", "--accept wrapped")),
+        ({"t": None}, ("--Ts", 2.5), ("too slow", "--Ts 0.0025", "--accept slow")),
+        (
+            {"t": 1e3 * T},
+            ("--time-unit", "us"),
+            ("unit of the time", "--time-unit", "--Ts", "--accept units"),
+        ),
+    ):
+        frame(**changed).to_csv(file, index=False)
+        status, _, err = run("check", file, *options)
+        assert status == 2
+        assert_one_sentence(err, *words)
+        assert "=" not in err.partition("unwrap")[0]
+
+
 def test_measured_joints_are_not_called_swapped(measured) -> None:
     for recording in [*measured("rotflex"), *measured("rotary_arm")]:
         assert not {"swapped", "absolute"} & {f.kind for f in recording.findings}

@@ -241,7 +241,7 @@ def test_the_table_has_a_line_per_weight() -> None:
         (
             {
                 "recordings": Recording(
-                    u=np.sin(np.arange(99.0)), y=np.ones((99, 2)), Ts=1.0, accept="constant"
+                    u=np.sin(np.arange(99.0)), y=np.ones((99, 2)), Ts=0.1, accept="constant"
                 )
             },
             "say which with `channel`",

@@ -10,7 +10,7 @@ from jaxtyping import Real
 from rotflex_jax.checks import real, shown
 from rotflex_jax.data.tables import Table, name_and_unit
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording.quality import Finding, whole_numbers
+from rotflex_jax.recording.quality import SLOWEST_SAMPLING, Finding, whole_numbers
 from rotflex_jax.recording.samples import even_spacing, finite, real_numbers, sampling_period
 
 OTHER_NAMES = {"t": ("time",), "theta": ("θ",), "alpha": ("α",)}
@@ -265,7 +265,7 @@ def timing(
         raise InputError(
             f"{label} advances by {measured:g} s, but Ts={Ts:g} was given; leave Ts out, or correct it."
         )
-    if measured >= 0.5 and not any_unit and time_unit is None:
+    if measured >= SLOWEST_SAMPLING and not any_unit and time_unit is None:
         raise InputError(
             f"{label} advances by {measured:g} per sample, too slow for a joint: it looks like "
             "milliseconds; pass time_unit='ms', or time_unit='s' if these are seconds."

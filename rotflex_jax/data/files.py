@@ -47,7 +47,7 @@ from rotflex_jax.data.tables import (
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.quality import Finding, acceptable
+from rotflex_jax.recording.quality import DOUBTED, SLOWEST_SAMPLING, Finding, acceptable, converted
 from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.samples import real_numbers
 from rotflex_jax.text.files import write_file
@@ -324,13 +324,15 @@ def load(
     u = column_of(table, u_name, "input=", {"mv": "volts"})
     held = [u, *(column_of(table, name, "signals=", {}) for name in acting.values())]
     per_turn = counts_per_turn(counts, tuple(chosen), degrees)
-    y = {}
+    y, in_radians = {}, set()  # channels that have been converted
     for channel, name in chosen.items():
         values = column_of(table, name, "outputs=", {})
         per = per_turn.get(channel)
         unit = (units or {}).get(channel, "rad")
         if unit.startswith("rad"):
             y[channel] = angle(table, channel, name, values, degrees, per, accepted)
+            if y[channel] is not values:
+                in_radians.add(channel)
         elif degrees or per is not None:
             raise InputError(
                 f"{table.label}: column {name!r} was to be converted to rad, but its unit is given as "
@@ -380,6 +382,8 @@ def load(
         start, period, steps, together, told = resampled(t, np.column_stack(held), together, resample, *at)
         held = list(steps.T)
         remarks.append(told)
+    # Whoever says the unit of the time means a long period; a column of it has been checked above.
+    seconds = period >= SLOWEST_SAMPLING and (time_unit is not None or "units" in accepted)
     try:
         other = (units or {}).get(u_name) or input_unit(table, u_name)
         recording = Recording(
@@ -392,7 +396,7 @@ def load(
             units=tuple((units or {}).get(channel, "rad") for channel in y),
             source=table.label,
             start=start,
-            accept=accepted,
+            accept=(*accepted, "slow") if seconds and "slow" not in accepted else accepted,
             remarks=remarks,
             signals=dict(zip(acting, held[1:], strict=True)),
         )
@@ -400,8 +404,9 @@ def load(
         raise InputError(f"{table.label}: {error}") from error
     for finding in recording.findings:
         # Arrays come from a program that knows what they are; the columns of a file are less certain.
-        if finding.kind in ("units", "absolute", "swapped") and finding.kind not in accepted:
-            raise InputError(f"{table.label}: {finding.message}")
+        if finding.kind in DOUBTED and finding.kind not in accepted:
+            told = converted(finding) if finding.channel in in_radians else finding
+            raise InputError(f"{table.label}: {told.message}")
     if table.cut:  # said of the file, not of parts of the recording
         cut = Finding("cut", [*table.columns][-1], table.cut, "note")
         vars(recording)["findings"] = (*recording.findings, cut)

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Complex, Float
 
 from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
+from rotflex_jax.recording.continuity import Still, frozen, motion, outliers, unwrapped, without, wraps
 
 
 def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
@@ -182,8 +183,14 @@ def is_absolute(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) 
     return True
 
 
-ACCEPTABLE = ("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped", "huge")
+IN_DIGESTS = ("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped", "huge")
+"""Faults that a part of a recording accepts as its digest says it: results are stored with digests."""
+
+ACCEPTABLE = (*IN_DIGESTS, "slow", "wrapped", "outliers", "frozen")
 """Faults that a user can accept by name; all others have no sensible reading."""
+
+DOUBTED = ("units", "absolute", "swapped", "outliers", "frozen")
+"""Warnings for which a file is refused, unless they are accepted."""
 
 SHORTEST_RECORDING = 50
 """Samples below which no fit makes sense."""
@@ -217,6 +224,7 @@ def inspect(
     units: Sequence[str],
     resolution: Mapping[str, float | None],
     accept: Sequence[str] = (),
+    start: float = 0.0,
 ) -> tuple[Finding, ...]:
     """All findings on a recording, signal by signal.
 
@@ -228,11 +236,14 @@ def inspect(
         units: in the same order.
         resolution: quantisation step of each output, where there is one [unit of the output].
         accept: kinds of errors that are to be warnings.
+        start: time of the first sample [s].
 
     Returns:
         The findings; `refuse` raises the errors among them.
     """
-    found = [_short(u), *_of_input(u, names[0], units[0])]
+    found = [_short(u), _slow(Ts, units[1:]), *_of_input(u, names[0], units[0])]
+    y, gaps = _continued(u, y, Ts, names[1:], units[1:], start)  # other faults are looked for beside gaps
+    found += gaps
     for x, name, unit in zip(y.T, names[1:], units[1:], strict=True):
         if _still(x):
             message = (
@@ -290,6 +301,115 @@ def _short(u: Float[np.ndarray, " N"]) -> Finding | None:
     return Finding("short", "time", message, "error")
 
 
+SLOWEST_SAMPLING = 0.5
+"""Sampling period at which an angle of a joint says nothing of its motion [s]."""
+
+
+def _slow(Ts: float, units: Sequence[str]) -> Finding | None:
+    if Ts < SLOWEST_SAMPLING or "rad" not in units:
+        return None
+    message = (
+        f"The sampling period was given as {Ts:g} s, too slow for a joint: it looks like milliseconds; "
+        f"pass Ts={Ts / 1000:g}, or accept=('slow',) if these are seconds."
+    )
+    return Finding("slow", "time", message, "error")
+
+
+def _size(x: float, unit: str) -> str:
+    return f"{x:.4g} {unit}" + (f" ({np.rad2deg(x):.4g} deg)" if unit == "rad" else "")
+
+
+def _wrapped(
+    x: Float[np.ndarray, " N"], Ts: float, name: str, start: float
+) -> tuple[Float[np.ndarray, " N"], Finding | None]:
+    """The angle without jumps by a whole turn, and what is said of them."""
+    for turn, jump, cure in (
+        (2 * np.pi, "a whole turn, 6.283 rad (360 deg)", " (period=360 for a column in degrees)"),
+        (360.0, "360, a whole turn in degrees", "(..., period=360), and pass degrees=True"),
+    ):
+        behind = wraps(x, turn)
+        if not len(behind):
+            continue
+        often = "once" if len(behind) == 1 else f"{len(behind)} times in all"
+        message = (
+            f"Channel {name!r} jumps by {jump}, after {start + behind[0] * Ts:.6g} s, {often}: it is "
+            f"wrapped; unwrap it before loading, with numpy.unwrap{cure}, or pass accept=('wrapped',)."
+        )
+        return unwrapped(x, behind, turn), Finding("wrapped", name, message, "error")
+    return x, None
+
+
+def _outliers(
+    x: Float[np.ndarray, " N"], Ts: float, name: str, unit: str, start: float
+) -> tuple[Float[np.ndarray, " N"], Finding | None]:
+    """The signal with lines in the place of outliers, and what is said of them."""
+    out = outliers(x)
+    if not out.any():
+        return x, None
+    first = int(np.argmax(out))
+    message = (
+        f"Channel {name!r} is {_size(float(x[first]), unit)} at {start + first * Ts:.6g} s (sample {first}), "
+        f"after {_size(float(x[first - 1]), unit)}, but else moves by {motion(x):.3g} {unit} per sample at "
+        f"most: outliers, {np.sum(out)} of {len(x)} samples in all; remove or interpolate them before "
+        "loading, cut the recording there, or pass accept=('outliers',)."
+    )
+    return without(x, out), Finding("outliers", name, message, "warning")
+
+
+def _continued(
+    u: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, "N C"],
+    Ts: float,
+    names: Sequence[str],
+    units: Sequence[str],
+    start: float,
+) -> tuple[Float[np.ndarray, "N C"], list[Finding]]:
+    """The outputs with lines in the place of what does not continue them, and what is said of that."""
+    columns, said = [], []
+    for x, name, unit in zip(y.T, names, units, strict=True):
+        wrapped = None
+        if unit == "rad":
+            x, wrapped = _wrapped(x, Ts, name, start)
+        x, out = _outliers(x, Ts, name, unit, start)
+        columns.append(x)
+        said += [wrapped, out]
+    y = np.column_stack(columns)
+    still = frozen(u, y, Ts)
+    if still is not None:
+        said.append(_frozen(still, y, Ts, names, units, start))
+        away = (np.arange(len(y)) >= still.first) & (np.arange(len(y)) <= still.last)
+        lost = [still.channel] if still.alone else range(y.shape[1])
+        y = np.column_stack([without(x, away & (c in lost)) for c, x in enumerate(y.T)])
+    return y, [finding for finding in said if finding is not None]
+
+
+def _frozen(
+    found: Still,
+    y: Float[np.ndarray, "N C"],
+    Ts: float,
+    names: Sequence[str],
+    units: Sequence[str],
+    start: float,
+) -> Finding:
+    name = names[found.channel]
+    jump = _size(found.jump, units[found.channel])
+    ends = f"from {start + found.first * Ts:.6g} to {start + found.last * Ts:.6g} s"
+    if found.alone:
+        value = f"{y[found.first, found.channel]:g} {units[found.channel]}"
+        what = f"Channel {name!r} is exactly {value} {ends}, and jumps to it and away, by {jump}"
+    else:
+        one = len(names) == 1
+        what = (
+            f"Channel{'' if one else 's'} {' and '.join(map(repr, names))} {'is' if one else 'are'} exactly "
+            f"constant {ends} while the input varies, and then {'it' if one else repr(name)} jumps by {jump}"
+        )
+    message = (
+        f"{what}: nothing was measured in that time; load the parts before and after it as recordings of "
+        "their own, or pass accept=('frozen',)."
+    )
+    return Finding("frozen", name, message, "warning")
+
+
 def _of_input(u: Float[np.ndarray, " N"], name: str, unit: str) -> list[Finding]:
     if _still(u):
         message = (
@@ -320,8 +440,28 @@ def _of_input(u: Float[np.ndarray, " N"], name: str, unit: str) -> list[Finding]
 def _quantised(name: str, unit: str, step: float | None) -> Finding | None:
     if step is None:
         return None
-    size = f"{step:.4g} {unit}" + (f" ({np.rad2deg(step):.4g} deg)" if unit == "rad" else "")
-    return Finding("quantised", name, f"Channel {name!r} is quantised in steps of {size}.", "note")
+    message = f"Channel {name!r} is quantised in steps of {_size(step, unit)}."
+    return Finding("quantised", name, message, "note")
+
+
+FASTEST_SAMPLING = 5e-5
+"""Sampling period below which an impossible speed may come from the unit of the time [s]."""
+
+IF_DEGREES = "it looks like degrees; pass degrees=True, or accept=('units',) if it is radians."
+IF_DEGREES_OR_TIME = (
+    "the unit of the time looks wrong, or that of the angle; correct time_unit= or Ts=, pass degrees=True "
+    "for degrees, or accept=('units',) if both are right."
+)
+
+
+def converted(finding: Finding) -> Finding:
+    """The finding for a channel that was degrees or counts and has been converted already."""
+    message = finding.message.replace(
+        IF_DEGREES,
+        "the column was converted to radians and is in another unit than was said, or the time is; correct "
+        "what was given, or pass accept=('units',) if it is right.",
+    ).replace("; correct time_unit= or Ts=, pass degrees=True for degrees,", "; correct time_unit= or Ts=,")
+    return replace(finding, message=message)
 
 
 def _like_degrees(
@@ -330,21 +470,21 @@ def _like_degrees(
     """Angles beyond what a joint can do in radians.
 
     A deflection of half a turn is none. A geared servo makes about 2 rad/s per volt, in degrees
-    100; the limit lies between them, for the speed over 20 ms, which noise does not reach.
+    100; the limit lies between them, for the speed over 20 ms, which noise does not reach. Of a
+    recording below 40 ms it is the speed over half of it.
     """
-    lag = max(1, round(0.02 / Ts))
+    lag = max(1, min(round(0.02 / Ts), len(x) // 2))
     speed = np.max(np.abs(x[lag:] - x[:-lag]), initial=0.0) / (lag * Ts)
     if name == "alpha" and np.max(np.abs(x)) > np.pi:
         what = f"reaches {np.max(np.abs(x)):.3g} rad, more than half a turn"
     elif input_unit == "V" and speed > max(60.0, 15.0 * np.max(np.abs(u))):
         what = f"turns at up to {speed:.3g} rad/s on {np.max(np.abs(u)):.3g} V"
+        if Ts < FASTEST_SAMPLING:
+            message = f"Channel {name!r} {what}, sampled at {1 / Ts:.6g} Hz: {IF_DEGREES_OR_TIME}"
+            return Finding("units", name, message, "warning")
     else:
         return None
-    message = (
-        f"Channel {name!r} {what}: it looks like degrees; pass degrees=True, "
-        "or accept=('units',) if it is radians."
-    )
-    return Finding("units", name, message, "warning")
+    return Finding("units", name, f"Channel {name!r} {what}: {IF_DEGREES}", "warning")
 
 
 MOST_WHOLE = 20

@@ -67,7 +67,8 @@ class Recording:
         source: where it comes from.
         start: time of the first sample [s].
         accept: faults to accept, which then are findings of severity `warning`: `short`,
-            `constant_input`, `constant`, `saturated`, `units`, `absolute`, `swapped`, `huge`.
+            `constant_input`, `constant`, `saturated`, `units`, `absolute`, `swapped`, `huge`, `slow`,
+            `wrapped`, `outliers`, `frozen`.
         resolution: quantisation step by channel, where it is known; found from the data otherwise.
         continues: the recording that ended where this one starts, if any; a part of a recording knows the
             part before it. States that no sensor shows (a warm motor) continue from there.
@@ -173,7 +174,9 @@ class Recording:
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the quality of the data."""
         names, units = (self.input_name, *self.channels), (self.input_unit, *self.units)
-        found = quality.inspect(self.u, self.y, self.Ts, names, units, self.resolution, self.accept)
+        found = quality.inspect(
+            self.u, self.y, self.Ts, names, units, self.resolution, self.accept, self.start
+        )
         return (*self.remarks, *found)
 
     @property
@@ -373,7 +376,8 @@ def content(recording: Recording) -> tuple[bytes, ...]:
     """All of a recording that a computation can depend on, as bytes; not the name of its file."""
     r = recording
     labels = (r.Ts, r.channels, r.units, r.input_name, r.input_unit)
-    labels = (*labels, r.n_init, r.start, r.accept, sorted(r.resolution.items()))
+    accepted = quality.IN_DIGESTS if r.accept == quality.ACCEPTABLE else r.accept
+    labels = (*labels, r.n_init, r.start, accepted, sorted(r.resolution.items()))
     labels = (*labels, sorted(r.constants.items()), *sorted(r.signals))
     arrays = (r.u, r.y, *(r.signals[name] for name in sorted(r.signals)))
     own = (repr(labels).encode(), *(np.ascontiguousarray(a).tobytes() for a in arrays))
