@@ -118,6 +118,9 @@ def test_limits_of_an_outlier() -> None:
     assert not outliers(step).any()  # what does not come back is no outlier
     decay = np.concatenate([np.zeros(50), 0.5 ** np.arange(50.0)])
     assert not outliers(decay).any()
+    pulse = 0.01 * np.sin(np.arange(600) / 300) * (np.arange(600) > 5)
+    pulse[300:308] += 0.3 * np.sin(np.pi * np.arange(8) / 7)
+    assert outliers(pulse, 0.05).any() and not outliers(pulse, 0.2).any()  # moves fast, but as a machine may
     assert not outliers(np.random.default_rng(2).normal(size=4000)).any()
     assert not outliers(changed(np.zeros(400), [200], 1.0)).any()  # nothing to compare with
 

@@ -28,6 +28,7 @@ from rotflex_jax.adaptive.step_sizes import Stability, analyse
 from rotflex_jax.basis import Basis
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.samples import of_one_period
 from rotflex_jax.runtime.xla import double_precision, spread
 
 FilterBuilder = Callable[[dict[str, Any]], AdaptiveFilter | tuple[AdaptiveFilter, Basis]]
@@ -225,7 +226,7 @@ def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, obj
             "given; cut a long one with Recording.slice."
         )
     lengths, periods = sorted({r.N for r in recordings}), {r.Ts for r in recordings}
-    if len(lengths) > 1 or len(periods) > 1:
+    if len(lengths) > 1 or not of_one_period(periods):
         raise InputError(
             f"The recordings must have one length and sampling period, but have {lengths} samples and "
             f"{sorted(periods)} s; cut them to the shortest with Recording.slice."

@@ -4,7 +4,6 @@ No choice of effects rests on anything here.
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -186,8 +185,6 @@ def evaluate(
 ) -> Stage:
     """What is reported of a hypothesis: estimates with intervals, its free runs and their errors.
 
-    What process torques gain is asked of predictions; `summary` adds it.
-
     Args:
         problem: With the training recordings.
         validation: The validation recordings.
@@ -212,7 +209,7 @@ def evaluate(
         windowed=runs.windows,
         window_seconds=validation.window_seconds,
         process_noise=h.process_noise,
-        process_noise_nats=math.nan,
+        process_noise_nats=0.0 if problem.free_run else process_noise_gain(problem, h),
         log_likelihood=validated.log_likelihood,
         horizon="free_run" if problem.free_run else "prediction",
         of_validation=tuple(Model(m, solver) for m in of_each),

@@ -252,6 +252,8 @@ def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis, correct
             are its predictions then: the error of the coarser one would count as a random torque.
     """
     problem = state.problem
+    if stage.horizon == "prediction" and not corrected:
+        return stage
     if stage.horizon == "free_run":
         near = state.current.hypothesis
         # First states that were fitted: a run from measured ones drifts, which would count as random torque.

@@ -4,8 +4,6 @@ import dataclasses
 import math
 from typing import ClassVar
 
-import jax.numpy as jnp
-
 from rotflex_jax.effects.base import (
     Drive,
     Force,
@@ -17,6 +15,7 @@ from rotflex_jax.effects.base import (
     Stamp,
     StatePart,
     register,
+    within,
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import parameter
@@ -213,11 +212,6 @@ class Heating(Memory):
         )
 
 
-def _within(x: Scalar, limit: Scalar) -> Scalar:
-    """`x`, at most `limit` in size; not `clip`, which splits the derivative at the limit itself."""
-    return jnp.where(x > limit, limit, jnp.where(x < -limit, -limit, x))
-
-
 DYNAMIXEL_GAIN_SCALE = 4096 / (2 * math.pi) / (256 * 885)
 """Duty per radian of error and per unit of the P gain of a Dynamixel X: counts of the encoder per radian, by
 the divisor 256 of the gain and the 885 counts of full duty [1/rad]. The logged duty of an XL-330 agrees to
@@ -306,7 +300,7 @@ class PositionLoop(Linear):
 
     def _counted(self, error: Scalar) -> Scalar:
         """What the firmware takes for an error, beyond its dead band [rad]."""
-        return error if self.dead_band is None else error - _within(error, self.dead_band)
+        return error if self.dead_band is None else error - within(error, -self.dead_band, self.dead_band)
 
     def _wanted(self, position: Scalar, speed: Scalar, goal: Scalar) -> tuple[Scalar, Scalar]:
         """Duty by P and D gain before the limit: as the linear loop has it, and with the dead band."""
@@ -321,7 +315,7 @@ class PositionLoop(Linear):
     def duty(self, position: Scalar, speed: Scalar, goal: Scalar, integral: Scalar | None = None) -> Scalar:
         """Duty that the firmware gives; `integral` is that of its I gain. Zero where the torque is off."""
         wanted = self._wanted(position, speed, goal)[1]
-        given = _within(wanted if integral is None else wanted + integral, self.limit)
+        given = within(wanted if integral is None else wanted + integral, -self.limit, self.limit)
         return given if self.enabled is None else self.enabled * given
 
     def _beyond(
@@ -331,7 +325,7 @@ class PositionLoop(Linear):
         linear, wanted = self._wanted(position, speed, goal)
         before = wanted if integral is None else wanted + integral
         # What the limit takes away, added: nothing is rounded below it.
-        off = _within(before, self.limit) - before
+        off = within(before, -self.limit, self.limit) - before
         if self.dead_band is not None:
             off = off + (wanted - linear)
         if integral is not None:
@@ -476,7 +470,7 @@ class PidServo(PositionLoop, Memory):
         """Time derivative of the duty of the I gain [1/s]; `drive` is the goal [rad]."""
         error = self._counted(self._error(position, speed, drive))
         wanted = self._wanted(position, speed, drive)[1] + z
-        rate = self.integral * error - self.anti_windup * (wanted - _within(wanted, self.limit))
+        rate = self.integral * error - self.anti_windup * (wanted - within(wanted, -self.limit, self.limit))
         return rate if self.enabled is None else self.enabled * rate
 
     def force(self, z: Scalar, position: Scalar, speed: Scalar, drive: Scalar) -> Scalar:

@@ -119,9 +119,10 @@ class Identifiability:
             return tuple(said)
         if not self.badly_known:
             worst = max(self.std, key=lambda n: self.std[n], default="")
-            tail = f"; worst is {worst}, {100 * self.std[worst]:.2g} %" if worst else ""
-            least = f"with a standard deviation of {100 * BADLY_KNOWN:.0f} % or less"
-            return (*said, f"This recording determines every combination {least}{tail}.")
+            half = 100 * HALF_WIDTH_95
+            tail = f"; worst is {worst}, ± {half * self.std[worst]:.2g} %" if worst else ""
+            least = f"± {half * BADLY_KNOWN:.0f} % or better"
+            return (*said, f"This recording determines every combination to {least}{tail}.")
         said += [f"{d.sentence}." for d in self.badly_known if np.isfinite(d.std)]
         if self.structural:
             for words, found in (

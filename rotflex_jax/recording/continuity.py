@@ -73,11 +73,15 @@ def unwrapped(
     return x - turn * np.cumsum(turns)
 
 
-def outliers(x: Float[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+def outliers(x: Float[np.ndarray, " N"], least: float = 0.0) -> Bool[np.ndarray, " N"]:
     """Which samples are out of line with their neighbours on both sides.
 
     They jump by `FAR_OUT` times what the signal moves otherwise, and a few samples later back to where it
     has gone on.
+
+    Args:
+        x: signal.
+        least: jumps up to this size are motion, of a machine that mostly rests for instance [unit of x].
 
     >>> x = np.sin(np.arange(200) / 20)
     >>> x[120:123] = -9999
@@ -87,7 +91,7 @@ def outliers(x: Float[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
     out = np.zeros(len(x), dtype=bool)
     usual = motion(x)
     steps = np.abs(np.diff(x))
-    jumps = np.flatnonzero(steps > FAR_OUT * usual)
+    jumps = np.flatnonzero(steps > max(FAR_OUT * usual, least))
     if usual == 0 or len(jumps) > 2 * MOST_OUTLIERS:
         return out
     last = -1

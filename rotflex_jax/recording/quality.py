@@ -343,7 +343,7 @@ def _outliers(
     x: Float[np.ndarray, " N"], Ts: float, name: str, unit: str, start: float
 ) -> tuple[Float[np.ndarray, " N"], Finding | None]:
     """The signal with lines in the place of outliers, and what is said of them."""
-    out = outliers(x)
+    out = outliers(x, FASTEST * Ts if unit == "rad" else 0.0)
     if not out.any():
         return x, None
     first = int(np.argmax(out))
@@ -464,6 +464,10 @@ def converted(finding: Finding) -> Finding:
     return replace(finding, message=message)
 
 
+FASTEST = 60.0
+"""Speed that a geared servo does not reach [rad/s]."""
+
+
 def _like_degrees(
     x: Float[np.ndarray, " N"], u: Float[np.ndarray, " N"], Ts: float, name: str, input_unit: str
 ) -> Finding | None:
@@ -477,7 +481,7 @@ def _like_degrees(
     speed = np.max(np.abs(x[lag:] - x[:-lag]), initial=0.0) / (lag * Ts)
     if name == "alpha" and np.max(np.abs(x)) > np.pi:
         what = f"reaches {np.max(np.abs(x)):.3g} rad, more than half a turn"
-    elif input_unit == "V" and speed > max(60.0, 15.0 * np.max(np.abs(u))):
+    elif input_unit == "V" and speed > max(FASTEST, 15.0 * np.max(np.abs(u))):
         what = f"turns at up to {speed:.3g} rad/s on {np.max(np.abs(u)):.3g} V"
         if Ts < FASTEST_SAMPLING:
             message = f"Channel {name!r} {what}, sampled at {1 / Ts:.6g} Hz: {IF_DEGREES_OR_TIME}"

@@ -38,7 +38,7 @@ from rotflex_jax.text.numbers import (
     equation,
     multiple,
     percent_explained,
-    percent_left,
+    percent_own,
     plain_number,
     ratio,
     readable,
@@ -210,7 +210,7 @@ def _ranked(r: Ranked, outcome: Outcome) -> dict[str, str]:
         "label": effect_label(r.effect, r.port),
         "title": effect_title(r.effect),
         "score": plain_number(r.score),
-        "own": percent_left(r.unconfounded),
+        "own": percent_own(r.unconfounded),
         "state": outcome.value,
     }
 

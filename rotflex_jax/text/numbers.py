@@ -166,6 +166,15 @@ def percent_explained(percent: float) -> str:
     return f"{percent:.2f} %" if percent > 99 else f"{percent:.1f} %" if percent > 0 else "0 %"
 
 
+def percent_own(fraction: float) -> str:
+    """A share of a whole, of which small ones differ by powers of ten.
+
+    >>> [percent_own(f) for f in (0.997, 0.413, 0.0152, 0.00041)]
+    ['100 %', '41 %', '1.5 %', '0.041 %']
+    """
+    return f"{100 * fraction:.0f} %" if fraction >= 0.1 else f"{100 * fraction:.2g} %"
+
+
 def percent_left(fraction: float) -> str:
     """What is left of something, as a fraction of it; may be more than all of it.
 
