@@ -10,6 +10,7 @@ from rotflex_jax.discover import localise, locate
 from rotflex_jax.discover.localise import ConditionSet, ErrorShare, half_width, missing_acceleration
 from rotflex_jax.discover.result import Where
 from rotflex_jax.recording import Recording
+from rotflex_jax.text.numbers import percent_of_whole
 
 WORDS = {k: f"{k} {{}}" for k in ("inside", "outside", "above", "below")}
 WORDS |= {"positive": "positive", "negative": "negative"}
@@ -232,7 +233,7 @@ def test_a_share_of_all_or_of_nothing_has_a_divergence() -> None:
     ],
 )
 def test_shares_as_they_are_read(share: float, said: str) -> None:
-    assert localise.percent(share) == said
+    assert percent_of_whole(share) == said
 
 
 def test_the_deflection_is_the_parabola_through_seven_samples() -> None:

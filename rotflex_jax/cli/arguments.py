@@ -11,6 +11,7 @@ import typer
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import JOINTS
+from rotflex_jax.text.files import without_folder
 
 STDOUT = Path("-")
 SIMULATORS = ("mjcf", "urdf", "fmu", "bam")
@@ -364,10 +365,7 @@ def check_writable(*, json_file: Path | None = None, folder: Path | None = None)
         if json_file.is_dir():
             raise InputError(f"{json_file} is a folder, but a file is written; name the file.")
         if not json_file.absolute().parent.is_dir():
-            raise InputError(
-                f"{json_file} cannot be written, since the folder {json_file.parent} does not "
-                "exist; create it or name another."
-            )
+            raise without_folder(json_file)
     if folder is not None:
         _check_folder(folder)
 

@@ -128,14 +128,18 @@ class LikelihoodProblem:
         against the sampling period: a predictor that forgets within a few samples follows any motion
         and no longer distinguishes one model from another, whatever its likelihood.
         """
-        unit = self.dataset.torque_scale**2 * float(self.dataset.data.Ts[0])
+        unit = self._intensity(self.dataset.torque_scale)
         return MIN_PROCESS_NOISE_SHARE * unit, MAX_PROCESS_NOISE_SHARE * unit
 
     def least_process_noise(self, h: Hypothesis) -> float:
         """The least intensity by the motor of a hypothesis, not by that of the user's model [(N m)^2 s]."""
-        s, data = self.supermodel, self.dataset.data
-        torque = torque_scale(s.clean(h.mean_values(s), ()), data)
-        return MIN_PROCESS_NOISE_SHARE * torque**2 * float(data.Ts[0])
+        s = self.supermodel
+        motor = torque_scale(s.clean(h.mean_values(s), ()), self.dataset.data)
+        return MIN_PROCESS_NOISE_SHARE * self._intensity(motor)
+
+    def _intensity(self, torque: float) -> float:
+        """Intensity of a torque that is drawn again at each sample [(N m)^2 s]."""
+        return torque**2 * float(self.dataset.data.Ts[0])
 
     def with_process_noise(self, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
         """The hypothesis with the gains of another process noise."""

@@ -17,7 +17,7 @@ from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.smoothing import local_polynomial, smoothed
-from rotflex_jax.text.numbers import as_read
+from rotflex_jax.text.numbers import as_read, percent_of_whole
 
 # Angles are smoothed over this half width before they are differentiated [s].
 SMOOTHING_SECONDS = 0.03
@@ -124,7 +124,7 @@ def condition_sets(
         mechanism: Says what the channels measure; by their names if None.
     """
     half = half_width(recording)
-    units = {c: _unit(recording, c) for c in channels}
+    units = {c: recording.unit(c) for c in channels}
     moving = motion_channels(units, mechanism)
     if not half or not moving:
         return ()
@@ -144,10 +144,6 @@ def condition_sets(
     return tuple(conditions for conditions in found if conditions is not None)
 
 
-def _unit(recording: Recording, channel: str) -> str:
-    return recording.units[recording.channels.index(channel)]
-
-
 def _subject(channel: str, mechanism: Mechanism | None) -> str:
     ports = {c: port for c, (port, _) in mechanism.outputs} if mechanism is not None else {}
     port = ports.get(channel, {"theta": "hub", "alpha": "joint"}.get(channel, channel))
@@ -159,7 +155,7 @@ def _speed(
 ) -> tuple[np.ndarray, float, str]:
     """Smoothed speed of a channel, the standard deviation of its error, and its unit."""
     window = 2 * half_width(recording) + 1
-    unit = _unit(recording, channel)
+    unit = recording.unit(channel)
     order = 1 - derivative_of(channel, unit, mechanism)
     weights = local_polynomial(window, 2, order, recording.Ts)[window // 2]
     y = recording.channel(channel).astype(float)
@@ -311,8 +307,8 @@ def in_conditions(
     energy = energies[verb]
     profile = np.bincount(conditions.bins, energy, len(conditions.edges) - 1)
     statement = (
-        f"{percent(share)} of the {channel} error {verb} {conditions.phrases[k]}, "
-        f"where the machine spends {percent(expected[k])} of the time."
+        f"{percent_of_whole(share)} of the {channel} error {verb} {conditions.phrases[k]}, "
+        f"where the machine spends {percent_of_whole(expected[k])} of the time."
     )
     usual = np.bincount(conditions.bins, minlength=len(profile)) / N
     profile /= profile.sum()
@@ -354,7 +350,8 @@ def in_time(channel: str, error: Float[np.ndarray, " N"], recording: Recording) 
     profile = np.bincount(bins, energy, TIME_SEGMENTS) / energy.sum()
     usual = np.bincount(bins, minlength=TIME_SEGMENTS) / N
     statement = (
-        f"{percent(share)} of the {channel} error lies {when}, which is {percent(expected)} of the recording."
+        f"{percent_of_whole(share)} of the {channel} error lies {when}, which is "
+        f"{percent_of_whole(expected)} of the recording."
     )
     where = Where(statement, share, p_value, "time", channel, edges, profile, usual, "s")
     return ErrorShare(where, expected)
@@ -400,23 +397,11 @@ def in_frequency(channel: str, error: Float[np.ndarray, " N"], recording: Record
         what = f"lies below {above}" if low == 1 else f"lies between {edges[low]:g} and {above}"
         what = f"lies above {below}" if high == len(usual) else what
     statement = (
-        f"{percent(share)} of the {channel} error {what}, "
-        f"where white sensor noise would have {percent(expected)} of its power."
+        f"{percent_of_whole(share)} of the {channel} error {what}, "
+        f"where white sensor noise would have {percent_of_whole(expected)} of its power."
     )
     where = Where(statement, share, p_value, "frequency", channel, edges, profile, usual, "Hz")
     return ErrorShare(where, expected)
-
-
-def percent(share: float) -> str:
-    """A share for a sentence.
-
-    >>> percent(0.784), percent(0.0042), percent(0.998), percent(1.0)
-    ('78 %', '0.4 %', '99.8 %', 'all')
-    """
-    p = 100 * float(share)
-    if p >= 99.5:
-        return f"{p:.1f} %" if p < 99.95 else "all"
-    return f"{p:.0f} %" if p >= 1 else f"{max(p, 0.1):.1f} %"
 
 
 SIGNIFICANCE = 0.05
@@ -501,7 +486,7 @@ def locate(
     for channel, error in zip(channels, e.T, strict=True):
         if np.sum(error**2) <= 0.0:
             continue
-        unit = _unit(recording, channel)
+        unit = recording.unit(channel)
         found.append(in_time(channel, error, recording))
         found.append(in_frequency(channel, error, recording, unit))
         order = 2 - derivative_of(channel, unit, mechanism)

@@ -291,10 +291,7 @@ class ScoreTest:
         found = []
         for i, a in enumerate(by_shape):
             for b in by_shape[i + 1 :]:
-                if not (a and b):
-                    continue
-                one, other = a[0][0].candidate.location, b[0][0].candidate.location
-                if not (one.contains(other) or other.contains(one)):
+                if a and b and not a[0][0].candidate.location.is_related_to(b[0][0].candidate.location):
                     found.append(self._best_pair(gram, a, b, alone))
         return found
 

@@ -395,7 +395,7 @@ def _alike(
 def _related(a: ValidatedHypothesis, b: ValidatedHypothesis) -> bool:
     """Whether one of two effects is a special case of the other."""
     assert a.location and b.location
-    return a.location.contains(b.location) or b.location.contains(a.location)
+    return a.location.is_related_to(b.location)
 
 
 def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:

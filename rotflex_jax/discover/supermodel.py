@@ -90,6 +90,10 @@ class EffectLocation(NamedTuple):
         """Whether another effect is a special case of this one."""
         return self.port == other.port and other.effect in CATALOG[self.effect].contains
 
+    def is_related_to(self, other: "EffectLocation") -> bool:
+        """Whether one of the two is a special case of the other."""
+        return self.contains(other) or other.contains(self)
+
 
 class ErrorLine(NamedTuple):
     """A line in the spectrum of a model's errors that the input has not.

@@ -69,7 +69,7 @@ RUGGED = 0.5
 # Of two attempts whose costs differ by less, one that converged is better [nat].
 EQUAL_COST = 0.1
 
-# How often a robust fit determines anew which errors are large.
+# How often a robust fit determines which errors are large.
 ROBUST_REPETITIONS = 2
 
 # Standard deviation of a normal number, by the median of its size.
@@ -349,7 +349,7 @@ class GreyBoxProblem:
         """Windows of some seconds, or whole recordings, behind those of shorter horizons for restarts.
 
         They have the same number of windows, so that all share one compiled program. A solver of optimistix
-        would compile each anew; predictions, and fits without restarts, have no use for them.
+        would compile a program for each; predictions, and fits without restarts, have no use for them.
         """
         of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
         lengths = [r.N * r.Ts for r in self.dataset.recordings]

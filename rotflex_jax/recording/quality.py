@@ -454,13 +454,20 @@ IF_DEGREES_OR_TIME = (
 )
 
 
+IF_CONVERTED = {
+    IF_DEGREES: "the column was converted to radians and is in another unit than was said, or the time is; "
+    "correct what was given, or pass accept=('units',) if it is right.",
+    IF_DEGREES_OR_TIME: "the unit of the time looks wrong, or that of the angle; correct time_unit= or Ts=, "
+    "or accept=('units',) if both are right.",
+}
+"""Advice on a channel in radians -> that on one that was degrees or counts and has been converted already."""
+
+
 def converted(finding: Finding) -> Finding:
     """The finding for a channel that was degrees or counts and has been converted already."""
-    message = finding.message.replace(
-        IF_DEGREES,
-        "the column was converted to radians and is in another unit than was said, or the time is; correct "
-        "what was given, or pass accept=('units',) if it is right.",
-    ).replace("; correct time_unit= or Ts=, pass degrees=True for degrees,", "; correct time_unit= or Ts=,")
+    message = finding.message
+    for advice, instead in IF_CONVERTED.items():
+        message = message.replace(advice, instead)
     return replace(finding, message=message)
 
 

@@ -24,6 +24,13 @@ def path_of(given: Any) -> Path:
     raise InputError(f"The path of a file is needed, but {shown(given)} was given; give its name as text.")
 
 
+def without_folder(path: Path) -> InputError:
+    """What is said of a file whose folder does not exist."""
+    return InputError(
+        f"{path} cannot be written, since the folder {path.parent} does not exist; create it or name another."
+    )
+
+
 def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
     """Write a file beside its place and put it there in one step: an old file stays until then.
 
@@ -59,10 +66,7 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
             UNFINISHED.discard(part)
     except OSError as error:
         if not place.parent.exists():
-            raise InputError(
-                f"{path} cannot be written, since the folder {path.parent} does not exist; create it or name "
-                "another."
-            ) from error
+            raise without_folder(path) from error
         raise InputError(
             f"{path} cannot be written ({error.strerror or error}); make space or name another place."
         ) from error

@@ -166,6 +166,18 @@ def percent_explained(percent: float) -> str:
     return f"{percent:.2f} %" if percent > 99 else f"{percent:.1f} %" if percent > 0 else "0 %"
 
 
+def percent_of_whole(fraction: float) -> str:
+    """A part of a whole, for a sentence.
+
+    >>> [percent_of_whole(f) for f in (0.784, 0.0042, 0.998, 1.0)]
+    ['78 %', '0.4 %', '99.8 %', 'all']
+    """
+    p = 100 * float(fraction)
+    if p >= 99.5:
+        return f"{p:.1f} %" if p < 99.95 else "all"
+    return f"{p:.0f} %" if p >= 1 else f"{max(p, 0.1):.1f} %"
+
+
 def percent_own(fraction: float) -> str:
     """A share of a whole, of which small ones differ by powers of ten.
 
