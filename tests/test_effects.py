@@ -80,6 +80,7 @@ PASSIVE = {
     "coulomb_asymmetric",
     "stribeck",
     "load_friction",
+    "gear_friction",
     "quadratic_drag",
     "dahl",
     "lugre",
@@ -203,7 +204,7 @@ def test_probes_are_valid_and_show(cls, scale):
 
 @every_effect
 def test_ports_and_relations(cls):
-    assert set(cls.searched) <= set(cls.ports)
+    assert set(cls.searched) <= {*cls.ports, "loaded"}  # a role of the hub
     assert set(cls.amplitudes) <= set(cls.declared())
     assert set(cls.contains) <= set(CATALOG)
     # A special case is a law of the same thing.
@@ -513,6 +514,7 @@ def test_candidates_cover_the_first_family():
     assert {("voltage_drift", "input"), ("periodic_disturbance", "input")} <= pairs
     # What ties with a simpler effect on most recordings is tried on request only.
     assert not {"load_friction", "amplifier_saturation", "elastic_backlash"} & {n for n, _ in pairs}
+    assert "gear_friction" not in {n for n, _ in pairs}  # no weight at the hub
     assert ("heating", "arm") not in pairs and ("heating", "joint") not in pairs  # no motor there
     assert ("sensor_bias", "alpha") in pairs and ("sensor_bias", "theta") not in pairs
     assert not {"inertia", "spring", "motor"} & {n for n, _ in pairs}

@@ -20,7 +20,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare
 from rotflex_jax.joints import by_name, position_servo, xl330_pendulum
 from rotflex_jax.mechanism.assembly import Layout
-from rotflex_jax.mechanism.roles import port_roles
+from rotflex_jax.mechanism.roles import port_roles, search_places
 from rotflex_jax.mechanism.step import memory_drive
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import double_precision
@@ -177,6 +177,9 @@ def test_presets_by_name_and_the_role_of_the_port():
         ("q",), {"shaft": (1,)}, [fx.Inertia("shaft"), fx.PositionServo("shaft")], outputs={"q": "shaft"}
     )
     assert port_roles(shaft, "shaft") == {"hub"}  # its loop is no spring
+    assert port_roles(shaft + fx.Gravity("shaft"), "shaft") == {"hub", "loaded"}
+    assert (fx.GearFriction, "hub") in search_places(xl330_pendulum())
+    assert fx.GearFriction not in dict(search_places(rf.joints.paper()))
 
 
 # -- an independent servo: firmware at 1 kHz on whole counts, friction that sticks, steps of 0.1 ms ----------
@@ -191,8 +194,15 @@ FREE = {
 }
 
 
-def servo_run(gain: float, goal: np.ndarray, fine: int = 50) -> np.ndarray:
-    """Angles; the firmware sees them in whole counts. No code of the toolkit."""
+def servo_run(gain: float, goal: np.ndarray, fine: int = 50, lost: float = 0.0) -> np.ndarray:
+    """Angles; the firmware sees them in whole counts. No code of the toolkit.
+
+    Args:
+        gain: Of the firmware.
+        goal: Goals [rad].
+        fine: Steps of a sample.
+        lost: Share of the motor's torque that the gear takes as friction.
+    """
     J, kt, R, level, cosine = (TRUTH[k] for k in ("J", "kt", "R", "level", "cosine"))
     h, weight, q, v, out = TS / fine, 0.49 * 9.80665 * 0.1, 0.0, 0.0, []
     every = max(round(1e-3 / h), 1)
@@ -204,11 +214,12 @@ def servo_run(gain: float, goal: np.ndarray, fine: int = 50) -> np.ndarray:
                 read, wanted = round(q / COUNT), round(u / COUNT)
                 volts = 7.4 * min(max(gain * (wanted - read) / (256 * 885), -1.0), 1.0)
             tick += 1
-            drive = kt / R * (volts - kt * v) - weight * np.sin(q) - cosine * np.cos(q)
-            if v == 0.0 and abs(drive) <= level:
+            motor = kt / R * (volts - kt * v)
+            drive, most = motor - weight * np.sin(q) - cosine * np.cos(q), level + lost * abs(motor)
+            if v == 0.0 and abs(drive) <= most:
                 continue
             way = np.sign(v) if v != 0.0 else np.sign(drive)
-            new = v + h * (drive - way * level) / J
+            new = v + h * (drive - way * most) / J
             new = 0.0 if v != 0.0 and new * v < 0 else new
             q, v = q + h * (v + new) / 2, new
     return np.array(out)
@@ -222,12 +233,12 @@ def goals(samples: int = 800) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.fixture(scope="module")
-def servo_recordings() -> list[Recording]:
+def recorded(*runs: tuple[float, str], lost: float = 0.0) -> list[Recording]:
+    """Recordings of the independent servo at gains, following goals, with noise and in whole counts."""
     made = []
-    for k, (gain, kind) in enumerate(((100, "sums"), (200, "sweep"), (400, "sums"), (800, "sweep"))):
+    for k, (gain, kind) in enumerate(runs):
         goal = goals()[kind]
-        angle = servo_run(float(gain), goal) + np.random.default_rng(k).normal(0, NOISE, len(goal))
+        angle = servo_run(gain, goal, lost=lost) + np.random.default_rng(k).normal(0, NOISE, len(goal))
         made.append(
             Recording(
                 u=goal,
@@ -236,10 +247,15 @@ def servo_recordings() -> list[Recording]:
                 input_name="goal",
                 input_unit="rad",
                 resolution={"theta": COUNT},
-                constants={GAIN: float(gain)},
+                constants={GAIN: gain},
             )
         )
     return made
+
+
+@pytest.fixture(scope="module")
+def servo_recordings() -> list[Recording]:
+    return recorded((100.0, "sums"), (200.0, "sweep"), (400.0, "sums"), (800.0, "sweep"))
 
 
 def far_start() -> rf.Mechanism:
@@ -339,6 +355,24 @@ def test_every_part_of_a_search_knows_the_constants_of_each_recording(servo_reco
     fitted = {e.name: e.value for e in stage.estimates}
     for name, key in FREE.items():
         assert fitted[name] == pytest.approx(TRUTH[key], rel=0.1, abs=2e-3)
+
+
+@pytest.mark.parametrize("lost", [0.4, 0.0])
+def test_a_search_tells_the_friction_of_a_loaded_gear_from_a_constant_one(lost):
+    """From the preset, whose values are off: the share of the torque that is lost, or Coulomb friction."""
+    train = recorded((200.0, "sums"), (400.0, "sweep"), lost=lost)
+    validation = recorded((200.0, "sweep"), (400.0, "sums"), lost=lost)
+    laws = (fx.Coulomb, fx.GearFriction, fx.Viscous, fx.QuadraticDrag, fx.CoulombAsymmetric)
+    model = rf.Model(xl330_pendulum(), rf.Exponential(substeps=2))
+    found = rf.discover(model, train, validation, candidates=[(law, "hub") for law in laws], rounds=2)
+    assert [(r.effect, r.status) for r in found.rounds] == [
+        ("gear_friction" if lost else "coulomb", "established")
+    ]
+    assert found.verdict.value != "unexplained"
+    estimates = {e.name.rpartition(".")[2]: e for e in found.final.estimates}
+    assert estimates["level"].value == pytest.approx(TRUTH["level"], rel=0.1)
+    if lost:
+        assert abs(estimates["share"].value - lost) < 3 * estimates["share"].std < 0.1
 
 
 def test_a_measured_servo_at_a_gain_that_no_fit_has_seen(measured: Callable[[str], list[Recording]]):

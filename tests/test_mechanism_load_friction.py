@@ -207,6 +207,25 @@ def test_tied_shares_are_one_in_a_fit_and_in_a_file(tmp_path):
         fx.LoadFriction("hub", tied=1)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize("push", [0.3, 0.375, 0.385, 0.5, 0.62, 0.64, 0.7])
+def test_friction_in_proportion_to_the_motors_torque_holds_a_weight(push):
+    """A motor lifts where `push - level - share push` is more than the weight, and lets it sink below."""
+    weight, level, share = 0.48, 0.02, 0.2
+    lifts, sinks = push * (1 - share) - level > weight, push * (1 + share) + level < weight
+    m = single_inertia(J) + fx.Gravity("hub", sine=0.0, cosine=weight)
+    m = m + fx.GearFriction("hub", level=level, share=share)
+    moved = simulate(m, np.full(5, push / GAIN), Ts)[-1, 0]
+    assert (moved > 1e-6) == lifts and (moved < -1e-6) == sinks
+    assert lifts or sinks or abs(moved) < 1e-15
+
+
+def test_it_is_the_load_friction_of_the_motor_with_one_share():
+    given, u = paper(joint_damping=0.003), steps(1500, 25, 4.0)
+    one = simulate(given + fx.GearFriction("hub", level=FC, share=DRIVING), u, Ts)
+    tied = fx.LoadFriction("hub", level=FC, driving=DRIVING, tied=True, of="motor")
+    np.testing.assert_allclose(one, simulate(given + tied, u, Ts), atol=1e-12)
+
+
 def test_it_needs_a_motor_and_an_inertia():
     with pytest.raises(InputError, match="at 'arm', but it needs a port with a motor and an inertia"):
         _ = paper() + fx.LoadFriction("arm")

@@ -50,6 +50,7 @@ class Machine:
         factor: errors in that unit per unit of the channel.
         solver: integration rule, where it is not the usual one.
         with_signals: whether its recordings have signals beside the input.
+        released: trusted parameters of the mechanism that its recordings do not know.
     """
 
     dataset: str
@@ -60,13 +61,14 @@ class Machine:
     factor: float = math.degrees(1.0)
     solver: rf.Exponential | None = None
     with_signals: bool = False
+    released: tuple[str, ...] = ()
 
     def model(self) -> rf.Model | None:
         """The textbook model; None where there is none yet."""
         preset = getattr(rf.joints, self.preset, None)
         if preset is None:
             return None
-        mechanism = preset(**self.options)
+        mechanism = preset(**self.options).release(*self.released)
         return rf.Model(mechanism) if self.solver is None else rf.Model(mechanism, self.solver)
 
     def ways(self) -> list[Way]:
@@ -205,7 +207,13 @@ MACHINES: dict[str, Machine] = {
         "two_dof_link", "two_dof_link", _stage(2, True), {"stage": 2}, with_signals=True
     ),
     "two_stage_link": Machine("two_dof_link", "two_stage_link", _both_stages, with_signals=True),
-    # Position servos: no model of their firmware yet.
-    "bam_xl330": Machine("bam_xl330", "bam_xl330", _by_gain),
-    "so101": Machine("so101", "so101", _elbow),
+    "bam_xl330": Machine("bam_xl330", "xl330_pendulum", _by_gain),
+    "so101": Machine(
+        "so101",
+        "sts3215",
+        _elbow,
+        {"gain": 16.0},
+        solver=rf.Exponential(substeps=4),  # of 20 ms
+        released=("hub.position_servo.gain",),
+    ),
 }

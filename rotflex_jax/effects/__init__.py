@@ -32,7 +32,7 @@ from rotflex_jax.effects.base import (
     register,
 )
 from rotflex_jax.effects.damping import QuadraticDrag, Viscous, ViscousAsymmetric
-from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, LoadFriction, Stribeck
+from rotflex_jax.effects.friction import Coulomb, CoulombAsymmetric, GearFriction, LoadFriction, Stribeck
 from rotflex_jax.effects.gear import Backlash, ElasticBacklash
 from rotflex_jax.effects.hysteresis import BoucWen, Dahl, LuGre
 from rotflex_jax.effects.inertia import Inertia, SecondMode
@@ -93,6 +93,7 @@ __all__ = [
     "CoulombAsymmetric",
     "Stribeck",
     "LoadFriction",
+    "GearFriction",
     # force
     "QuadraticDrag",
     "ViscousAsymmetric",

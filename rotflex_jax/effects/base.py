@@ -147,7 +147,8 @@ class Effect(abc.ABC):
     contains: ClassVar[tuple[str, ...]] = ()
     # What several laws describe, such as dry friction; only a model near the noise can tell these laws apart.
     law_of: ClassVar[str] = ""
-    # Ports a search tries it at by default; none for what a model has from the start.
+    # Ports a search tries it at by default, by their roles (`mechanism.roles`); none for what a model has
+    # from the start.
     searched: ClassVar[tuple[str, ...]] = ()
     # Its volts are the unit of the input, also where that is no voltage but a current or a goal.
     volts_of_input: ClassVar[bool] = False

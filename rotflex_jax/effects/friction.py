@@ -260,3 +260,60 @@ class LoadFriction(DryFriction):
             f"friction at the {self.at} grows with the torque {whose}: from {self.level:.3g} N m by "
             f"{self.driving:.1%} of it while the motor drives and by {self.driven:.1%} while it is driven"
         )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class GearFriction(DryFriction):
+    """Friction of a gear that loses a share of the torque of its motor.
+
+        |tau| = level + share |motor torque|
+
+    At rest any torque up to that level holds the port. It is `LoadFriction` of the motor's torque with one
+    share for both directions of power, which is as much as a recording of one load can tell. Where the
+    motor's torque is in phase with the speed it is hardly distinguished from viscous damping or from another
+    torque per volt; a weight or a spring that the motor holds makes the difference.
+
+    Args:
+        at: Port of the motor.
+        level: Friction torque without load [N m].
+        share: Of the motor's torque that is lost.
+
+    Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
+        simulation of servo actuators, 2024, model M3, by the torque of the motor.
+    """
+
+    name: ClassVar[str] = "gear_friction"
+    title: ClassVar[str] = "torque-dependent gear friction"
+    law_of: ClassVar[str] = DRY_FRICTION
+    equation: ClassVar[str] = "tau = -(level + share * |motor torque|) * sign(speed)"
+    ports: ClassVar[tuple[str, ...]] = ("hub",)
+    amplitudes: ClassVar[tuple[str, ...]] = ("level", "share")
+    contains: ClassVar[tuple[str, ...]] = ("coulomb",)
+    # Where only inertias and springs load the motor it is alike with other frictions of the catalogue.
+    searched: ClassVar[tuple[str, ...]] = ("loaded",)
+    loaded: ClassVar[bool] = True
+
+    level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque without load")
+    share: float = parameter(0.2, unit="", lower=0.0, meaning="share of the motor's torque that is lost")
+
+    @property
+    def rest_share(self) -> float:
+        """The torque is that of the motor alone."""
+        return 0.0
+
+    def limit(self, position: Scalar, speed: Scalar, direction: Scalar, load: Scalar) -> Scalar:
+        """Level [N m] that opposes motion in `direction` under the motor's torque `load` [N m]."""
+        return self.level + self.share * jnp.abs(jnp.asarray(load))
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """Two directions, one for each parameter."""
+        return [[{"level": 0.1 * scale.torque, "share": 0.0}, {"level": 0.0, "share": 0.2}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"friction at the {self.at} is {self.share:.1%} of the torque of the motor, "
+            f"and {self.level:.3g} N m besides"
+        )

@@ -8,6 +8,7 @@ needs no list of machines and a machine none of effects.
 
 from collections.abc import Callable
 
+from rotflex_jax.effects.angle import Gravity
 from rotflex_jax.effects.base import CATALOG, Effect, driven_place, port_and_signal
 from rotflex_jax.mechanism.mechanism import Mechanism
 
@@ -18,18 +19,21 @@ def port_roles(mechanism: Mechanism, port: str) -> set[str]:
     """Roles of a port: its own name if the joint has one of that name, otherwise by the effects at it.
 
     A motor makes it a `hub`, a spring a `joint`, and neither an `arm`; one that moves in metres is an
-    `axis` as well. A machine that has a hub, a joint and an arm by name says with them where it is
-    searched: its other ports have no role. Neither has the motor's side of a gear with play.
+    `axis` as well, and a motor that turns a weight is `loaded`. A machine that has a hub, a joint and an arm
+    by name says with them where it is searched: its other ports have no role but that. Neither has the
+    motor's side of a gear with play.
     """
+    weight = any(isinstance(e, Gravity) and e.at == port for e in mechanism.effects)
+    loaded = {"loaded"} if weight and mechanism.has_motor(port) else set()
     if port in PORTS:
-        return {port}
+        return {port} | loaded
     if mechanism.on_rotor(port) or all(name in mechanism.port_vectors for name in PORTS):
-        return set()
+        return loaded
     stiff = any(float(e.stamp().stiffness) != 0 for e in mechanism.linear_effects(port) if not e.motor)
     roles = {"hub"} if mechanism.has_motor(port) else set()
     roles |= {"joint"} if stiff else set()
     along = {"axis"} if mechanism.units.motion == "m" else set()
-    return (roles or {"arm"}) | along
+    return (roles or {"arm"}) | along | loaded
 
 
 def sensor_role(mechanism: Mechanism, channel: str) -> str:
