@@ -138,19 +138,10 @@ def refit_candidates(
     memory takes the place of the simpler one that it contains: two in parallel would be a third effect.
     """
     s = problem.supermodel
-    shapes = [
-        (i, dataclasses.replace(c, values=x)) for i, c in enumerate(starts) for x in (c.values, *c.others)
-    ]
-    grown = [[with_candidate(s, current, c, share) for share in AMPLITUDE_SHARES] for _, c in shapes]
-    for h in {i: row[0] for (i, _), row in zip(shapes, grown, strict=True)}.values():
-        make_ahead(problem.slopes, [h])
-    likely = problem.log_likelihoods([h for row in grown for h in row]).reshape(len(grown), -1)
-    likeliest = [row[int(np.argmax(ll))] for row, ll in zip(grown, likely, strict=True)]
-    refitted = refit(problem, _best_shapes(problem, [i for i, _ in shapes], likeliest))
-    gains = [h.log_likelihood - current.log_likelihood for h in refitted]
-    stuck = {i for i, gain in enumerate(gains) if gain < STUCK_SHARE * max(starts[i].expected_gain, 0.0)}
-    again = [(i, row[-1]) for (i, _), row in zip(shapes, grown, strict=True) if i in stuck]
-    refitted = refit_from(problem, refitted, again)
+    for c in starts:
+        make_ahead(problem.slopes, [with_candidate(s, current, c, AMPLITUDE_SHARES[0])])
+    # Each from start to end on one thread: the others need not wait for the slowest after every stage.
+    refitted = on_threads(lambda c: _refit_candidate(problem, current, c), starts)
     # An effect that contains another one is never worse: where a refit is, it starts again from that one.
     below = [
         (i, replacing(s, refitted[j], [b.location], a, AMPLITUDE_SHARES[-1]))
@@ -159,6 +150,25 @@ def refit_candidates(
         if a.location.contains(b.location) and refitted[i].log_likelihood < refitted[j].log_likelihood
     ]
     return refit_from(problem, refitted, below)
+
+
+def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: CandidateStart) -> Hypothesis:
+    """The same with one candidate, which is compared with no other."""
+    shapes = [dataclasses.replace(start, values=x) for x in (start.values, *start.others)]
+    grown = [
+        [with_candidate(problem.supermodel, current, shape, share) for share in AMPLITUDE_SHARES]
+        for shape in shapes
+    ]
+    likely = problem.log_likelihoods([h for row in grown for h in row]).reshape(len(grown), -1)
+    likeliest = [row[int(np.argmax(ll))] for row, ll in zip(grown, likely, strict=True)]
+    if len(likeliest) > 1:
+        likeliest = levenberg_marquardt(problem, likeliest, max_steps=SHAPE_CHOICE_STEPS)
+    (refitted,) = refit(problem, [max(likeliest, key=lambda h: h.log_likelihood)])
+    gain = refitted.log_likelihood - current.log_likelihood
+    if gain >= STUCK_SHARE * max(start.expected_gain, 0.0):
+        return refitted
+    again = refit(problem, [row[-1] for row in grown])
+    return max([refitted, *again], key=lambda h: h.log_likelihood)
 
 
 def refit_from(
@@ -184,25 +194,8 @@ def refit_near_predictions(
         refitted: Fitted to them.
         predictions: The same structures, fitted to predictions.
     """
-    begun = [(i, as_free_run(problem, h)) for i, h in enumerate(predictions)]
+    begun = enumerate(on_threads(lambda h: as_free_run(problem, h), predictions))
     return refit_from(problem, refitted, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
-
-
-def _best_shapes(
-    problem: LikelihoodProblem, candidates: list[int], starts: list[Hypothesis]
-) -> list[Hypothesis]:
-    """For each candidate the start with which a short fit gains most; `candidates` has that of each start."""
-    several = [k for k, i in enumerate(candidates) if candidates.count(i) > 1]
-    current = list(starts)
-    if several:
-        fitted = levenberg_marquardt(problem, [current[k] for k in several], max_steps=SHAPE_CHOICE_STEPS)
-        for k, h in zip(several, fitted, strict=True):
-            current[k] = h
-    best = {}
-    for i, h in zip(candidates, current, strict=True):
-        if i not in best or h.log_likelihood > best[i].log_likelihood:
-            best[i] = h
-    return [best[i] for i in sorted(best)]
 
 
 class Eliminated(NamedTuple):
