@@ -12,7 +12,6 @@ import rotflex_jax as rf
 from rotflex_jax.discover import likelihood as refit_module
 from rotflex_jax.discover.likelihood import (
     EXTRA_ALTERNATIONS,
-    SUBSTEP_FACTOR,
     LikelihoodProblem,
     _grid,
     choose_process_noise,
@@ -25,6 +24,7 @@ from rotflex_jax.effects import Delay, Heating, Lag
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.mechanism import Exponential
+from rotflex_jax.mechanism.finer_step import SUBSTEP_FACTOR
 from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP
 from rotflex_jax.parameters import Transform
 from rotflex_jax.runtime.xla import double_precision

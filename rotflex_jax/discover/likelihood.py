@@ -18,8 +18,9 @@ from rotflex_jax.discover.hypothesis import Hypothesis, Whitener, fit_whitener
 from rotflex_jax.discover.supermodel import SuperModel
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows, torque_scale
-from rotflex_jax.mechanism import Exponential, Solver, kalman_gains
+from rotflex_jax.mechanism import Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.mechanism.finer_step import with_finer_steps
 from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, minimise
 from rotflex_jax.runtime.persistent_jit import make_ahead
 from rotflex_jax.runtime.xla import on_threads
@@ -415,8 +416,6 @@ def _refitted(problem: LikelihoodProblem, h: Hypothesis, wide: bool, alternation
     return current
 
 
-# Substeps in the place of one. Sixteen moved no estimate further by a third of its standard deviation.
-SUBSTEP_FACTOR = 4
 # Where friction holds and lets go at other samples, the slopes predict too large a decrease: what most steps
 # do not need, a few refused ones find.
 CORRECTION_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-6, increase=30)
@@ -424,13 +423,11 @@ MAX_CORRECTION_STEPS = 10
 
 
 def finer_integration(problem: LikelihoodProblem, h: Hypothesis) -> LikelihoodProblem | None:
-    """The problem with steps `SUBSTEP_FACTOR` times as short; None where the steps are exact as they are."""
+    """The problem with shorter steps; None where `with_finer_steps` has none."""
     predictor, s = problem.predictor, problem.supermodel
-    # A linear motion is integrated exactly, and effects on voltages and readings need no integration.
-    exact = all(e.exact_step for e in s.clean(h.mean_values(s), h.locations).effects)
-    if exact or not isinstance(predictor.solver, Exponential):
+    solver = with_finer_steps(predictor.solver, s.clean(h.mean_values(s), h.locations).effects)
+    if solver is None:
         return None
-    solver = dataclasses.replace(predictor.solver, substeps=SUBSTEP_FACTOR * predictor.solver.substeps)
     finer = BatchedPredictor(s, solver, predictor.data, predictor.constants)
     return dataclasses.replace(problem, predictor=finer)
 
@@ -440,8 +437,8 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
 
         x <- x - (J'J)^-1 J'w
 
-    with the slopes `J` of the search's own step and the whitened innovations `w` of one `SUBSTEP_FACTOR`
-    times as short. Friction that builds up within a sample shifts an estimate by several of its standard
+    with the slopes `J` of the search's own step and the whitened innovations `w` of `finer_integration`.
+    Friction that builds up within a sample shifts an estimate by several of its standard
     deviations; where the motion is linear the step is exact and no parameter moves.
 
     Args:
