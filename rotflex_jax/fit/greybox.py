@@ -10,6 +10,7 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare
+from rotflex_jax.fit.discretisation_bias import coarse_step, finer_steps
 from rotflex_jax.fit.greybox_problem import LEAST_SCALE, FitAttempt, FitPoint, FitStage, GreyBoxProblem
 from rotflex_jax.fit.held_constants import with_held_constants
 from rotflex_jax.fit.inference import (
@@ -73,6 +74,7 @@ def report(
     H = curvature(parts, int(moves.sum()))
     covariance = _spread_out(sandwich(parts, H), moves)
     names, specs = m.parameter_names, m.parameter_specifications
+    finer = finer_steps(problem, end, e, scale, parts, H, covariance)
     combinations: list[Combination | None] = []
     local: dict[str, tuple[Estimate, ...]] = {}
     for i, name in enumerate(names):
@@ -90,6 +92,7 @@ def report(
             combinations.append(Combination([point.free.index(i)], stretch[:1, i]))
     free = [c for c in combinations if c is not None]
     free_names = tuple(name for name, c in zip(names, combinations, strict=True) if c is not None)
+    rows = [(name, c.rows) for name, c in zip(free_names, free, strict=True)]
     cost = float(np.sum(len(residual) * (np.log(deviation) + 0.5 * np.log(2 * np.pi) + 0.5)))
     notes = [at_end.get(name, "") for name in names]
     fitted = m.with_values(common)
@@ -107,7 +110,7 @@ def report(
         steps=end.steps,
         history=tuple(end.history),
         local=local,
-        remarks=(*at_bounds(found), *beyond_recordings(fitted, reach)),
+        remarks=(*at_bounds(found), *beyond_recordings(fitted, reach), *coarse_step(finer, rows)),
         options=options or FitOptions(),
         Ts=problem.dataset.recordings[0].Ts,
         n_init=problem.dataset.recordings[0].n_init,
@@ -161,6 +164,10 @@ def fit(
     errors that go on for many samples make that many nats. Parameters stay within the physical range that
     their effects declare, a damper as far as the damping of its port is not negative; one that is at the end
     of its range, or a size far beyond what the recordings reach, is named in `remarks`.
+
+    One step of integration per sample is too long for some dry friction. Where an estimate would move by
+    more than a standard deviation with shorter steps, and the recordings are no less likely with them,
+    `remarks` says so and what to give; the fit itself keeps the steps that were asked for.
 
     Args:
         mechanism: What to fit; its values are the start, its trusted parameters are held.

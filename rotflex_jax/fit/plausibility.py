@@ -208,7 +208,7 @@ class Remark(NamedTuple):
 
     Attributes:
         parameter: Full name.
-        kind: `BEYOND_RECORDINGS` or "at a bound".
+        kind: `BEYOND_RECORDINGS`, "at a bound", or `discretisation_bias.COARSE_STEP`.
         sentence: In words, with numbers.
     """
 

@@ -205,6 +205,35 @@ def runs_with_slopes(
     return spread(lambda rows: jax.lax.map(one, rows), layout.mesh)(rows)
 
 
+@persistent_jit(static=1, optimisation_level=1)
+def runs(
+    layout: RunLayout,
+    values: Float[Array, "R P"],
+    x0: Float[Array, "R *W m"],
+    data: StackedRecordings,
+    K: Float[Array, "R n C"],
+    window: Int[Array, "R N"] | None = None,
+) -> Float[Array, "R N C"]:
+    """Outputs alone, as `runs_with_slopes` gives them.
+
+    Args:
+        layout: Static.
+        values: Parameter values of each recording.
+        x0: First positions and speeds.
+        data: The recordings.
+        K: Gains of the predictor; zero for free runs.
+        window: Window of each sample, where runs start again at each; `x0` is then (R, W, m).
+    """
+    gates = jnp.ones(len(layout.structure.effects), values.dtype)
+
+    def several(rows: Any) -> Array:
+        values, x0, K, samples, *window = rows
+        return predicted(layout.structure, layout.solver, values, x0, gates, samples, K, *window)
+
+    rows = (values, x0, K, data) if window is None else (values, x0, K, data, window)
+    return spread(several, layout.mesh)(rows)
+
+
 def free_run_slopes(
     layout: RunLayout,
     values: Float[np.ndarray, " P"],
@@ -320,6 +349,24 @@ class LikelihoodEquations:
         return float(-(self.gradient @ step + step @ self.H @ step / 2))
 
 
+def negative_log_likelihood(
+    e: Float[np.ndarray, "R N C"], samples: int, floor: Float[np.ndarray, " C"]
+) -> tuple[float, Float[np.ndarray, " C"]]:
+    """Cost of errors, constants left out [nat], and the scale of each channel.
+
+        cost = sum over channels of  n ln s + sum e^2 / (2 s^2) - n / 2,   s = max(rms e, floor)
+
+    Args:
+        e: Errors, zero where a sample does not count.
+        samples: How many count.
+        floor: Least scale of each channel.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        costs = np.einsum("rnc,rnc->c", e, e) / 2
+        scale = channel_scale(costs, samples, floor)
+        return float(np.sum(samples * (np.log(scale) - 0.5) + costs / scale**2)), scale
+
+
 def likelihood_equations(
     coordinates: FitCoordinates,
     e: Float[np.ndarray, "R N C"],
@@ -338,11 +385,8 @@ def likelihood_equations(
         floor: Least scale of each channel.
         room: How far each coordinate may go down and up.
     """
-    samples = int(np.count_nonzero(seen))
+    cost, scale = negative_log_likelihood(e, int(np.count_nonzero(seen)), floor)
     with np.errstate(over="ignore", invalid="ignore"):
-        costs = np.einsum("rnc,rnc->c", e, e) / 2
-        scale = channel_scale(costs, samples, floor)
-        cost = float(np.sum(samples * (np.log(scale) - 0.5) + costs / scale**2))
         parts = coordinates.parts(e / scale, J / scale[:, None], seen)
         H, g = curvature(parts, coordinates.size), np.zeros(coordinates.size)
         for part in parts:

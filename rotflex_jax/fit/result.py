@@ -72,7 +72,8 @@ class Fit:
         history: Negative log-likelihood after each minimisation that led here, constants left out [nat].
         local: Parameter that each recording has for itself -> its estimates, in the order of the
             recordings; `parameters` has the mean.
-        remarks: Parameters at a bound, or far beyond what the recordings reach, each with a sentence.
+        remarks: Parameters at a bound, far beyond what the recordings reach, or moved by steps of integration
+            that are too long, each with a sentence.
         options: How it was asked for.
         Ts: Sampling period of the first recording [s], which a saved model keeps; None where none is known.
         n_init: Samples at its start that the fit looked at, or None.
