@@ -158,6 +158,11 @@ REFUSED = {
     "check {run} --signal wind=t --signal wind=alpha": "the name 'wind' for 't' and for 'alpha'",
     "check {run} --output theta --signal =alpha": "given the name ''",
     "reproduce --out {tmp}/page --signal wind": "--signal was given",
+    "reproduce --out {tmp}/page --substeps 4": "--substeps was given, but",
+    "discover {run} --substeps 0": "given 0, but each sample is integrated in one step or more; give for "
+    "instance --substeps 4",
+    "compare {run} --substeps -2": "given -2, but each sample",
+    "simulate {run} --substeps 2.5": "--substeps",
     "discover {run} --accept everything": "everything",
     "discover {run} --json {tmp}/missing/r.json": "missing",
     "discover {run} --json {tmp}": "folder",

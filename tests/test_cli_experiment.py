@@ -52,6 +52,8 @@ def test_bad_input_is_one_sentence(run, changes, match, capsys):
         (["--continue", "none.json", "run.csv"], "cannot be read"),
         (["--continue", "none.json", "run.csv", "--voltage", "5"], "leave them out"),
         (["--continue", "none.json", "run.csv", "--travel", "5"], "leave them out"),
+        (["--continue", "none.json", "run.csv", "--substeps", "4"], "leave them out"),
+        (["--continue", "none.json", "run.csv", "--intersample", "smooth"], "leave them out"),
         (["run.csv"], "belongs to --continue"),
         (["--fit", "run.csv", "--between", "coulomb@hub", "--voltage", "4"], "given --voltage in the place"),
         (["--between", "coulomb@hub", "--fit", "run.csv", "--voltage", "4"], "needs two effects"),

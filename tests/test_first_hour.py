@@ -1,6 +1,7 @@
 """What stopped or misled a newcomer with a file of an own drive: each stumble as a test, by both doors."""
 
 import dataclasses
+import json
 from typing import ClassVar
 
 import numpy as np
@@ -10,6 +11,8 @@ import scipy.io
 from test_cli import assert_one_sentence, run  # noqa: F401 - a fixture
 
 import rotflex_jax as rf
+from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.cli.recordings import Columns
 from rotflex_jax.data.datasets import demo_recording
 from rotflex_jax.data.tables import name_and_unit
 from rotflex_jax.discover.supermodel import build
@@ -289,6 +292,45 @@ def test_a_smooth_input_on_the_command_line(run, tmp_path) -> None:  # noqa: F81
     status, _, err = run("simulate", file, "--intersample", "linear")
     assert status == 2
     assert_one_sentence(err, "held or smooth")
+
+
+def test_steps_of_integration_on_the_command_line(run, tmp_path) -> None:  # noqa: F811
+    made = make_record([("coulomb", "hub")], seed=2, seconds=8.0, fs=250.0)
+    other, file = tmp_path / "other.csv", tmp_path / "run.csv"
+    table = pd.DataFrame({"t": np.arange(len(made["u"])) * made["Ts"], "voltage": made["u"]})
+    table["theta"], table["alpha"] = made["y"].T
+    table.to_csv(other, index=False)
+    table[:1200].to_csv(file, index=False)
+    options = ("--add", "coulomb@hub:level=0.03", "--save", tmp_path / "saved.csv")
+    for given, solver in (
+        ((), rf.Exponential()),
+        (("--substeps", "4"), rf.Exponential(substeps=4)),
+        (("--intersample", "smooth"), rf.Exponential(substeps=4, between="smooth")),
+        (("--intersample", "smooth", "--substeps", "6"), rf.Exponential(substeps=6, between="smooth")),
+    ):
+        assert run("simulate", file, *options, *given)[0] == 0
+        y_hat = rf.Model(rf.joints.paper() + rf.effects.Coulomb(at="hub", level=0.03), solver).simulate(
+            rf.load(file)
+        )
+        saved = pd.read_csv(tmp_path / "saved.csv")
+        assert np.allclose(saved["theta_simulated"], y_hat[:, 0], rtol=0, atol=1e-6)
+    # A fit in steps that are too long says so, and with what it advises it says so no more.
+    page = tmp_path / "page"
+    status, out, _ = run("simulate", file, "--fit", other, "--add", "coulomb@hub", "--report", page)
+    (note,) = [line for line in out.splitlines() if line.startswith("note: ")]
+    assert status == 0 and note.endswith("on the command line --substeps 4.")
+    (remark,) = json.loads((page / "simulation.json").read_text())["remarks"]
+    assert note == f"note: {remark['sentence']}." and remark["kind"] == "step of integration"
+    assert "rf.Exponential(substeps=4)" in (page / "simulation.html").read_text()
+    out = run("simulate", file, "--fit", other, "--add", "coulomb@hub", "--substeps", "4")[1]
+    assert "note: " not in out
+
+
+def test_steps_are_no_matter_of_an_input_that_is_switched_within_samples(tmp_path) -> None:
+    model = rf.Model(rf.joints.paper(), rf.Exponential(between="switched"))
+    with pytest.raises(rf.InputError, match=r"--substeps 4 was given.*leave it out"):
+        Columns(substeps=4).of(model)
+    assert Columns(substeps=1).of(model)[0] == model
 
 
 # Public data by name

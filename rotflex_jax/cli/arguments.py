@@ -96,6 +96,14 @@ Intersample = Annotated[
         help="The input between its samples: held, or smooth where it was measured behind a low-pass filter.",
     ),
 ]
+Substeps = Annotated[
+    int | None,
+    typer.Option(
+        "--substeps",
+        metavar="NUMBER",
+        help="Steps of integration in each sample; 4 where friction stops the machine within a sample.",
+    ),
+]
 Accept = Annotated[
     list[str] | None,
     typer.Option("--accept", metavar="FAULT", help="Accept a named fault of the data, such as saturated."),

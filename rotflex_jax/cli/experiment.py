@@ -29,7 +29,7 @@ FIRST_COMMAND = (
     "plot",
     "further",
 )
-FIRST_COMMAND += ("error", "max_seconds")
+FIRST_COMMAND += ("error", "max_seconds", "intersample", "substeps")
 FIGURE_ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 
 

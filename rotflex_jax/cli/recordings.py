@@ -19,6 +19,7 @@ from rotflex_jax.cli.arguments import (
     Resample,
     SamplingPeriod,
     Signals,
+    Substeps,
     TimeColumn,
     TimeUnit,
 )
@@ -51,6 +52,7 @@ class Columns:
     time_unit: TimeUnit = None
     resample: Resample = None
     intersample: Intersample = "held"
+    substeps: Substeps = None
     mechanism: Any = None  # whose channels and signals are read where the options name none
 
     def __post_init__(self) -> None:
@@ -69,9 +71,14 @@ class Columns:
                 f"--intersample was given {self.intersample!r}, but the input between its samples is held or "
                 "smooth; give one of the two."
             )
+        if self.substeps is not None and self.substeps < 1:
+            raise InputError(
+                f"--substeps was given {self.substeps}, but each sample is integrated in one step or more; "
+                "give for instance --substeps 4."
+            )
 
     def of(self, model: "Model") -> "tuple[Model, Columns]":
-        """The model with the input between its samples as it was given, and how to read its recordings."""
+        """The model with the integration that the options ask for, and how to read its recordings."""
         if self.intersample == "smooth":
             solver = model.solver
             if not hasattr(solver, "between"):
@@ -82,6 +89,14 @@ class Columns:
             substeps = max(SMOOTH_SUBSTEPS, getattr(solver, "substeps", 1))
             smooth: Any = dataclasses.replace(solver, between="smooth", substeps=substeps)  # pyright: ignore
             model = dataclasses.replace(model, solver=smooth)
+        if self.substeps is not None:
+            solver = model.solver
+            if self.substeps > 1 and getattr(solver, "between", "held") == "switched":
+                raise InputError(
+                    f"--substeps {self.substeps} was given, but the input of the model is switched within "
+                    "its samples, which needs one step in each; leave it out."
+                )
+            model = dataclasses.replace(model, solver=dataclasses.replace(solver, substeps=self.substeps))
         return model, dataclasses.replace(self, mechanism=model.mechanism)
 
     def load(self, file: Path) -> "Recording":
@@ -158,7 +173,8 @@ class Columns:
             if public_name(file) is None:
                 found.append(self.load(file))
                 continue
-            if dataclasses.replace(self, mechanism=None, intersample="held", accept=None) != Columns():
+            of_model = {"mechanism": None, "intersample": "held", "substeps": None}
+            if dataclasses.replace(self, **of_model, accept=None) != Columns():
                 raise InputError(
                     f"{file} is a public data set whose columns and units are known, but an option says how "
                     "to read it; leave that option out."

@@ -39,6 +39,10 @@ def reproduce(
         raise InputError(
             "--intersample was given, but the experiment of the paper holds its input; leave it out."
         )
+    if columns.substeps is not None:
+        raise InputError(
+            "--substeps was given, but the experiment of the paper has steps of its own; leave it out."
+        )
     if columns.signals:
         raise InputError(
             "--signal was given, but the experiment of the paper has its input alone; leave it out."

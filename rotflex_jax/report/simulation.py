@@ -106,6 +106,7 @@ def _plain(simulation: Simulation) -> dict[str, Any]:
         "source": simulation.recording.source,
         "errors": {channel: json_numbers(row) for channel, row in simulation.errors().items()},
         "parameters": {e.name: e.to_dict() for e in fit.parameters} if fit else {},
+        "remarks": [remark.to_dict() for remark in fit.remarks] if fit else [],
     }
 
 
@@ -137,6 +138,7 @@ def _content(simulation: Simulation) -> dict[str, Any]:
         "rows": rows,
         "fitted": f"fitted before: {fit.ending}" if fit else "taken as given",
         "estimates": estimates,
+        "remarks": [f"{remark.sentence}." for remark in fit.remarks] if fit else [],
         "runs": [p.on_page for p in _run_pictures(simulation)],
         "tests": simulation.residuals.sentences() if simulation.residuals else [],
         "test_pictures": [p.on_page for p in _test_pictures(simulation)],
