@@ -96,8 +96,7 @@ def rows(split: Split, parts: list[str], rollouts: int, say: Callable[[str], Non
         jobs[ROBUST] = lambda: fitted(servo(FRICTION["motor friction, delay"]), split, ABSOLUTE)[1]
         jobs[YIELDING] = lambda: fitted(yielding(), split)[1]
     if "search" in parts:
-        jobs["search"] = lambda: searched(split, own=False, say=say)
-        jobs["search, own effect"] = lambda: searched(split, own=True, say=say)
+        jobs["search"] = lambda: searched(split, say)
     return jobs
 
 

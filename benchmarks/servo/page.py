@@ -7,8 +7,6 @@ from typing import Any
 
 from rotflex_jax.parameters import HALF_WIDTH_95
 
-SEARCHES = {"search": "search of the catalogue", "search, own effect": "search, `weight_friction` added"}
-
 
 def mean(row: dict[str, Any], part: str, kind: str) -> float:
     """Error of a part of the recordings, averaged over them [deg]."""
@@ -36,6 +34,11 @@ def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
     return out
 
 
+def _label(name: str) -> str:
+    """A model as the page has it."""
+    return "what the search finds" if name == "search" else name
+
+
 def page(found: dict[str, Any]) -> str:
     """The page."""
     splits = found["splits"]
@@ -58,7 +61,7 @@ def page(found: dict[str, Any]) -> str:
             known = [v for v in values if v is not None]
             cells = ["" if v is None else f"{v:.2f}" for v in values]
             cells.append(f"{statistics.mean(known):.2f}" if len(known) == len(values) else "")
-            lines.append(f"| {SEARCHES.get(name, name)} | " + " | ".join(cells) + " |")
+            lines.append(f"| {_label(name)} | " + " | ".join(cells) + " |")
         lines.append("")
     lines += ["## What it takes", "", "| model | free runs of a recording | fit [s] | search [s] |"]
     lines += ["|---|---:|---:|---:|"]
@@ -66,9 +69,7 @@ def page(found: dict[str, Any]) -> str:
         rows = [case[name] for case in splits.values() if name in case]
         middle = lambda key, rows=rows: statistics.median(r.get(key, 0.0) for r in rows)  # noqa: E731
         search = f"{middle('search seconds'):.0f}" if "search seconds" in rows[0] else ""
-        lines.append(
-            f"| {SEARCHES.get(name, name)} | {middle('rollouts'):.0f} | {middle('seconds'):.1f} | {search} |"
-        )
+        lines.append(f"| {_label(name)} | {middle('rollouts'):.0f} | {middle('seconds'):.1f} | {search} |")
     lines += [
         "",
         "Medians over what was left out, on a machine with other work. A free run of the grey box carries "
@@ -77,11 +78,9 @@ def page(found: dict[str, Any]) -> str:
     ]
     lines += ["## What the search found", ""]
     for split, case in splits.items():
-        for name, title in SEARCHES.items():
-            if name in case:
-                row = case[name]
-                effects = ", ".join(row["effects"]) or "nothing"
-                lines.append(f"- {split} left out, {title}: {effects} (`{row['verdict']}`)")
+        if row := case.get("search"):
+            effects = ", ".join(row["effects"]) or "nothing"
+            lines.append(f"- {split} left out: {effects} (`{row['verdict']}`)")
     if "direction" in found:
         d = found["direction"]
         fits = ", ".join(f"{n} = {v:.3g} ± {HALF_WIDTH_95 * s:.2g}" for n, (v, s) in d["fit"].items())
