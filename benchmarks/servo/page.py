@@ -23,8 +23,9 @@ def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
         rows = {left_out: case[name] for left_out, case in splits.items() if name in case}
         ways = {"": "", "motion ": "motion", "gain ": "gain"}
         for label, way in ways.items():
-            if all(left_out in rows for left_out in splits if left_out.startswith(way)):
-                listed = [r for left_out, r in rows.items() if left_out.startswith(way)]
+            wanted = [left_out for left_out in splits if left_out.startswith(way)]
+            if wanted and all(left_out in rows for left_out in wanted):
+                listed = [rows[left_out] for left_out in wanted]
                 for kind in ("mean", "rms"):
                     value = statistics.mean(mean(r, "test", kind) for r in listed)
                     out.setdefault(name, {})[label + kind] = value

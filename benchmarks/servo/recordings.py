@@ -26,6 +26,10 @@ def motion(recording: rf.Recording) -> str:
     return next(name for name in MOTIONS if f" {name}," in recording.source)
 
 
+# Of what is learnt from, a search fits this share of every recording and compares its models on the rest.
+SHARE = 0.7
+
+
 @dataclasses.dataclass(frozen=True)
 class Split:
     """What is learnt from and what is left out.
@@ -33,35 +37,33 @@ class Split:
     Attributes:
         name: What is left out.
         train: Learnt from.
-        validation: Those of them on which a search compares its models.
         test: Left out.
     """
 
     name: str
     train: tuple[rf.Recording, ...]
-    validation: tuple[rf.Recording, ...]
     test: tuple[rf.Recording, ...]
 
     @property
     def search(self) -> tuple[rf.Recording, ...]:
-        """What a search learns from."""
-        return tuple(r for r in self.train if r not in self.validation)
+        """What a search fits."""
+        return tuple(r.split(SHARE)[0] for r in self.train)
+
+    @property
+    def validation(self) -> tuple[rf.Recording, ...]:
+        """What a search compares its models on."""
+        return tuple(r.split(SHARE)[1] for r in self.train)
 
 
 def splits(recordings: Sequence[rf.Recording]) -> dict[str, Split]:
-    """Every motion and every gain left out once; within the rest, a search validates on the next one."""
+    """Every motion and every gain left out once."""
 
-    def one(name: str, of: Callable[[rf.Recording], object], left_out: object, judged: object) -> Split:
+    def one(name: str, of: Callable[[rf.Recording], object], left_out: object) -> Split:
         train = tuple(r for r in recordings if of(r) != left_out)
-        return Split(
-            name=name,
-            train=train,
-            validation=tuple(r for r in train if of(r) == judged),
-            test=tuple(r for r in recordings if of(r) == left_out),
-        )
+        return Split(name, train, tuple(r for r in recordings if of(r) == left_out))
 
-    listed = [one(f"motion {m}", motion, m, MOTIONS[k - 1]) for k, m in enumerate(MOTIONS)]
-    listed += [one(f"gain {g}", gain, g, GAINS[k - 2]) for k, g in enumerate(GAINS)]
+    listed = [one(f"motion {m}", motion, m) for m in MOTIONS]
+    listed += [one(f"gain {g}", gain, g) for g in GAINS]
     return {s.name: s for s in listed}
 
 
