@@ -315,6 +315,8 @@ MEASURED_DIRECTIONS = {
     "rigid_arm: gains 1 and 3, decided on gain 6, to gain 8": "rigid arm, gains 1 and 3 to gain 8",
     "rigid_arm: first 70 % of all to the rest": "rigid arm, first 70 % of all to the rest",
     "flexible_arm: first half to second half": "flexible arm, first half to second half",
+    "bam_xl330: gains 100 to 400 to gain 800": "XL-330, gains 100 to 400 to gain 800",
+    "bam_xl330: gain 800 to gains 100 to 400": "XL-330, gain 800 to gains 100 to 400",
 }
 """Directions of the table of the model to use, in its words."""
 _OF_STAGES = {
