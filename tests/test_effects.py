@@ -52,6 +52,7 @@ from rotflex_jax.effects import (
     SensorGain,
     Spring,
     Stribeck,
+    TorqueSaturation,
     Viscous,
     VoltageOffset,
     register,
@@ -87,6 +88,7 @@ PASSIVE = {
     "bouc_wen",
     "second_mode",
     "heating",
+    "torque_saturation",
 }
 CONSERVATIVE = {
     "inertia",
@@ -297,7 +299,7 @@ def test_gives_no_energy(cls):
     numbers = [jnp.asarray(n) for n in effect.values.values()]
     rng = np.random.default_rng(0)
     for x, w, v, z in rng.normal(size=(50, 4)) * [1.0, 3.0, 5.0, 1.0]:
-        if isinstance(effect, (LuGre, BoucWen, Heating, SecondMode)):
+        if isinstance(effect, (LuGre, BoucWen, Heating, TorqueSaturation, SecondMode)):
             assert taken(effect, x, w, v, z) >= -1e-15
             continue
         said = np.array(law(effect, numbers, *scalars(x, w, v, np.tanh(z))))
@@ -335,6 +337,10 @@ def taken(effect: Effect, x: float, w: float, v: float, z: float) -> float:
         loss = float(effect.force(*scalars(abs(z), x, w, v)))
         assert abs(loss) < abs(v)
         assert float(effect.flow(*scalars(0.0, x, w, v))) >= 0  # never colder than cold
+        return -loss * v
+    if isinstance(effect, TorqueSaturation):  # `v` is the torque of the linear motor
+        loss = float(effect.force(*scalars(x, w, v)))
+        assert abs(loss) < abs(v)
         return -loss * v
     if isinstance(effect, LuGre):  # passive as long as damping |speed| <= 4 level g
         z = (1 + effect.rise) * np.tanh(z)
@@ -514,7 +520,7 @@ def test_candidates_cover_the_first_family():
     assert {("voltage_drift", "input"), ("periodic_disturbance", "input")} <= pairs
     # What ties with a simpler effect on most recordings is tried on request only.
     assert not {"load_friction", "amplifier_saturation", "elastic_backlash"} & {n for n, _ in pairs}
-    assert "gear_friction" not in {n for n, _ in pairs}  # no weight at the hub
+    assert not {"gear_friction", "torque_saturation"} & {n for n, _ in pairs}  # no weight at the hub
     assert ("heating", "arm") not in pairs and ("heating", "joint") not in pairs  # no motor there
     assert ("sensor_bias", "alpha") in pairs and ("sensor_bias", "theta") not in pairs
     assert not {"inertia", "spring", "motor"} & {n for n, _ in pairs}

@@ -46,6 +46,7 @@ from rotflex_jax.effects.motor import (
     PidServo,
     PositionLoop,
     PositionServo,
+    TorqueSaturation,
 )
 from rotflex_jax.effects.sensors import (
     ChannelDelay,
@@ -112,6 +113,7 @@ __all__ = [
     "LuGre",
     "BoucWen",
     "Heating",
+    "TorqueSaturation",
     # actuation
     "DeadZone",
     "Saturation",

@@ -397,10 +397,17 @@ class Force(Effect):
     kind_label: ClassVar[str] = "force"
     kind_meaning: ClassVar[str] = "A torque that depends on position, speed or voltage at this moment."
     torque_at_port: ClassVar[bool] = True
+    # The last argument of `force`: the motor's voltage [V], or the torque [N m] of the motors at its port.
+    driven_by: ClassVar[Drive] = "voltage"
 
     @abc.abstractmethod
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
         """Torque [N m] on the port; of what a signal drives, its value stands in the place of the voltage."""
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """A motor where its torque is asked for."""
+        return ("motor",) if cls.driven_by == "motor" else ()
 
 
 class DryFriction(Effect):

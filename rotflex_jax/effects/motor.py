@@ -1,8 +1,13 @@
-"""The motor: driven by voltage or by current, its heating, the position loop of a servo, its readings."""
+"""The motor: driven by voltage or by current, its heating and saturation, the position loop of a servo.
+
+The meters that show a motor's current and duty are here as well.
+"""
 
 import dataclasses
 import math
 from typing import ClassVar
+
+import jax.numpy as jnp
 
 from rotflex_jax.effects.base import (
     Drive,
@@ -209,6 +214,54 @@ class Heating(Memory):
         return (
             f"the motor at the {self.at} warms up: its resistance rises by {self.rate:.3g} per second and "
             f"(N m)^2 of torque, and cools with a time constant of {self.time:.3g} s"
+        )
+
+
+@register
+@dataclasses.dataclass(frozen=True)
+class TorqueSaturation(Force):
+    """The torque of a motor falls behind its current: `m` becomes `m / (1 + loss |m|)`.
+
+        tau = -loss |m| / (1 + loss |m|) m
+
+    `m` is the torque of the linear motor at this port. The torque starts in proportion to the current and
+    stays below `1 / loss`: the iron of a small motor saturates, and its armature weakens the field. Not for
+    a motor that is driven at one level of torque, where the loss is equivalent to a lower torque constant.
+
+    Args:
+        at: Port of the motor.
+        loss: Relative loss of torque per torque of the linear motor [1/(N m)].
+
+    Source: A. E. Fitzgerald, C. Kingsley and S. D. Umans, Electric Machinery, 6th ed., 2003, section 7.3, on
+        the effect of the armature's field; the simplest law of one parameter with a limit.
+    """
+
+    name: ClassVar[str] = "torque_saturation"
+    title: ClassVar[str] = "saturating torque of the motor"
+    equation: ClassVar[str] = "tau = -loss * |m| / (1 + loss * |m|) * m, m torque of the linear motor"
+    ports: ClassVar[tuple[str, ...]] = ("hub",)
+    amplitudes: ClassVar[tuple[str, ...]] = ("loss",)
+    driven_by: ClassVar[Drive] = "motor"
+    # A motor that only accelerates an inertia is rarely at a large torque for long.
+    searched: ClassVar[tuple[str, ...]] = ("loaded",)
+
+    loss: float = parameter(0.5, unit="1/(N m)", lower=0.0, meaning="relative loss of torque per torque")
+
+    def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
+        """Torque [N m] on the port; the last argument is the torque of the linear motor [N m]."""
+        share = self.loss * jnp.abs(jnp.asarray(voltage))
+        return -share / (1 + share) * voltage
+
+    @classmethod
+    def probes(cls, scale: Scale) -> list[list[Probe]]:
+        """One direction."""
+        return [[{"loss": 0.1 / scale.torque}]]
+
+    def sentence(self) -> str:
+        """In words."""
+        return (
+            f"the torque of the motor at the {self.at} falls behind its current: 1 N m of a linear motor "
+            f"becomes {1 / (1 + self.loss):.3g} N m"
         )
 
 

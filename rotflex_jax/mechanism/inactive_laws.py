@@ -166,7 +166,7 @@ def adds_to_step(effect: Effect, structure: Mechanism, solver: Solver) -> bool:
         rigid = not effects_of(structure, Gear)
         return rigid and solver.order == 2 and effect.driven_by == "voltage" and not _has_load(structure)
     if isinstance(effect, Force):
-        return not effect.signal
+        return not effect.signal and effect.driven_by == "voltage"
     return isinstance(effect, DryFriction) and not effect.loaded
 
 

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
-from rotflex_jax.effects.base import Actuation, Gear, Memory
+from rotflex_jax.effects.base import Actuation, Force, Gear, Memory
 from rotflex_jax.mechanism.assembly import effects_of, motor_inputs, stamped
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.repetition import without_repetition
@@ -278,7 +278,8 @@ def accumulate_outputs(
 
 def _takes_repeated_constants(structure: Mechanism, solver: Solver) -> bool:
     """Whether the step accepts constants that are repeated along the directions."""
-    by_motor = any(e.driven_by != "voltage" for _, e in effects_of(structure, Memory))
+    laws = (*effects_of(structure, Force), *effects_of(structure, Memory))
+    by_motor = any(e.driven_by != "voltage" for _, e in laws)
     elastic = any(gear.teeth() is not None for _, gear in effects_of(structure, Gear))
     return isinstance(solver, Exponential) and not elastic and not by_motor
 

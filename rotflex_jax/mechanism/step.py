@@ -62,11 +62,6 @@ def voltage_of(mechanism: Mechanism, v: Float[Array, "*cS"]) -> Float[Array, "*S
     return v[0] if mechanism.takes_signals else v
 
 
-def driver_of(mechanism: Mechanism, e: Force, v: Float[Array, "*cS"]) -> Float[Array, "*S"]:
-    """What a force receives last: its signal, or the voltage."""
-    return v[1 + mechanism.signals.index(e.signal)] if e.signal else voltage_of(mechanism, v)
-
-
 def motor_torque(
     mechanism: Mechanism,
     at: str,
@@ -278,26 +273,30 @@ def motor_correction(
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Torque [N m] of the motors at a port beyond their linear part: less for a limit or for heat."""
+    """Torque [N m] of the motors at a port beyond their linear part: less for a limit, saturation or heat."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = motor_beyond_linear(mechanism, at, x, z, v, gates)
+    for i, e in effects_of(mechanism, Force):
+        if e.driven_by == "motor" and e.at == at:
+            k, drive = layout.torque_ports.index(at), drive_of(mechanism, e, x, z, v, gates)
+            total = total + gates[i] * _force(e, position[k], speed[k], drive)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         if e.driven_by == "motor" and e.at == at:
-            k, drive = layout.torque_ports.index(at), memory_drive(mechanism, e, x, z, v, gates)
+            k, drive = layout.torque_ports.index(at), drive_of(mechanism, e, x, z, v, gates)
             total = total + gates[i] * _force(e, z[m], position[k], speed[k], drive)
     return total
 
 
-def memory_drive(
+def drive_of(
     mechanism: Mechanism,
-    e: Memory,
+    e: Force | Memory,
     x: Float[Array, "m *S"],
     z: Float[Array, "z *S"],
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Last argument of `flow` and `force` of a memory, as its `driven_by` says."""
+    """Last argument of `flow` and `force`, as `driven_by` of the effect says."""
     if e.driven_by == "voltage":
         return v
     if e.driven_by == "duty":
@@ -339,12 +338,15 @@ def torques(
         jnp.unstack(z),
         [jnp.zeros(x.shape[1:], x.dtype)] * len(position),
     )
+    voltage = voltage_of(mechanism, v)
     for i, e in effects_of(mechanism, Force):
         k = layout.torque_ports.index(e.port)
-        total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], driver_of(mechanism, e, v))
+        signal = v[1 + mechanism.signals.index(e.signal)] if e.signal else None
+        drive = drive_of(mechanism, e, x, z, voltage, gates) if signal is None else signal
+        total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], drive)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = memory_drive(mechanism, e, x, z, voltage_of(mechanism, v), gates)
+        drive = drive_of(mechanism, e, x, z, voltage, gates)
         total[k] = total[k] + gate[i] * _force(e, memory[m], position[k], speed[k], drive)
     return computed_once(jnp.stack(total))
 
@@ -367,7 +369,7 @@ def memory_rates(
     memory, rates, flow = jnp.unstack(z), [], lambda e, *signals: e.flow(*signals)
     for m, (_, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
-        drive = memory_drive(mechanism, e, x, others, v, gates)
+        drive = drive_of(mechanism, e, x, others, v, gates)
         rates.append(jnp.asarray(evaluate_effect(e, flow, memory[m], position[k], speed[k], drive)))
     return jnp.stack(rates)
 
