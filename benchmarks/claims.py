@@ -317,6 +317,7 @@ MEASURED_DIRECTIONS = {
     "flexible_arm: first half to second half": "flexible arm, first half to second half",
     "bam_xl330: gains 100 to 400 to gain 800": "XL-330, gains 100 to 400 to gain 800",
     "bam_xl330: gain 800 to gains 100 to 400": "XL-330, gain 800 to gains 100 to 400",
+    "so101: random motion to steps": "SO-101, elbow, random motion to steps",
 }
 """Directions of the table of the model to use, in its words."""
 _OF_STAGES = {

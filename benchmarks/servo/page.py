@@ -77,11 +77,12 @@ def page(found: dict[str, Any]) -> str:
         "the derivatives along.",
         "",
     ]
-    lines += ["## What the search found", ""]
-    for split, case in splits.items():
-        if row := case.get("search"):
-            effects = ", ".join(row["effects"]) or "nothing"
-            lines.append(f"- {split} left out: {effects} (`{row['verdict']}`)")
+    searched = {split: case["search"] for split, case in splits.items() if "search" in case}
+    if searched:
+        lines += ["## What the search found", ""]
+    for split, row in searched.items():
+        effects = ", ".join(row["effects"]) or "nothing"
+        lines.append(f"- {split} left out: {effects} (`{row['verdict']}`)")
     if "direction" in found:
         d = found["direction"]
         fits = ", ".join(f"{n} = {v:.3g} ± {HALF_WIDTH_95 * s:.2g}" for n, (v, s) in d["fit"].items())
