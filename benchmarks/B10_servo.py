@@ -7,8 +7,10 @@
 
 An XL-330 lifts a pendulum at four gains in three motions. Every motion and every gain is left out once: M1
 to M6 are fitted to the rest by evolution, as their authors do (`servo/friction_models.py` has the laws), the
-grey box by `rf.fit` with the frictions of the catalogue and with what `rf.discover` finds, and one of them by
-evolution over the same numbers. Compared are free runs of what was left out, and of joints of an SO-101.
+grey box by `rf.fit` with the frictions of the catalogue and, with `--parts search`, with what `rf.discover`
+finds, one of them by evolution over the same numbers. Compared are free runs of what was left out, and of
+joints of an SO-101.
+
 Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by `ROTFLEX_DATA`. What
 `results/B10.json` has already is kept unless `--fresh` is given; writes it, `results/B10.md` and, where the
 results are the kept ones, `docs/figures/servo.png`.

@@ -258,6 +258,11 @@ def saturating(q, w, z, m):
     return at_hub(m / (1 + 4.0 * abs(m)) - m), []
 
 
+def hot_and_saturating(q, w, z, m):
+    rate, lost = heating(z[0], m, **HEAT)
+    return at_hub((m + lost) / (1 + 4.0 * abs(m + lost)) - m), [rate]
+
+
 def friction(q, w, z, m):
     hub, tau = lugre(z[0], w[0], **LUGRE)
     return at_hub(tau) - at_joint(0.02 * z[1]), [hub, bouc_wen(z[1], w[1], 0.02, 0.5)]
@@ -297,6 +302,9 @@ CASES = {
     "heating": Case((_HEATING,), heated, 1),
     "heating with a current": Case((_HEATING,), heated, 1, inductance=5e-3),
     "saturating motor": Case((fx.TorqueSaturation("hub", loss=4.0),), saturating),
+    "heating and saturating motor": Case(
+        (_HEATING, fx.TorqueSaturation("hub", loss=4.0)), hot_and_saturating, 1
+    ),
     "lugre and bouc_wen": Case(_FRICTION, friction, 2),
     "cogging": Case((_RIPPLE,), ripple),
     "joint_play": Case((_LOOSE,), loose),

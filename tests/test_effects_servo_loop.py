@@ -221,6 +221,20 @@ def test_presets_have_what_the_log_has():
         _ = rf.joints.two_dof_link() + fx.CurrentMeter("hub")
 
 
+def test_a_meter_shows_the_current_whose_torque_saturates():
+    """A motor against a stop of Coulomb friction, no back-EMF: the current is voltage over resistance."""
+    motor = fx.Motor("hub", torque_constant=0.4, back_emf=0.0, gear_ratio=1.0, resistance=3.4)
+    stopped = rf.Mechanism(
+        ("q",),
+        {"hub": (1.0,)},
+        [fx.Inertia("hub", inertia=0.01), motor, fx.Coulomb("hub", level=9.0), fx.CurrentMeter("hub")],
+        outputs={"q": "hub", "current": ("hub", "current")},
+    )
+    for machine in (stopped, stopped + fx.TorqueSaturation("hub", loss=2.0)):
+        y = rf.simulate(machine, np.full(400, 6.0), 0.005)
+        assert y[-1, 1] == pytest.approx(6.0 / 3.4, rel=1e-3)
+
+
 def test_the_current_of_a_motor_on_a_voltage_is_shown_too():
     """Held at rest by friction: current = voltage / resistance."""
     joint = rf.joints.paper() + fx.Coulomb("hub", level=1.0) + fx.CurrentMeter("hub", time=1e-3)

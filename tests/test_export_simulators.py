@@ -20,6 +20,7 @@ from rotflex_jax.effects import (
     CubicSpring,
     CurrentDrive,
     Delay,
+    GearFriction,
     Gravity,
     Inertia,
     JointPlay,
@@ -242,6 +243,19 @@ def test_urdf_names_what_it_lacks():
 # -- BAM -----------------------------------------------------------------------------------------------
 
 SERVO = xl330_pendulum().with_values({"hub.position_servo.period": 0.0})
+
+
+def test_bam_takes_the_friction_of_a_gear_as_that_of_its_load():
+    """The same law under both names; which torque it follows in BAM is said."""
+    one, other = (
+        to_bam(SERVO + effect, 0.005, u=0.3 * U[::2])
+        for effect in (
+            GearFriction("hub", level=0.03, share=0.27),
+            LoadFriction("hub", level=0.03, driving=0.27, tied=True, of="motor"),
+        )
+    )
+    assert json.loads(one.content) == json.loads(other.content)
+    assert "not of the motor alone" in str(one.certificate)
 
 
 @pytest.mark.parametrize(

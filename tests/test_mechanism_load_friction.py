@@ -11,6 +11,7 @@ import rotflex_jax.effects as fx
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper, single_inertia, xl330_pendulum
 from rotflex_jax.mechanism import Exponential, SmoothRK4, free_run, simulate, simulate_states
+from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.mechanism.step import load_rows, transmitted_torques
 from rotflex_jax.runtime.xla import double_precision
 
@@ -224,6 +225,14 @@ def test_it_is_the_load_friction_of_the_motor_with_one_share():
     one = simulate(given + fx.GearFriction("hub", level=FC, share=DRIVING), u, Ts)
     tied = fx.LoadFriction("hub", level=FC, driving=DRIVING, tied=True, of="motor")
     np.testing.assert_allclose(one, simulate(given + tied, u, Ts), atol=1e-12)
+
+
+def test_two_frictions_of_different_torques_at_one_port_are_refused():
+    with pytest.raises(InputError, match="depend on different torques through the gear"):
+        _ = paper() + FRICTION + fx.GearFriction("hub")
+    servo = xl330_pendulum()
+    assert (fx.GearFriction, "hub") in search_places(servo)
+    assert fx.GearFriction not in dict(search_places(servo + FRICTION))
 
 
 def test_it_needs_a_motor_and_an_inertia():

@@ -572,6 +572,7 @@ LADEN = {
         fx.BoucWen("joint", level=0.02, width=0.02, beta=0.4),
         fx.Heating("hub", rate=50.0, time=0.3),
     ],
+    "loaded motor": [fx.GearFriction("hub", 0.01, 0.2), fx.TorqueSaturation("hub", 0.5)],
 }
 # Each program runs a few times, so time spent on making it fast is lost.
 ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}

@@ -65,11 +65,21 @@ def _friction(ax: Axes, effect: Effect) -> None:
 
 def _load_friction(ax: Axes, effect: Effect) -> None:
     """Level against motion each way, over the torque through the gear."""
-    assert isinstance(effect, fx.LoadFriction)
+    assert isinstance(effect, fx.LoadFriction | fx.GearFriction)
     load = np.linspace(-0.5, 0.5, 201)
     for way, look, words in ((1.0, LINE, "forwards"), (-1.0, OTHER, "backwards")):
         ax.plot(load, np.asarray(effect.limit(0.0, 0.0, way, load)), **look, label=f"turning {words}")
-    _labels(ax, "torque through the gear [N m]", "level of friction [N m]")
+    whose = "torque of the motor" if isinstance(effect, fx.GearFriction) else "torque through the gear"
+    _labels(ax, f"{whose} [N m]", "level of friction [N m]")
+
+
+def _saturation(ax: Axes, effect: Effect) -> None:
+    """What is left of the torque, over what the current would give in proportion."""
+    assert isinstance(effect, fx.TorqueSaturation)
+    current = np.linspace(-3.0, 3.0, 201)
+    ax.plot(current, current, **OTHER, label="in proportion")
+    ax.plot(current, current + np.asarray(effect.force(0.0, 0.0, current)), **LINE, label="given")
+    _labels(ax, "torque in proportion to the current [N m]", "torque of the motor [N m]")
 
 
 def _force(ax: Axes, effect: Effect) -> None:
@@ -308,6 +318,8 @@ DRAWINGS: dict[type, Draw] = {
     fx.Backlash: _gear,
     fx.ElasticBacklash: _elastic_gear,
     fx.LoadFriction: _load_friction,
+    fx.GearFriction: _load_friction,
+    fx.TorqueSaturation: _saturation,
     fx.EccentricEncoder: _runout,
     fx.CrossTalk: _cross_talk,
     fx.ChannelDelay: _late,

@@ -50,7 +50,7 @@ class Machine:
         factor: errors in that unit per unit of the channel.
         solver: integration rule, where it is not the usual one.
         with_signals: whether its recordings have signals beside the input.
-        released: trusted parameters of the mechanism that its recordings do not know.
+        released: trusted parameters of the mechanism whose values are not known for its recordings.
     """
 
     dataset: str

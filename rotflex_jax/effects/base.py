@@ -397,8 +397,17 @@ class Force(Effect):
     kind_label: ClassVar[str] = "force"
     kind_meaning: ClassVar[str] = "A torque that depends on position, speed or voltage at this moment."
     torque_at_port: ClassVar[bool] = True
-    # The last argument of `force`: the motor's voltage [V], or the torque [N m] of the motors at its port.
+    # The last argument of `force`: the motor's "voltage" [V], or of the "motor" the torque [N m] that its
+    # current gives at the port.
     driven_by: ClassVar[Drive] = "voltage"
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        super().__init_subclass__(**given)
+        if cls.driven_by not in ("voltage", "motor") or (cls.driven_by, cls.acts_on) == ("motor", "signal"):
+            raise InputError(
+                f"The force {cls.__name__} was defined as driven by {cls.driven_by!r}, but a force is driven "
+                "by the 'voltage', by the torque of the 'motor' at its port or by a signal; choose one."
+            )
 
     @abc.abstractmethod
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:

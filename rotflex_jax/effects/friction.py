@@ -295,7 +295,9 @@ class GearFriction(DryFriction):
     loaded: ClassVar[bool] = True
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque without load")
-    share: float = parameter(0.2, unit="", lower=0.0, meaning="share of the motor's torque that is lost")
+    share: float = parameter(
+        0.2, unit="", lower=0.0, physical=(0.0, 1.0), meaning="share of the motor's torque that is lost"
+    )
 
     @property
     def rest_share(self) -> float:

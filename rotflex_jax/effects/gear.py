@@ -20,8 +20,8 @@ class Backlash(Gear):
     acts on it, all other effects at the port on the rest. What the motor's own shaft meets stands at the port
     `rotor`, which a mechanism with this gear has besides its own. The impact of the teeth is inelastic.
     Not for a spring that is loose about its rest position, which is `joint_play`, nor for play that is
-    never crossed, which shifts the angle only. Beside `heating` the lost torque acts on the port even
-    while the rotor is in flight.
+    never crossed, which shifts the angle only. Beside `heating` and `torque_saturation` the lost torque acts
+    on the port even while the rotor is in flight.
 
     Args:
         at: Port of the motor.

@@ -220,11 +220,11 @@ class Heating(Memory):
 @register
 @dataclasses.dataclass(frozen=True)
 class TorqueSaturation(Force):
-    """The torque of a motor falls behind its current: `m` becomes `m / (1 + loss |m|)`.
+    """The torque of a motor grows less than in proportion to its current: `m` becomes `m / (1 + loss |m|)`.
 
         tau = -loss |m| / (1 + loss |m|) m
 
-    `m` is the torque of the linear motor at this port. The torque starts in proportion to the current and
+    `m` is what the current of the motor would give at this port in proportion. The torque starts there and
     stays below `1 / loss`: the iron of a small motor saturates, and its armature weakens the field. Not for
     a motor that is driven at one level of torque, where the loss is equivalent to a lower torque constant.
 
@@ -238,7 +238,9 @@ class TorqueSaturation(Force):
 
     name: ClassVar[str] = "torque_saturation"
     title: ClassVar[str] = "saturating torque of the motor"
-    equation: ClassVar[str] = "tau = -loss * |m| / (1 + loss * |m|) * m, m torque of the linear motor"
+    equation: ClassVar[str] = (
+        "tau = -loss * |m| / (1 + loss * |m|) * m, m torque of the motor in proportion to its current"
+    )
     ports: ClassVar[tuple[str, ...]] = ("hub",)
     amplitudes: ClassVar[tuple[str, ...]] = ("loss",)
     driven_by: ClassVar[Drive] = "motor"
@@ -248,7 +250,7 @@ class TorqueSaturation(Force):
     loss: float = parameter(0.5, unit="1/(N m)", lower=0.0, meaning="relative loss of torque per torque")
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
-        """Torque [N m] on the port; the last argument is the torque of the linear motor [N m]."""
+        """Torque [N m] on the port; the last argument is the torque in proportion to the current [N m]."""
         share = self.loss * jnp.abs(jnp.asarray(voltage))
         return -share / (1 + share) * voltage
 
@@ -259,9 +261,10 @@ class TorqueSaturation(Force):
 
     def sentence(self) -> str:
         """In words."""
+        half = 1 / max(self.loss, 1e-12)
         return (
-            f"the torque of the motor at the {self.at} falls behind its current: 1 N m of a linear motor "
-            f"becomes {1 / (1 + self.loss):.3g} N m"
+            f"the torque of the motor at the {self.at} grows less than in proportion to its current: half of "
+            f"it is lost where that would give {half:.3g} N m"
         )
 
 

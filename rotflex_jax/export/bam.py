@@ -12,6 +12,7 @@ from rotflex_jax.checks import number, shown
 from rotflex_jax.effects import (
     Coulomb,
     Delay,
+    GearFriction,
     Gravity,
     Inertia,
     LoadFriction,
@@ -141,6 +142,11 @@ def _parameters(
                 approximated.append(f"{label(effect)}: the mean of both shares")
             if effect.of == "motor":
                 approximated.append(f"{label(effect)}: of the sum of both sides, not of the motor alone")
+        elif isinstance(effect, GearFriction) and not loads:
+            loads = True
+            content["friction_base"] += effect.level
+            content["load_friction_base"] = effect.share / 2
+            approximated.append(f"{label(effect)}: of the sum of both sides, not of the motor alone")
         elif isinstance(effect, Delay) and "command_delay" not in content:
             content["command_delay"] = effect.time
         elif not isinstance(effect, PositionLoop | Inertia | Gravity):

@@ -194,8 +194,10 @@ class Chain:
 
     def _add_level(self, mechanism: Mechanism, effect: Effect, place: Place, level: float) -> None:
         place.friction += level
+        loaded = isinstance(effect, DryFriction) and effect.loaded
+        which = "without load; what grows with the torque is left out" if loaded else "at speed"
         self.approximated.append(
-            f"{label(effect)}: as {Coulomb.title} of {level:.4g} {mechanism.units.effort}, its level at speed"
+            f"{label(effect)}: as {Coulomb.title} of {level:.4g} {mechanism.units.effort}, its level {which}"
         )
 
     def _add_actuation(self, mechanism: Mechanism, effect: Actuation) -> None:

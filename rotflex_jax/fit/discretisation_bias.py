@@ -1,7 +1,8 @@
 """How far the step of integration shifts the estimates of a fit, and what is said of it.
 
 Dry friction that stops and lets go within a sample is integrated coarsely by one step per sample. One run in
-shorter steps from the optimum shows what that does to the estimates, to first order:
+shorter steps from the optimum shows what that does to the estimates, to first order, and a second run what
+it does to the cost where one of them moves far:
 
     shift = (J'J)^-1 J'(e - e_fine)
 
@@ -124,9 +125,9 @@ def coarse_step(
     sentence = (
         f"{name} would move by {plain_number(largest, 2)} of its standard deviations, the most of all "
         f"parameters, and the cost would fall by {found.fall:.0f} nats, if each sample were integrated in "
-        f"{number} steps instead of {number // SUBSTEP_FACTOR}: the steps are too long for these intervals; "
-        f"give rf.Model(joint, rf.Exponential({given})) in the place of the joint, on the command line "
-        f"--substeps {number}"
+        f"{number} steps instead of {number // SUBSTEP_FACTOR}: the steps are too long for these confidence "
+        f"intervals; give rf.Model(joint, rf.Exponential({given})) in the place of the joint, on the command "
+        f"line --substeps {number}"
     )
     return (Remark(name, COARSE_STEP, sentence),)
 

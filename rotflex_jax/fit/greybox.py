@@ -165,9 +165,9 @@ def fit(
     their effects declare, a damper as far as the damping of its port is not negative; one that is at the end
     of its range, or a size far beyond what the recordings reach, is named in `remarks`.
 
-    One step of integration per sample is too long for some dry friction. Where an estimate would move by
-    more than a standard deviation with shorter steps, and the recordings are no less likely with them,
-    `remarks` says so and what to give; the fit itself keeps the steps that were asked for.
+    One step of integration per sample is too long for some effects, dry friction first of all. Where an
+    estimate would move by more than a standard deviation with shorter steps, and the recordings are no less
+    likely with them, `remarks` says so and what to give; the fit itself keeps the steps that were asked for.
 
     Args:
         mechanism: What to fit; its values are the start, its trusted parameters are held.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Real
 
 from rotflex_jax import checks
 from rotflex_jax.checks import number, shown
-from rotflex_jax.effects.base import Effect, Linear, Memory, driven_place
+from rotflex_jax.effects.base import DryFriction, Effect, Linear, Memory, driven_place
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.quantity import TURNING, Quantity, Units
@@ -134,6 +134,13 @@ def check(mechanism: "Mechanism") -> None:
             )
         seen.add((effect.at, effect.name))
         _check_surroundings(mechanism, effect)
+    shares: dict[str, float] = {}
+    for effect in (e for e in mechanism.effects if isinstance(e, DryFriction) and e.loaded):
+        if shares.setdefault(effect.at, effect.rest_share) != effect.rest_share:
+            raise InputError(
+                f"Two frictions at {effect.at!r} were put there that depend on different torques through the "
+                "gear, of the motor alone and of both sides, but only one of them is possible; leave one."
+            )
 
 
 def _check_surroundings(mechanism: "Mechanism", effect: Effect) -> None:

@@ -9,7 +9,7 @@ needs no list of machines and a machine none of effects.
 from collections.abc import Callable
 
 from rotflex_jax.effects.angle import Gravity
-from rotflex_jax.effects.base import CATALOG, Effect, driven_place, port_and_signal
+from rotflex_jax.effects.base import CATALOG, DryFriction, Effect, Gear, driven_place, port_and_signal
 from rotflex_jax.mechanism.mechanism import Mechanism
 
 PORTS, SENSORS = ("hub", "arm", "joint"), ("theta", "alpha")
@@ -19,12 +19,14 @@ def port_roles(mechanism: Mechanism, port: str) -> set[str]:
     """Roles of a port: its own name if the joint has one of that name, otherwise by the effects at it.
 
     A motor makes it a `hub`, a spring a `joint`, and neither an `arm`; one that moves in metres is an
-    `axis` as well, and a motor that turns a weight is `loaded`. A machine that has a hub, a joint and an arm
-    by name says with them where it is searched: its other ports have no role but that. Neither has the
-    motor's side of a gear with play.
+    `axis` as well. A motor that turns a weight is `loaded`, unless the model has the friction of a loaded
+    gear, or play, there already. A machine that has a hub, a joint and an arm by name says with them where
+    it is searched: its other ports have no role but that. Neither has the motor's side of a gear with play.
     """
-    weight = any(isinstance(e, Gravity) and e.at == port for e in mechanism.effects)
-    loaded = {"loaded"} if weight and mechanism.has_motor(port) else set()
+    here = [e for e in mechanism.effects if e.at == port]
+    weight = any(isinstance(e, Gravity) for e in here)
+    known = any(isinstance(e, Gear) or (isinstance(e, DryFriction) and e.loaded) for e in here)
+    loaded = {"loaded"} if weight and mechanism.has_motor(port) and not known else set()
     if port in PORTS:
         return {port} | loaded
     if mechanism.on_rotor(port) or all(name in mechanism.port_vectors for name in PORTS):

@@ -273,14 +273,29 @@ def motor_correction(
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Torque [N m] of the motors at a port beyond their linear part: less for a limit, saturation or heat."""
+    """Torque [N m] of the motors at a port beyond their linear part: less for a limit, heat or saturation."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
-    total = motor_beyond_linear(mechanism, at, x, z, v, gates)
+    total = _current_correction(mechanism, at, x, z, v, gates)
     for i, e in effects_of(mechanism, Force):
         if e.driven_by == "motor" and e.at == at:
             k, drive = layout.torque_ports.index(at), drive_of(mechanism, e, x, z, v, gates)
             total = total + gates[i] * _force(e, position[k], speed[k], drive)
+    return total
+
+
+def _current_correction(
+    mechanism: Mechanism,
+    at: str,
+    x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "*S"]:
+    """The same in proportion to the current: limits and heat lower it, saturation does not."""
+    layout = Layout.of(mechanism.structure)
+    position, speed = port_motion(layout, x)
+    total = motor_beyond_linear(mechanism, at, x, z, v, gates)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         if e.driven_by == "motor" and e.at == at:
             k, drive = layout.torque_ports.index(at), drive_of(mechanism, e, x, z, v, gates)
@@ -301,11 +316,12 @@ def drive_of(
         return v
     if e.driven_by == "duty":
         return motor_duty(mechanism, e.at, x, z, v)
-    if e.driven_by == "motor":
-        linear = motor_torque(mechanism, e.at, x, v, gates)
+    linear = motor_torque(mechanism, e.at, x, v, gates)
+    if e.driven_by == "motor" and isinstance(e, Memory):
         return linear + motor_beyond_linear(mechanism, e.at, x, z, v, gates)
-    # What the motor gives after all that it loses, by heat too, is what its current makes.
-    given = motor_torque(mechanism, e.at, x, v, gates) + motor_correction(mechanism, e.at, x, z, v, gates)
+    given = linear + _current_correction(mechanism, e.at, x, z, v, gates)
+    if e.driven_by == "motor":
+        return given
     motor = next(m for m in mechanism.linear_effects(e.at) if m.has_current)
     return evaluate_effect(motor, lambda motor, given: given / motor.torque_per_current, given)
 
@@ -341,8 +357,10 @@ def torques(
     voltage = voltage_of(mechanism, v)
     for i, e in effects_of(mechanism, Force):
         k = layout.torque_ports.index(e.port)
-        signal = v[1 + mechanism.signals.index(e.signal)] if e.signal else None
-        drive = drive_of(mechanism, e, x, z, voltage, gates) if signal is None else signal
+        if e.signal:
+            drive = v[1 + mechanism.signals.index(e.signal)]
+        else:
+            drive = drive_of(mechanism, e, x, z, voltage, gates)
         total[k] = total[k] + gate[i] * _force(e, position[k], speed[k], drive)
     for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
         k = layout.torque_ports.index(e.at)
