@@ -120,10 +120,9 @@ def main() -> int:
         part(results, "whole")
         save(a.out, results)
     for name, machine in MACHINES.items():
-        base = machine.model()
-        if base is None or (a.only and name not in a.only):
+        if a.only and name not in a.only:
             continue
-        base = rf.Model.of(base)
+        base = machine.model()
         # The same runs with a signal, which these models do not take, are no further fits.
         if machine.with_signals or not {"hub", "axis"} & set(base.mechanism.port_vectors):
             continue

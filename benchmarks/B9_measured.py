@@ -44,7 +44,6 @@ from rotflex_jax.text.files import write_file
 from speed.processes import process
 
 CHILD = "from measured_machines.child import main; main()"
-NO_MODEL = "no model of its name in rotflex_jax.joints"
 
 
 def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
@@ -55,9 +54,6 @@ def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
         if only and not chosen:
             continue
         try:
-            if machine.model() is None:
-                left_out[name] = NO_MODEL
-                continue
             ways = [w.name for w in machine.ways()]
         except (rf.InputError, OSError) as problem:
             left_out[name] = str(problem)

@@ -10,7 +10,7 @@ import pytest
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
-from rotflex_jax.fit import discretisation_bias
+from rotflex_jax.fit import greybox_problem
 from rotflex_jax.fit.discretisation_bias import COARSE_STEP, FinerSteps, coarse_step
 from rotflex_jax.fit.problem import runs
 from rotflex_jax.fit.result import Fit
@@ -114,7 +114,7 @@ def test_exact_steps_are_not_checked_by_a_run(monkeypatch) -> None:
     def fail(*_):
         raise AssertionError("A run in finer steps was made of a linear model.")
 
-    monkeypatch.setattr(discretisation_bias, "runs", fail)
+    monkeypatch.setattr(greybox_problem, "runs", fail)
     assert rf.fit(rf.joints.paper(), recorded([("coulomb", "hub")]), restarts=0).remarks == ()
 
 

@@ -40,7 +40,6 @@ def row(
 ) -> dict[str, Any]:
     """What a search finds and how well it does; without `all_of_it` what it finds and its times alone."""
     model = MACHINES[machine].model()
-    assert model is not None
     way = next(w for w in MACHINES[machine].ways() if w.name == direction)
     clock, processor = time.perf_counter(), time.process_time()
     result = searched(model, way.train, way.validation, way.test, say)

@@ -13,10 +13,10 @@ import numpy as np
 
 import rotflex_jax as rf
 from rotflex_jax import effects as fx
-from rotflex_jax.mechanism.roles import search_places
 from servo import friction_models
 from servo.evolved import Box, evolved_alike, evolved_models
 from servo.friction_models import Logs
+from servo.grey_box import of_the_package
 
 # Learnt from these motions, evaluated on the other one, of joints that carry little.
 TRAIN, TEST = ("multisine", "chirp_sweep"), "step_response"
@@ -194,8 +194,7 @@ def joint_row(
     if search and "search" not in row:
         known = {n: v[0] for n, v in row["takes"]["no friction"]["parameters"].items()}
         model = with_effects(starts()[0].with_values(known), ())
-        # Effects of the benchmark's own are in the catalogue, too, where it runs.
-        ours = [p for p in search_places(model.mechanism) if p[0].__module__.startswith("rotflex_jax.")]
+        ours = of_the_package(model.mechanism)
         began, processor = time.perf_counter(), time.process_time()
         say = functools.partial(print, flush=True)
         found = rf.discover(model, of[TRAIN[0]], test, candidates=ours, progress=say)

@@ -235,6 +235,11 @@ def evolved_grey_box(split: Split, rollouts: int) -> dict[str, Any]:
     }
 
 
+def of_the_package(mechanism: rf.Mechanism) -> list[tuple[type[fx.Effect], str]]:
+    """What a search tries by default, less effects of the benchmark's own, which are in the catalogue too."""
+    return [p for p in search_places(mechanism) if p[0].__module__.startswith("rotflex_jax.")]
+
+
 def searched(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
     """The structure that a search of the training recordings finds, fitted by free runs to all of them.
 
@@ -243,10 +248,8 @@ def searched(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
         say: Called with lines of progress.
     """
     base = servo()
-    # Effects of the benchmark's own are in the catalogue, too, while it runs.
-    places = [p for p in search_places(base) if p[0].__module__.startswith("rotflex_jax.")]
     began = time.perf_counter()
-    found = rf.discover(base, split.search, split.validation, candidates=places, progress=say)
+    found = rf.discover(base, split.search, split.validation, candidates=of_the_package(base), progress=say)
     seconds = time.perf_counter() - began
     _, row = fitted(found.model.mechanism, split)
     return row | {

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 import rotflex_jax as rf
+from rotflex_jax.arena.measured import SHARE
 from rotflex_jax.effects.motor import DYNAMIXEL_GAIN_SCALE
 from servo.friction_models import GRAVITY, Logs
 
@@ -26,10 +27,6 @@ def motion(recording: rf.Recording) -> str:
     return next(name for name in MOTIONS if f" {name}," in recording.source)
 
 
-# Of what is learnt from, a search fits this share of every recording and compares its models on the rest.
-SHARE = 0.7
-
-
 @dataclasses.dataclass(frozen=True)
 class Split:
     """What is learnt from and what is left out.
@@ -46,12 +43,12 @@ class Split:
 
     @property
     def search(self) -> tuple[rf.Recording, ...]:
-        """What a search fits."""
+        """What a search fits: this share of every recording."""
         return tuple(r.split(SHARE)[0] for r in self.train)
 
     @property
     def validation(self) -> tuple[rf.Recording, ...]:
-        """What a search compares its models on."""
+        """What a search compares its models on: the rest of each."""
         return tuple(r.split(SHARE)[1] for r in self.train)
 
 

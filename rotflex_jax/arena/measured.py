@@ -1,8 +1,4 @@
-"""Every measured machine: its model, and all ways to fit some recordings and evaluate on others.
-
-A machine without a model in `rotflex_jax.joints` is listed too and left out with that reason; it takes part
-as soon as there is a mechanism of its name.
-"""
+"""Every measured machine: its model, and all ways to fit some recordings and evaluate on others."""
 
 from __future__ import annotations
 
@@ -63,12 +59,9 @@ class Machine:
     with_signals: bool = False
     released: tuple[str, ...] = ()
 
-    def model(self) -> rf.Model | None:
-        """The textbook model; None where there is none yet."""
-        preset = getattr(rf.joints, self.preset, None)
-        if preset is None:
-            return None
-        mechanism = preset(**self.options).release(*self.released)
+    def model(self) -> rf.Model:
+        """The textbook model."""
+        mechanism = getattr(rf.joints, self.preset)(**self.options).release(*self.released)
         return rf.Model(mechanism) if self.solver is None else rf.Model(mechanism, self.solver)
 
     def ways(self) -> list[Way]:

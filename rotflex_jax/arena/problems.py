@@ -205,8 +205,6 @@ def measured(say: Callable[[str], None] = lambda _: None) -> list[Problem]:
     found = []
     for name, machine in MACHINES.items():
         model = machine.model()
-        if model is None:
-            continue
         try:
             ways = machine.ways()
         except (rf.InputError, OSError) as problem:

@@ -133,20 +133,19 @@ def _parameters(
             falls = True
             content["friction_base"] += effect.level
             content |= {"friction_stribeck": effect.excess, "dtheta_stribeck": effect.speed, "alpha": 2.0}
-        elif isinstance(effect, LoadFriction) and not loads:
+        elif isinstance(effect, LoadFriction | GearFriction) and not loads:
             loads = True
+            if isinstance(effect, GearFriction):
+                driving = driven = effect.share
+            else:
+                driving, driven = effect.driving, effect.driven
             content["friction_base"] += effect.level
             # BAM's torque through the gear is the sum of both sides, ours their mean.
-            content["load_friction_base"] = (effect.driving + effect.driven) / 4
-            if effect.driving != effect.driven:
+            content["load_friction_base"] = (driving + driven) / 4
+            if driving != driven:
                 approximated.append(f"{label(effect)}: the mean of both shares")
-            if effect.of == "motor":
+            if effect.rest_share == 0:
                 approximated.append(f"{label(effect)}: of the sum of both sides, not of the motor alone")
-        elif isinstance(effect, GearFriction) and not loads:
-            loads = True
-            content["friction_base"] += effect.level
-            content["load_friction_base"] = effect.share / 2
-            approximated.append(f"{label(effect)}: of the sum of both sides, not of the motor alone")
         elif isinstance(effect, Delay) and "command_delay" not in content:
             content["command_delay"] = effect.time
         elif not isinstance(effect, PositionLoop | Inertia | Gravity):

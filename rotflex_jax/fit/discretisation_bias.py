@@ -14,15 +14,13 @@ a fit has no part in it.
 import dataclasses
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.fit.greybox_problem import LEAST_SCALE, FitAttempt, FitPoint, GreyBoxProblem, bent
-from rotflex_jax.fit.inference import UNDETERMINED_CURVATURE, RecordingSlopes
+from rotflex_jax.fit.greybox_problem import LEAST_SCALE, FitAttempt, GreyBoxProblem
+from rotflex_jax.fit.inference import RecordingSlopes, scaled_inverse
 from rotflex_jax.fit.plausibility import Remark
-from rotflex_jax.fit.problem import negative_log_likelihood, runs
+from rotflex_jax.fit.problem import negative_log_likelihood
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.mechanism.finer_step import SUBSTEP_FACTOR, with_finer_steps
 from rotflex_jax.text.numbers import plain_number
@@ -75,7 +73,7 @@ def finer_steps(
         return None
     layout = dataclasses.replace(problem.layout, solver=solver)
     problem = dataclasses.replace(problem, layout=layout)
-    fine = _errors(problem, end.point, end)
+    fine = problem.errors_alone(end.point, end.stage, end.K)
     if not np.isfinite(fine).all():
         return None
     coordinates, seen = problem.coordinates(end.point, end.stage.windows), problem.dataset.data.seen
@@ -85,15 +83,14 @@ def finer_steps(
     gradient = np.zeros(len(H))
     for part, change in zip(parts, coordinates.parts((fine - e) / scale, none, seen), strict=True):
         gradient[part.columns] += part.J.reshape(-1, len(part.columns)).T @ change.e.ravel()
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    inverse = np.linalg.pinv(H / np.outer(size, size), rcond=UNDETERMINED_CURVATURE, hermitian=True)
+    inverse, size = scaled_inverse(H)
     step = np.zeros(len(moves))
     step[moves] = -(inverse @ (gradient / size)) / size
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = step / np.sqrt(np.diag(covariance))
     if not np.any(np.abs(shift) > LARGE_SHIFT):
         return None
-    moved = _errors(problem, coordinates.moved(end.point, step), end)
+    moved = problem.errors_alone(coordinates.moved(end.point, step), end.stage, end.K)
     cost = min(_cost(problem, fine), _cost(problem, moved))
     return FinerSteps(solver, shift, _cost(problem, e) - cost)
 
@@ -130,23 +127,6 @@ def coarse_step(
         f"line --substeps {number}"
     )
     return (Remark(name, COARSE_STEP, sentence),)
-
-
-def _errors(problem: GreyBoxProblem, point: FitPoint, end: FitAttempt) -> Float[np.ndarray, "R N C"]:
-    """Errors at a point by runs without slopes, as `GreyBoxProblem.errors` gives them."""
-    many, data = point.x0.shape[1] > 1, problem.dataset.data
-    y_hat = jax.device_get(
-        runs(
-            problem.layout,
-            jnp.asarray(problem.physical(point)[0]),
-            jnp.asarray(point.x0 if many else point.x0[:, 0]),
-            jax.tree.map(jnp.asarray, data),
-            jnp.asarray(end.K),
-            jnp.asarray(end.stage.windows.index) if many else None,
-        )
-    )
-    e = np.where(data.seen[:, :, None] > 0, y_hat - data.y, 0.0)
-    return e if problem.bend is None else bent(e, np.zeros((*e.shape, 0)), problem.bend)[0]
 
 
 def _cost(problem: GreyBoxProblem, e: Float[np.ndarray, "R N C"]) -> float:

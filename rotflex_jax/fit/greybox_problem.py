@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from rotflex_jax.fit.problem import (
     LikelihoodEquations,
     RunLayout,
     likelihood_equations,
+    runs,
     runs_with_slopes,
 )
 from rotflex_jax.mechanism import kalman_gains
@@ -302,20 +303,31 @@ class GreyBoxProblem:
     ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
         """Errors of the runs and their slopes, bent where large ones count less; zero where none counts."""
         values, slopes = self.physical(point)
-        many = point.x0.shape[1] > 1
-        y_hat, J = jax.device_get(
-            runs_with_slopes(
-                self.layout,
-                *map(jnp.asarray, (values, slopes, np.array((*point.free, *point.local)))),
-                jnp.asarray(point.x0 if many else point.x0[:, 0]),
-                jax.tree.map(jnp.asarray, self.dataset.data),
-                jnp.asarray(K),
-                jnp.asarray(stage.windows.index) if many else None,
-            )
-        )
+        directions = map(jnp.asarray, (values, slopes, np.array((*point.free, *point.local))))
+        given = self._run_inputs(point, stage, K)
+        y_hat, J = jax.device_get(runs_with_slopes(self.layout, *directions, *given))
         seen = self.dataset.data.seen[:, :, None] > 0
         e, J = np.where(seen, y_hat - self.dataset.data.y, 0.0), np.where(seen[..., None], J, 0.0)
         return (e, J) if self.bend is None else bent(e, J, self.bend)
+
+    def errors_alone(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> Float[np.ndarray, "R N C"]:
+        """The same errors by runs without slopes, which cost less."""
+        values = jnp.asarray(self.physical(point)[0])
+        y_hat = jax.device_get(runs(self.layout, values, *self._run_inputs(point, stage, K)))
+        e = np.where(self.dataset.data.seen[:, :, None] > 0, y_hat - self.dataset.data.y, 0.0)
+        return e if self.bend is None else bent(e, np.zeros((*e.shape, 0)), self.bend)[0]
+
+    def _run_inputs(self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]) -> tuple[Any, ...]:
+        """First states, recordings, gains and windows of runs, as their programs take them."""
+        many = point.x0.shape[1] > 1
+        return (
+            jnp.asarray(point.x0 if many else point.x0[:, 0]),
+            jax.tree.map(jnp.asarray, self.dataset.data),
+            jnp.asarray(K),
+            jnp.asarray(stage.windows.index) if many else None,
+        )
 
     def robust(self, end: FitAttempt, beyond: float) -> tuple["GreyBoxProblem", FitAttempt]:
         """The same problem with large errors bent, and its end.

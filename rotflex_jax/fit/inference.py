@@ -99,10 +99,17 @@ def nats_that_count(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"
     """
     if not np.isfinite(H).all():
         return 1.0
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    ratios = np.linalg.pinv(H / np.outer(size, size), rcond=UNDETERMINED_CURVATURE, hermitian=True)
+    ratios, size = scaled_inverse(H)
     S = long_run_scores(parts, len(H)) / np.outer(size, size)
     return max(1.0, float(np.sum(ratios * S)) / len(H))
+
+
+def scaled_inverse(
+    H: Float[np.ndarray, "D D"],
+) -> tuple[Float[np.ndarray, "D D"], Float[np.ndarray, " D"]]:
+    """Inverse of a curvature in units of the sizes of its coordinates, and these; zero where undetermined."""
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    return np.linalg.pinv(H / np.outer(size, size), rcond=UNDETERMINED_CURVATURE, hermitian=True), size
 
 
 def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> Float[np.ndarray, "D D"]:

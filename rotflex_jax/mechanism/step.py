@@ -7,7 +7,7 @@ no smoothing width.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, get_args
 
 import jax
@@ -226,14 +226,39 @@ def motor_beyond_linear(
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
     """Torque [N m] of motors at a port beyond `motor_torque`: limits, dead bands, a weak supply, I gains."""
+    return _of_laws(mechanism, _loops(mechanism, at), at, x, z, v, gates)
+
+
+def _loops(mechanism: Mechanism, at: str) -> list[tuple[int, Force | Memory]]:
+    """Motors at a port whose torque is not linear, with their indices among the effects."""
+    motors = ((i, e) for i, e in effects_of(mechanism, Linear) if isinstance(e, Force | Memory) and e.motor)
+    return [(i, e) for i, e in motors if e.at == at]
+
+
+def _driven_by_motor(
+    mechanism: Mechanism, at: str, kind: type[Force] | type[Memory]
+) -> list[tuple[int, Force | Memory]]:
+    """Laws of a kind at a port that take from the torque of its motors, with their indices."""
+    return [(i, e) for i, e in effects_of(mechanism, kind) if e.driven_by == "motor" and e.at == at]
+
+
+def _of_laws(
+    mechanism: Mechanism,
+    laws: Iterable[tuple[int, Force | Memory]],
+    at: str,
+    x: Float[Array, "m *S"],
+    z: Float[Array, "z *S"],
+    v: Float[Array, "*S"],
+    gates: Float[Array, "E *D"],
+) -> Float[Array, "*S"]:
+    """Torque [N m] of some laws at a port, each with its index among the effects."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = jnp.zeros(x.shape[1:], x.dtype)
     memories = _states_of_memories(mechanism, z)
-    for i, e in effects_of(mechanism, Linear):
-        if isinstance(e, Force | Memory) and e.motor and e.at == at:
-            k = layout.torque_ports.index(at)
-            total = total + gates[i] * _force(e, *memories.get(i, ()), position[k], speed[k], v)
+    for i, e in laws:
+        k, drive = layout.torque_ports.index(at), drive_of(mechanism, e, x, z, v, gates)
+        total = total + gates[i] * _force(e, *memories.get(i, ()), position[k], speed[k], drive)
     return total
 
 
@@ -274,33 +299,13 @@ def motor_correction(
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
     """Torque [N m] of the motors at a port beyond their linear part: less for a limit, heat or saturation."""
-    layout = Layout.of(mechanism.structure)
-    position, speed = port_motion(layout, x)
-    total = _current_correction(mechanism, at, x, z, v, gates)
-    for i, e in effects_of(mechanism, Force):
-        if e.driven_by == "motor" and e.at == at:
-            k, drive = layout.torque_ports.index(at), drive_of(mechanism, e, x, z, v, gates)
-            total = total + gates[i] * _force(e, position[k], speed[k], drive)
-    return total
+    laws = (*_of_current(mechanism, at), *_driven_by_motor(mechanism, at, Force))
+    return _of_laws(mechanism, laws, at, x, z, v, gates)
 
 
-def _current_correction(
-    mechanism: Mechanism,
-    at: str,
-    x: Float[Array, "m *S"],
-    z: Float[Array, "z *S"],
-    v: Float[Array, "*S"],
-    gates: Float[Array, "E *D"],
-) -> Float[Array, "*S"]:
-    """The same in proportion to the current: limits and heat lower it, saturation does not."""
-    layout = Layout.of(mechanism.structure)
-    position, speed = port_motion(layout, x)
-    total = motor_beyond_linear(mechanism, at, x, z, v, gates)
-    for m, (i, e) in enumerate(effects_of(mechanism, Memory)):
-        if e.driven_by == "motor" and e.at == at:
-            k, drive = layout.torque_ports.index(at), drive_of(mechanism, e, x, z, v, gates)
-            total = total + gates[i] * _force(e, z[m], position[k], speed[k], drive)
-    return total
+def _of_current(mechanism: Mechanism, at: str) -> tuple[tuple[int, Force | Memory], ...]:
+    """Laws of the motors at a port that change their current: limits and heat, saturation does not."""
+    return (*_loops(mechanism, at), *_driven_by_motor(mechanism, at, Memory))
 
 
 def drive_of(
@@ -319,7 +324,7 @@ def drive_of(
     linear = motor_torque(mechanism, e.at, x, v, gates)
     if e.driven_by == "motor" and isinstance(e, Memory):
         return linear + motor_beyond_linear(mechanism, e.at, x, z, v, gates)
-    given = linear + _current_correction(mechanism, e.at, x, z, v, gates)
+    given = linear + _of_laws(mechanism, _of_current(mechanism, e.at), e.at, x, z, v, gates)
     if e.driven_by == "motor":
         return given
     motor = next(m for m in mechanism.linear_effects(e.at) if m.has_current)
