@@ -261,7 +261,7 @@ def test_an_end_that_the_recordings_do_not_reach_is_taken_only_alone(monkeypatch
     bound = Remark("hub.lugre.damping", "at a bound", "")
 
     def ends(*kinds: tuple[float, tuple[Remark, ...]]) -> float:
-        structure = SimpleNamespace(starts=range(len(kinds)), local=(), window_seconds=2.0)
+        structure = SimpleNamespace(starts=range(len(kinds)), local=(), window_seconds=2.0, first="measured")
         of_starts = [SimpleNamespace(cost=cost, remarks=remarks) for cost, remarks in kinds]
         monkeypatch.setattr(STRUCTURE, "fit", lambda start, recordings, **how: of_starts[start])
         return STRUCTURE.fit_structures([(structure, [])])[0].fit.cost
@@ -612,6 +612,31 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
     found = search()
     assert (found.final_fit is None) == (said is not None)
     assert [note.endswith(said or "") for note in refusals(found)] == [True] * (said is not None)
+
+
+def test_where_measured_first_states_do_worse_the_fit_is_with_fitted_ones(runs, arm, monkeypatch):
+    """As the search fits, from its parameters alone, and to all recordings: friction of both runs counts."""
+    train, validation, test = runs
+    tried = MODULE._LastFit.tried
+
+    def worse_from_measured(last, structures):
+        each = tried(last, structures)
+        lost = RunErrors({"theta": np.inf}, {"theta": np.inf})
+        return [t._replace(errors=lost) if t.structure.first == "measured" else t for t in each]
+
+    monkeypatch.setattr(MODULE._LastFit, "tried", worse_from_measured)
+    found = rf.discover(arm, train, validation, test=test, candidates=LAWS[:1], rounds=1)
+    last = found.final_fit
+    assert last.fit.options.first == found.to_dict()["final_fit"]["first"] == "fitted"
+    assert refusals(found) == [] and "with fitted first states" in final_fit_sentence(found)
+    structure, local = found.final.model.mechanism, list(last.fit.local)
+    if OFFSET in local:
+        structure = structure + rf.effects.VoltageOffset("input")
+    by_hand = rf.fit(structure, [train, validation], local=local, window_seconds=2.0)
+    assert level_of(found.model) == pytest.approx(by_hand[LEVEL].value, rel=1e-3)
+    assert level_of(found.final.model) < 0.97 * level_of(found.model)
+    missed = short_runs_miss(found.model, test)
+    assert last.test.windows["theta"] == pytest.approx(missed, rel=1e-6)
 
 
 @pytest.mark.parametrize(("share", "taken"), [(0.98, True), (1.02, False)])

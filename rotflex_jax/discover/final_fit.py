@@ -6,10 +6,11 @@ and from run to run, and half of the recordings show half of that.
 
 Parameters of an incomplete model depend on what they are fitted to. Those of the search suit predictions, or
 free runs that each have a first state of their own, which may hide a drift of the model. Whoever uses a model
-starts it from a measured state. So this fit is to free runs over windows from what their first samples show,
-unless validation data speak against that clearly, tried on the training recordings alone. Validation data
-also decide whether recordings have offsets that the search could do without. A run of which nothing is known
-gets what the fitted runs have in common of them.
+starts it from a measured state. So this fit is to free runs over windows from what their first samples show.
+Where validation data speak against that clearly, tried on the training recordings alone, it is to free runs
+with fitted first states instead, as in the search. Validation data also decide whether recordings have
+offsets that the search could do without. A run of which nothing is known gets what the fitted runs have in
+common of them.
 
 In a search each free run has a first state of its own, which hides much of what distinguishes one law of
 friction from another. From measured first states it shows: a law that the search cannot exclude, or that
@@ -177,14 +178,13 @@ class _LastFit:
         return self.stage.calibrated or self.carried_over
 
     def made(self, h: Hypothesis) -> FinalFit | Refused:
-        """The fit of a final model; or why there is none."""
+        """The fit of a final model; or why there is none, from measured first states."""
         state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
         variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
         structures = [
             FinalStructure.of(s, state.model.solver, v, state.order, seconds) for v in variants.values()
         ]
-        best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
-        candidates = [_Candidate(best, self.fitted_to_all(best))]
+        candidates = [self.best_of(structures)]
         for improved in (
             self.without_needless_offsets,
             self.with_better_laws,
@@ -196,7 +196,16 @@ class _LastFit:
         made = self.accepted(candidates.pop())
         while isinstance(made, Refused) and candidates:
             made = self.accepted(candidates.pop())
+        if isinstance(made, Refused):
+            self.state.say("  with fitted first states")
+            as_searched = self.accepted(self.best_of([each.as_searched() for each in structures]))
+            made = made if isinstance(as_searched, Refused) else as_searched
         return made if isinstance(made, Refused) else self.tested(*made)
+
+    def best_of(self, structures: Sequence[FinalStructure]) -> _Candidate:
+        """The structure with the smallest errors on validation data, fitted to all."""
+        best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
+        return _Candidate(best, self.fitted_to_all(best))
 
     def fitted_to_all(self, tried: _Tried) -> FittedStructure:
         """The fit to all recordings of what was fitted without the validation data.

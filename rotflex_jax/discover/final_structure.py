@@ -1,6 +1,7 @@
 """What the final fit fits: effects, the parameters that each recording has for itself, where fits start.
 
-The fits are to free runs over windows that start from what their first samples show.
+The fits are to free runs over windows. They start from what their first samples show, or from first states
+that are fitted too.
 """
 
 import dataclasses
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from rotflex_jax.discover.hypothesis import Hypothesis, replacing, usual_start, without
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.effects.base import DRY_FRICTION
-from rotflex_jax.fit.greybox import fit
+from rotflex_jax.fit.greybox import FirstState, fit
 from rotflex_jax.fit.plausibility import BEYOND_RECORDINGS
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Solver
@@ -28,8 +29,8 @@ class FinalStructure:
     """What is fitted.
 
     Attributes:
-        starts: Models from which fits start, with the calibrations of the recordings; the last one has usual
-            values.
+        starts: Models from which fits start, with the calibrations of the recordings; the first one has the
+            parameters of the search, or of an earlier fit, and the last one usual ones.
         local: Parameters that each recording has for itself.
         own: Calibrations that are not carried over to other recordings.
         on: What is on in the model that a user gets.
@@ -37,6 +38,7 @@ class FinalStructure:
         supermodel: What it is a hypothesis of.
         window_seconds: Length of free runs [s].
         friction: Sizes of friction among `local`.
+        first: Whether free runs start from what their first samples show, or from fitted first states.
     """
 
     starts: tuple[Model, ...]
@@ -47,6 +49,7 @@ class FinalStructure:
     supermodel: SuperModel
     window_seconds: float
     friction: tuple[str, ...] = ()
+    first: FirstState = "measured"
 
     @classmethod
     def of(
@@ -89,6 +92,10 @@ class FinalStructure:
     def also_from(self, start: Model) -> "FinalStructure":
         """The same with a further start."""
         return dataclasses.replace(self, starts=(*self.starts, start))
+
+    def as_searched(self) -> "FinalStructure":
+        """The same with fitted first states, from the parameters of the search alone."""
+        return dataclasses.replace(self, starts=self.starts[:1], first="fitted")
 
     def carrying(self, *locations: EffectLocation) -> "FinalStructure":
         """The same where the model that a user gets has these calibrations of the recordings."""
@@ -220,7 +227,7 @@ def fit_structures(
         k, start = job
         structure, recordings = asked[k]
         # Starts that the search has found take the place of restarts.
-        how = {"first": "measured", "window_seconds": structure.window_seconds, "restarts": 0}
+        how = {"first": structure.first, "window_seconds": structure.window_seconds, "restarts": 0}
         return fit(start, list(recordings), local=structure.local, **how)
 
     # Those of one structure share a program, which one of them compiles: others first.

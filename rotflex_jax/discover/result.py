@@ -217,7 +217,8 @@ def assess_stages(baseline: Stage, final: Stage, floor: dict[str, float]) -> Ass
 class FinalFit:
     """The final model of a search that ends unexplained, fitted once more to all that had a say in it.
 
-    The fit is to free runs over windows, from what the first samples of each show.
+    The fit is to free runs over windows, from what the first samples of each show; or from fitted first
+    states (`fit.options.first`) where validation data speak against that.
 
     Attributes:
         fit: To the training and validation recordings together, with what each has for itself. What belongs
@@ -264,6 +265,7 @@ class FinalFit:
         """Plain JSON types."""
         out: dict[str, Any] = {
             "window_seconds": self.fit.options.window_seconds,
+            "first": self.fit.options.first,
             "status": self.fit.status,
             "parameters": _parameters(self.estimates),
             "laws": [{"found": list(found), "used": list(used)} for found, used in self.laws],

@@ -198,9 +198,14 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         if needless
         else ""
     )
+    first = (
+        "from measured first states"
+        if found.fit.options.first == "measured"
+        else "with fitted first states, since from measured ones it does worse on validation data"
+    )
     return (
-        f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s from "
-        f"measured first states.{left_out}{laws}{friction} Fitted in the same way without the validation "
+        f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s "
+        f"{first}.{left_out}{laws}{friction} Fitted in the same way without the validation "
         f"data, its errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
     )
 
