@@ -187,7 +187,7 @@ def _box(model: Model, whole: Model) -> tuple[np.ndarray, np.ndarray]:
     mechanism = whole.mechanism
     values = mechanism.named_values
     limits = dict(zip(mechanism.parameter_names, mechanism.parameter_specifications, strict=True))
-    amplitudes = {f"{e.at}.{e.name}.{a}" for e in mechanism.effects for a in e.amplitudes}
+    amplitudes = {e.full_name(a) for e in mechanism.effects for a in e.amplitudes}
     own, box = set(model.mechanism.free_names), []
     for name in mechanism.free_names:
         s, value = limits[name], values[name]
@@ -269,7 +269,7 @@ def evolved(train: Sequence[Recording], validation: Sequence[Recording], model: 
     runs["validation"] = _Runs.of(validation, model, whole, len(runs["train"].u))
     names, free = list(mechanism.parameter_names), list(mechanism.free_names)
     place = np.array([names.index(n) for n in free])
-    owner = {f"{e.at}.{e.name}.": i for i, e in enumerate(mechanism.effects)}
+    owner = {e.full_name(): i for i, e in enumerate(mechanism.effects)}
     of_effect = np.array([next(i for head, i in owner.items() if n.startswith(head)) for n in free])
     lower, upper = _box(model, whole)
     first = mechanism.values.astype(float)

@@ -9,6 +9,7 @@ from typing import Any
 from rotflex_jax.arena.simulator.hidden import ABSORBED, EQUIVALENT, OUTSIDE, UNSEEN
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.arena.simulator.plant import Plant
+from rotflex_jax.effects.base import full_name
 from rotflex_jax.text.numbers import json_number
 
 # Arena's parameter -> the parameters of the same effect in the package.
@@ -137,7 +138,7 @@ def parameter_errors(
         if place in ABSORBED:
             continue
         for name, true in renamed(place, values, K).items():
-            full = f"{place[1]}.{place[0]}.{name}"
+            full = full_name(place[1], place[0], name)
             if full not in estimates:
                 continue
             e = estimates[full]

@@ -196,7 +196,7 @@ def window_sizes(
     found = {}
     for location in locations:
         kind = CATALOG[location.effect]
-        names = {f"{location.port}.{location.effect}.{n}" for n in kind.amplitudes}
+        names = {location.full_name(n) for n in kind.amplitudes}
         own = [i for i, n in enumerate(s.mechanism.parameter_names) if n in names and i in columns]
         if kind.per_recording or not own:
             continue

@@ -138,7 +138,7 @@ class FittedStructure:
         m, sizes, this = self.fit.model.mechanism, list[str](), self.structure
         units = {n: spec.unit for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)}
         for effect in [e for e in m.effects if e.law_of == DRY_FRICTION]:
-            names = [f"{effect.at}.{effect.name}.{amplitude}" for amplitude in effect.amplitudes]
+            names = [effect.full_name(amplitude) for amplitude in effect.amplitudes]
             sizes += [n for n in names if n in m.free_names and units[n] == units[names[0]]]
         starts = (self.fit.model, this.starts[-1])
         return dataclasses.replace(this, starts=starts, local=(*this.local, *sizes), friction=tuple(sizes))

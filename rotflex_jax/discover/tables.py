@@ -10,6 +10,7 @@ import numpy as np
 from rotflex_jax.discover.explanation import advice, coloured_sensors
 from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, longest_with_a_say
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
+from rotflex_jax.effects.base import full_name
 from rotflex_jax.effects.labels import effect_label, effect_phrase
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
@@ -213,7 +214,7 @@ def final_fit_sentence(discovery: SearchResult) -> str:
 def estimates_in_use(discovery: SearchResult, added: Round) -> dict[str, Estimate | None]:
     """Parameters of an effect as the model to use has them, by short name; None for one that it lacks."""
     known = {e.name: e for e in discovery.estimates}
-    return {name: known.get(f"{added.port}.{added.effect}.{name}") for name in added.parameters}
+    return {name: known.get(full_name(added.port, added.effect, name)) for name in added.parameters}
 
 
 def has_moved(found: Estimate, used: Estimate) -> bool:

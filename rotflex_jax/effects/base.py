@@ -64,6 +64,15 @@ def port_and_signal(place: str) -> tuple[str, str]:
     return port, signal
 
 
+def full_name(port: str, effect: str, parameter: str = "") -> str:
+    """Name of an effect's parameter in a mechanism; what all of them begin with where none is given.
+
+    >>> full_name("hub", "coulomb", "level"), full_name("hub", "coulomb")
+    ('hub.coulomb.level', 'hub.coulomb.')
+    """
+    return f"{port}.{effect}.{parameter}"
+
+
 class Stamp(NamedTuple):
     """What a linear effect writes into the equations of motion at its port `p`.
 
@@ -271,6 +280,10 @@ class Effect(abc.ABC):
     def signal(self) -> str:
         """The measured signal that drives it in the place of the voltage; empty for most."""
         return port_and_signal(self.at)[1] if self.acts_on == "signal" else ""
+
+    def full_name(self, parameter: str = "") -> str:
+        """Name of one of its parameters in a mechanism; see the function of that name."""
+        return full_name(self.at, self.name, parameter)
 
     @property
     def values(self) -> dict[str, Any]:

@@ -89,9 +89,7 @@ def rival_set(
     transform = Transform.of(specs)
     before = {n for m in reduced for n in m.mechanism.parameter_names}
     calibrations = {n for m in complete for n in m.parameter_names} - before
-    calibrations |= {
-        f"{e.at}.{e.name}.{p}" for e in union.effects if e.name == "voltage_offset" for p in e.values
-    }
+    calibrations |= {e.full_name(p) for e in union.effects if e.name == "voltage_offset" for p in e.values}
     own = np.array([i for i, n in enumerate(names) if n in calibrations], dtype=int)
     gates, values, free, mean, covariance = [], [], [], [], []
     for m, (_, source) in zip(complete, items, strict=True):

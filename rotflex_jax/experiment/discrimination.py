@@ -176,7 +176,7 @@ def starts_with_other_shapes(rival: RivalModel) -> list[Float[np.ndarray, " D"]]
     effect = rival.effect()
     names, starts = rival.mechanism.parameter_names, []
     for name, value in effect.values.items():
-        full = f"{effect.at}.{effect.name}.{name}"
+        full = effect.full_name(name)
         if name in effect.amplitudes or names.index(full) not in rival.free or value == 0:
             continue
         spec = effect.declared()[name]

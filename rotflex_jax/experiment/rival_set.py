@@ -389,7 +389,7 @@ class RivalSet:
             if shared[e] or self.gates[h, e] == 0:
                 continue
             for name in effect.values:
-                i = names.index(f"{effect.at}.{effect.name}.{name}")
+                i = names.index(effect.full_name(name))
                 where = np.flatnonzero(self.free[h] == i)
                 value = self.values[h, i]
                 if name in effect.amplitudes or not len(where) or value == 0:

@@ -155,7 +155,7 @@ class Subject:
         reads = lambda e: e.acts_on == "channel" and e.at not in others  # noqa: E731
         effects = tuple(e for e in m.effects if not (reads(e) or (isinstance(e, Memory) and e.shows)))
         left_out = tuple(f"{c}: the {what} at {port}" for c, (port, what) in m.outputs if c not in others)
-        names = {f"{e.at}.{e.name}.{n}" for e in effects for n in e.values}
+        names = {e.full_name(n) for e in effects for n in e.values}
         reduced = dataclasses.replace(m, effects=effects, outputs=others, trusted=m.trusted & names)
         model = dataclasses.replace(self.model, mechanism=reduced)
         return dataclasses.replace(self, model=model, left_out=left_out)

@@ -236,7 +236,7 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
     found = []
     for effect in m.effects if effects is None else effects:
         for name, spec in specifications(effect).items():
-            full, value = f"{effect.at}.{effect.name}.{name}", float(getattr(effect, name))
+            full, value = effect.full_name(name), float(getattr(effect, name))
             if full in m.trusted:
                 continue
             unit, limit = m.units.of(effect, spec.unit), reach.limit(effect, spec.unit)

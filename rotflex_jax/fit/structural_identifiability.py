@@ -252,11 +252,7 @@ def impulse_slopes(
     unit = {name: tuple(Fraction(int(i == k)) for k in range(len(free))) for i, name in enumerate(free)}
     effects = [
         e.replace(
-            **{
-                p: Dual(values[full], unit.get(full, zero))
-                for p in e.values
-                for full in (f"{e.at}.{e.name}.{p}",)
-            }
+            **{p: Dual(values[full], unit.get(full, zero)) for p in e.values for full in (e.full_name(p),)}
         )
         for e in m.effects
     ]

@@ -190,7 +190,7 @@ class _Reader:
         units = Units("m", "N", input=self.input_unit) if hub.slides else Units(input=self.input_unit)
         channel = "position" if hub.slides else "theta"
         drive = next(e for e in self.effects if isinstance(e, Motor | CurrentDrive | PositionServo))
-        held = [f"{drive.at}.{drive.name}.{n}" for n in drive.values]
+        held = [drive.full_name(n) for n in drive.values]
         if arm is None:
             ports, outputs, coordinates = {self.port: (1.0,)}, {channel: self.port}, (channel,)
             if isinstance(drive, PositionServo):

@@ -307,6 +307,6 @@ def two_stage_link() -> Mechanism:
         ports=ports,
         effects=(*effects, Inertia(at="mass2", inertia=at_mass), driven),
         outputs={"theta1": "hub1", "alpha1": "joint1", "theta2": "hub2", "alpha2": "joint2"},
-        trusted=("hub1.current_drive.gain", "arm1.inertia.inertia", f"{driven.at}.{driven.name}.gain"),
+        trusted=("hub1.current_drive.gain", "arm1.inertia.inertia", driven.full_name("gain")),
         units=Units(input="A"),
     )

@@ -158,7 +158,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
             "value": _json(float(value)),
             "unit": mechanism.units.of(effect, declared[name].unit),
             "bounds": [_json(declared[name].lower), _json(declared[name].upper)],
-            "trusted": f"{effect.at}.{effect.name}.{name}" in mechanism.trusted,
+            "trusted": effect.full_name(name) in mechanism.trusted,
             "meaning": declared[name].meaning,
         }
         for name, value in effect.values.items()
