@@ -324,6 +324,15 @@ def test_steps_of_integration_on_the_command_line(run, tmp_path) -> None:  # noq
     assert "rf.Exponential(substeps=4)" in (page / "simulation.html").read_text()
     out = run("simulate", file, "--fit", other, "--add", "coulomb@hub", "--substeps", "4")[1]
     assert "note: " not in out
+    # So do a comparison and the design of an experiment of the models that they fit.
+    model = rf.joints.paper() + rf.effects.Coulomb(at="hub")
+    later = make_record([("coulomb", "hub")], seed=4, seconds=4.0, fs=250.0)
+    test = rf.Recording(u=later["u"], y=later["y"], Ts=later["Ts"])
+    (row,) = rf.compare(rf.load(other), ["grey_box"], mechanism=model, test=test).rows
+    assert row.note == remark["sentence"]
+    between = ("--between", "coulomb@hub", "delay@input", "--voltage", "2", "--seconds", "2", "--rank-only")
+    status, out, _ = run("experiment", "--fit", other, *between)
+    assert status == 0 and f"note: fit with coulomb@hub: {remark['sentence']}." in out.splitlines()
 
 
 def test_steps_are_no_matter_of_an_input_that_is_switched_within_samples(tmp_path) -> None:

@@ -140,6 +140,9 @@ def experiment(
                 improve=not rank_only,
             )
             begun = begun.with_next_segment(step)
+        if json_file != given.STDOUT:
+            for name, fitted in models.items():
+                terminal.print_remarks(fitted, f"fit with {name}")
         _report(begun, state, save, json_file)
         return
     with terminal.progress("Designing") as step:
@@ -161,6 +164,7 @@ def experiment(
         print(json.dumps(result, indent=2), flush=True)
         _write_files(found, save, plot)
         return
+    terminal.print_remarks(fitted, f"fit with {between[0]}")
     terminal.output().print(str(found), markup=False)
     names = found.channels
     rows = [

@@ -50,8 +50,7 @@ def simulate(
             fitted = rf.fit(model, train, progress=tell)
         model, first = fitted.model, train[0]
         saved = Saved(model, fitted.parameters, fitted.covariance, fitted.free_names, first.Ts, first.n_init)
-        for remark in fitted.remarks:
-            terminal.message(f"note: {remark.sentence}.")
+        terminal.print_remarks(fitted)
     y, y_hat = model.measured(recording), model.simulate(recording)
     rmse = rf.metrics.rmse(y, y_hat, recording.n_init).tolist()
     units = {name: recording.unit(name) for name in model.mechanism.channels}

@@ -274,6 +274,12 @@ def print_recording(recording: Any) -> None:
         message(f"{finding.severity}: {finding}")
 
 
+def print_remarks(fitted: Any, of: str = "") -> None:
+    """What a fit remarks on its parameters, each as a note; of which model, where there are several."""
+    for remark in fitted.remarks:
+        message(f"note: {f'{of}: ' if of else ''}{remark.sentence}.")
+
+
 def message(text: str, *, error: bool = False) -> None:
     """One line for a person."""
     SafeConsole(stderr=error, highlight=False).print(text, markup=False, soft_wrap=True)

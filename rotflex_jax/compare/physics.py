@@ -114,12 +114,12 @@ def fit_mechanism(
     process_noise: Mapping[str, float] | None = None,
     note: str = "",
 ) -> Fitted:
-    """A fit of the free parameters; one that diverged raises, one that stopped early is noted."""
+    """A fit of the free parameters; one that diverged raises, an early stop and remarks are noted."""
     fitted = fit(model, train, process_noise=process_noise, progress=say)
     if fitted.status.startswith("diverged"):
         raise RuntimeError(fitted.status)
     stopped = "" if fitted.status == "converged" else f"fit {fitted.status}"
-    note = "; ".join(filter(None, (note, stopped)))
+    note = "; ".join(filter(None, (note, stopped, *(remark.sentence for remark in fitted.remarks))))
     return Fitted(fitted.model, len(fitted.free_names), note, one_step_predictor(fitted.model, train))
 
 
