@@ -18,6 +18,7 @@ from rotflex_jax.discover.validation import Horizons, as_free_run, validate
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Windows, padded_length, prepare
+from rotflex_jax.fit.problem import runs_with_slopes
 from rotflex_jax.mechanism.sensitivities import (
     RecordingSamples,
     RunParameters,
@@ -266,3 +267,15 @@ def test_without_a_recording_there_is_nothing_to_prepare():
     assert padded_length([]) == 0
     with pytest.raises(rf.InputError, match="No recording"):
         prepare(MODEL, [])
+
+
+@pytest.mark.parametrize("how", [{"window_seconds": 0.5, "restarts": 0}, {"first": "measured"}], ids=str)
+def test_a_fit_compiles_nothing_for_other_lengths_or_more_recordings(how):
+    first, longer, shorter = (recording(N, 0.004) for N in (1000, 1024, 964))
+    rf.fit(MODEL, first, **how)
+    made = len(runs_with_slopes)
+    for given in (longer, [longer, shorter], [first, shorter, longer]):
+        rf.fit(MODEL, given, **how)
+    assert len(runs_with_slopes) == made
+    rf.fit(MODEL, recording(1025, 0.004), **how)  # of the next step of lengths
+    assert len(runs_with_slopes) == made + 1

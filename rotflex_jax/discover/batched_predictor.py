@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rotflex_jax.discover.supermodel import ReducedModel, SuperModel
-from rotflex_jax.fit.dataset import StackedRecordings
+from rotflex_jax.fit.dataset import LEAST_WINDOWS, StackedRecordings
 from rotflex_jax.fit.problem import predicted
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.assembly import whole_state
@@ -23,9 +23,6 @@ from rotflex_jax.mechanism.sensitivities import (
 from rotflex_jax.models.model import program_length
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision, on_threads
-
-# Windows of a program, at least.
-LEAST_WINDOWS = 16
 
 Used = TypeVar("Used")
 

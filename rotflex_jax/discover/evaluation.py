@@ -390,7 +390,7 @@ class Evaluation:
             dataset = prepare(model, test, length=length, like=problem.dataset)
             s, solver, number = problem.supermodel, problem.predictor.solver, problem.windows.number
             whole = LikelihoodProblem.of(s, solver, dataset, problem.ports)
-            cut = whole.of_free_runs(Windows.of_seconds(model, dataset, seconds, number))
+            cut = whole.of_free_runs(Windows.of_seconds(model, dataset, seconds).filled_up(number))
             other = ValidationSet(cut, seconds)
         train = horizons.free_run.problem.dataset.recordings
         runs = KnownRuns.of(train, validation.problem.dataset.recordings)

@@ -146,7 +146,7 @@ def _with_opposite_sign(
         negated.append(dataclasses.replace(r, y=r.y * sign, accept=ACCEPTABLE))
     length = problem.dataset.data.seen.shape[1]
     dataset = prepare(model, negated, length=length, like=problem.dataset)
-    windows = Windows.of_seconds(model, dataset, seconds, problem.windows.number)
+    windows = Windows.of_seconds(model, dataset, seconds).filled_up(problem.windows.number)
     return dataclasses.replace(problem.of_dataset(dataset), windows=windows)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from rotflex_jax import checks
-from rotflex_jax.discover.batched_predictor import LEAST_WINDOWS
 from rotflex_jax.discover.checkpoint import beginning, digest_of_search
 from rotflex_jax.discover.conclusion import with_proposal
 from rotflex_jax.discover.discovery import Discovery
@@ -44,7 +43,7 @@ from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, valid
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import padded_length, prepare, process_noise_ports
+from rotflex_jax.fit.dataset import LEAST_WINDOWS, padded_length, prepare, process_noise_ports
 from rotflex_jax.fit.plausibility import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places

@@ -215,7 +215,7 @@ class ValidationSet:
         windows = p.windows
         if not p.free_run:
             model = Model(p.supermodel.baseline, p.predictor.solver)
-            windows = Windows.of_seconds(model, p.dataset, self.window_seconds, p.windows.number)
+            windows = Windows.of_seconds(model, p.dataset, self.window_seconds).filled_up(p.windows.number)
         return ShortRuns(p.predictor, p.dataset, windows)
 
     def short_run_errors(
@@ -447,8 +447,10 @@ class Horizons:
         problems = (train, *([validation] if validation else []))
         recordings = [r for p in problems for r in p.dataset.recordings]
         number = max(len(window_starts(r, seconds)[0]) for r in recordings)
-        whole = [dataclasses.replace(p, windows=Windows.whole(p.dataset, number)) for p in problems]
-        cut = [p.of_free_runs(Windows.of_seconds(model, p.dataset, seconds, number)) for p in problems]
+        whole = [dataclasses.replace(p, windows=Windows.whole(p.dataset).filled_up(number)) for p in problems]
+        cut = [
+            p.of_free_runs(Windows.of_seconds(model, p.dataset, seconds).filled_up(number)) for p in problems
+        ]
         if validation is None:
             sets = [ValidationSet.leave_one_out(p[0], seconds) for p in (whole, cut)]
         else:

@@ -20,6 +20,9 @@ from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
+# Arrays of programs hold at least so many windows, where runs start again at all: they cost next to nothing.
+LEAST_WINDOWS = 16
+
 
 class StackedRecordings(NamedTuple):
     """Recordings side by side, shorter ones padded with samples that are not `seen`.
@@ -246,33 +249,37 @@ class Windows:
     first_states: Float[np.ndarray, "R W n"]
 
     @classmethod
-    def whole(cls, dataset: Dataset, number: int = 1) -> "Windows":
-        """One window per recording; `number` is W, so that runs with more windows share compiled code."""
+    def whole(cls, dataset: Dataset) -> "Windows":
+        """One window per recording."""
         R, N = dataset.data.seen.shape
-        first = np.repeat(dataset.first_states[:, None], number, axis=1)
-        return cls(np.zeros((R, N), np.int32), (1,) * R, first)
+        return cls(np.zeros((R, N), np.int32), (1,) * R, dataset.first_states[:, None])
 
     @classmethod
-    def of_seconds(cls, model: Model, dataset: Dataset, seconds: float, number: int = 1) -> "Windows":
+    def of_seconds(cls, model: Model, dataset: Dataset, seconds: float) -> "Windows":
         """Windows of some seconds, as errors over windows have them.
 
         Args:
             model: Its channels count.
             dataset: What is cut.
             seconds: Length of a window [s].
-            number: Least W.
         """
         starts = [window_starts(r, seconds)[0] for r in dataset.recordings]
         counts = tuple(map(len, starts))
         R, N = dataset.data.seen.shape
         index = np.zeros((R, N), np.int32)
-        first = np.repeat(dataset.first_states[:, None], max(number, *counts), axis=1)
+        first = np.repeat(dataset.first_states[:, None], max(counts), axis=1)
         for r, (recording, begins) in enumerate(zip(dataset.recordings, starts, strict=True)):
             y = model.measured(recording).astype(float)
             index[r] = np.searchsorted(begins, np.arange(N), side="right") - 1
             heads = y[begins[:, None] + np.arange(recording.n_init)]
             first[r, : len(begins)] = rough_states(model.mechanism.structure, heads, recording.Ts)
         return cls(index, counts, first)
+
+    def filled_up(self, number: int) -> "Windows":
+        """The same in arrays for at least so many windows, so that runs with more of them share programs."""
+        more = max(number - self.number, 0)
+        last = np.repeat(self.first_states[:, -1:], more, axis=1)
+        return dataclasses.replace(self, first_states=np.concatenate([self.first_states, last], axis=1))
 
     @property
     def number(self) -> int:

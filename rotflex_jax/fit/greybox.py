@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import prepare
+from rotflex_jax.fit.dataset import padded_length, prepare
 from rotflex_jax.fit.discretisation_bias import coarse_step, finer_steps
 from rotflex_jax.fit.greybox_problem import LEAST_SCALE, FitAttempt, FitPoint, FitStage, GreyBoxProblem
 from rotflex_jax.fit.held_constants import with_held_constants
@@ -304,7 +304,7 @@ def _problem(
     states = 2 * len(m.coordinates) if first == "fitted" else 0
     return GreyBoxProblem(
         model,
-        prepare(model, recordings),
+        prepare(model, recordings, length=padded_length(recordings)),
         RunLayout(m.structure, model.solver, states, mesh if len(recordings) > 1 else None),
         physical_ranges(m),
         max_steps,

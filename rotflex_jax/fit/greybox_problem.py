@@ -11,7 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.dataset import Dataset, Windows, process_noise_ports
+from rotflex_jax.fit.dataset import (
+    LEAST_WINDOWS,
+    Dataset,
+    StackedRecordings,
+    Windows,
+    process_noise_ports,
+)
 from rotflex_jax.fit.plausibility import AT_BOUND
 from rotflex_jax.fit.problem import (
     LikelihoodEquations,
@@ -22,7 +28,7 @@ from rotflex_jax.fit.problem import (
 )
 from rotflex_jax.mechanism import kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.models.model import Model
+from rotflex_jax.models.model import Model, program_length
 from rotflex_jax.optimise.damped_least_squares import (
     LARGEST_STEP,
     Minimum,
@@ -303,9 +309,14 @@ class GreyBoxProblem:
     ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
         """Errors of the runs and their slopes, bent where large ones count less; zero where none counts."""
         values, slopes = self.physical(point)
-        directions = map(jnp.asarray, (values, slopes, np.array((*point.free, *point.local))))
-        given = self._run_inputs(point, stage, K)
-        y_hat, J = jax.device_get(runs_with_slopes(self.layout, *directions, *given))
+        moved = np.array((*point.free, *point.local))
+        inputs = self._run_inputs(point, stage, K)
+        y_hat, J = self._joined(
+            [
+                runs_with_slopes(self.layout, values[rows], slopes[rows], moved, *given)
+                for rows, given in inputs
+            ]
+        )
         seen = self.dataset.data.seen[:, :, None] > 0
         e, J = np.where(seen, y_hat - self.dataset.data.y, 0.0), np.where(seen[..., None], J, 0.0)
         return (e, J) if self.bend is None else bent(e, J, self.bend)
@@ -314,20 +325,38 @@ class GreyBoxProblem:
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> Float[np.ndarray, "R N C"]:
         """The same errors by runs without slopes, which cost less."""
-        values = jnp.asarray(self.physical(point)[0])
-        y_hat = jax.device_get(runs(self.layout, values, *self._run_inputs(point, stage, K)))
+        values, _ = self.physical(point)
+        inputs = self._run_inputs(point, stage, K)
+        (y_hat,) = self._joined([(runs(self.layout, values[rows], *given),) for rows, given in inputs])
         e = np.where(self.dataset.data.seen[:, :, None] > 0, y_hat - self.dataset.data.y, 0.0)
         return e if self.bend is None else bent(e, np.zeros((*e.shape, 0)), self.bend)[0]
 
-    def _run_inputs(self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]) -> tuple[Any, ...]:
-        """First states, recordings, gains and windows of runs, as their programs take them."""
+    @functools.cached_property
+    def _together(self) -> list[tuple[slice, StackedRecordings]]:
+        """Which recordings run in one call of a program, with their samples on the device.
+
+        One at a time, so that a program does not depend on how many there are; all at once where devices
+        share them.
+        """
+        R = len(self.dataset.recordings)
+        each = [slice(0, R)] if self.layout.mesh else [slice(r, r + 1) for r in range(R)]
+        data = self.dataset.data
+        return [(rows, StackedRecordings(*(jnp.asarray(part[rows]) for part in data))) for rows in each]
+
+    def _run_inputs(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> list[tuple[slice, tuple[Any, ...]]]:
+        """Recordings that run together; first states, samples, gains and windows as programs take them."""
         many = point.x0.shape[1] > 1
-        return (
-            jnp.asarray(point.x0 if many else point.x0[:, 0]),
-            jax.tree.map(jnp.asarray, self.dataset.data),
-            jnp.asarray(K),
-            jnp.asarray(stage.windows.index) if many else None,
-        )
+        x0, window = (point.x0, stage.windows.index) if many else (point.x0[:, 0], None)
+        return [
+            (rows, (x0[rows], samples, K[rows], None if window is None else window[rows]))
+            for rows, samples in self._together
+        ]
+
+    def _joined(self, results: list[tuple[jax.Array, ...]]) -> tuple[np.ndarray, ...]:
+        """Results of all recordings in the place of those of each call."""
+        return tuple(map(np.concatenate, zip(*jax.device_get(results), strict=True)))
 
     def robust(self, end: FitAttempt, beyond: float) -> tuple["GreyBoxProblem", FitAttempt]:
         """The same problem with large errors bent, and its end.
@@ -360,8 +389,9 @@ class GreyBoxProblem:
     def horizons(self, seconds: float | None, process_noise: ProcessNoise) -> list[Windows]:
         """Windows of some seconds, or whole recordings, behind those of shorter horizons for restarts.
 
-        They have the same number of windows, so that all share one compiled program. A solver of optimistix
-        would compile a program for each; predictions, and fits without restarts, have no use for them.
+        They have the same number of windows, so that all share one compiled program, also with those of
+        recordings of nearby lengths. A solver of optimistix would compile a program for each; predictions,
+        and fits without restarts, have no use for them.
         """
         of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
         lengths = [r.N * r.Ts for r in self.dataset.recordings]
@@ -369,12 +399,12 @@ class GreyBoxProblem:
         length = max(SHORTEST_HORIZON, sum(lengths) / MOST_WINDOWS)
         restarts = self.restarts and process_noise is None and self.minimiser is None
         while restarts and length < LONGEST_SHARE * horizon:
-            found.append(of_seconds(length, found[0].number if found else 1))
+            found.append(of_seconds(length))
             length *= NEXT_HORIZON
-        number = found[0].number if found else 1
-        if seconds is None:
-            return [*found, Windows.whole(self.dataset, number)]
-        return [*found, of_seconds(seconds, number)]
+        last = Windows.whole(self.dataset) if seconds is None else of_seconds(seconds)
+        most = max(windows.number for windows in (*found, last))
+        number = 1 if most == 1 else program_length(most, LEAST_WINDOWS)
+        return [windows.filled_up(number) for windows in (*found, last)]
 
     def solve(
         self, local: Sequence[int], process_noise: ProcessNoise, window_seconds: float | None
