@@ -603,8 +603,11 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
         return RunErrors({"theta": 0.0}, {"theta": 0.9 * theirs})
 
     def alone(last, structures):
+        # With fitted first states it is worse still; what is said is of measured ones.
+        error = {"measured": limit, "fitted": 3 * limit}
         return [
-            t._replace(errors=RunErrors({"theta": 0.0}, {"theta": limit})) for t in tried(last, structures)
+            t._replace(errors=RunErrors({"theta": 0.0}, {"theta": error[t.structure.first]}))
+            for t in tried(last, structures)
         ]
 
     monkeypatch.setattr(MODULE, "_on_validation", on_validation)

@@ -331,8 +331,8 @@ def test_steps_of_integration_on_the_command_line(run, tmp_path) -> None:  # noq
     (row,) = rf.compare(rf.load(other), ["grey_box"], mechanism=model, test=test).rows
     assert row.note == remark["sentence"]
     between = ("--between", "coulomb@hub", "delay@input", "--voltage", "2", "--seconds", "2", "--rank-only")
-    status, out, _ = run("experiment", "--fit", other, *between)
-    assert status == 0 and f"note: fit with coulomb@hub: {remark['sentence']}." in out.splitlines()
+    status, _, err = run("experiment", "--fit", other, *between)
+    assert status == 0 and f"note: fit with coulomb@hub: {remark['sentence']}." in err.splitlines()
 
 
 def test_steps_are_no_matter_of_an_input_that_is_switched_within_samples(tmp_path) -> None:

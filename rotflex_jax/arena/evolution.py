@@ -269,7 +269,7 @@ def evolved(train: Sequence[Recording], validation: Sequence[Recording], model: 
     runs["validation"] = _Runs.of(validation, model, whole, len(runs["train"].u))
     names, free = list(mechanism.parameter_names), list(mechanism.free_names)
     place = np.array([names.index(n) for n in free])
-    owner = {e.full_name(): i for i, e in enumerate(mechanism.effects)}
+    owner = {e.name_prefix: i for i, e in enumerate(mechanism.effects)}
     of_effect = np.array([next(i for head, i in owner.items() if n.startswith(head)) for n in free])
     lower, upper = _box(model, whole)
     first = mechanism.values.astype(float)

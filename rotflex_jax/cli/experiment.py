@@ -140,9 +140,8 @@ def experiment(
                 improve=not rank_only,
             )
             begun = begun.with_next_segment(step)
-        if json_file != given.STDOUT:
-            for name, fitted in models.items():
-                terminal.print_remarks(fitted, f"fit with {name}")
+        for name, fitted in models.items():
+            terminal.print_remarks(fitted, f"fit with {name}", error=True)
         _report(begun, state, save, json_file)
         return
     with terminal.progress("Designing") as step:
@@ -159,12 +158,12 @@ def experiment(
             improve=not rank_only,
             progress=step,
         )
+    terminal.print_remarks(fitted, f"fit with {between[0]}", error=True)
     result = found.to_dict(None if save is None else str(save))
     if json_file == given.STDOUT:
         print(json.dumps(result, indent=2), flush=True)
         _write_files(found, save, plot)
         return
-    terminal.print_remarks(fitted, f"fit with {between[0]}")
     terminal.output().print(str(found), markup=False)
     names = found.channels
     rows = [

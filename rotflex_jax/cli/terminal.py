@@ -274,10 +274,10 @@ def print_recording(recording: Any) -> None:
         message(f"{finding.severity}: {finding}")
 
 
-def print_remarks(fitted: Any, of: str = "") -> None:
-    """What a fit remarks on its parameters, each as a note; of which model, where there are several."""
+def print_remarks(fitted: Any, label: str = "", *, error: bool = False) -> None:
+    """What a fit remarks on its parameters, each as a note; with a label where there are several fits."""
     for remark in fitted.remarks:
-        message(f"note: {f'{of}: ' if of else ''}{remark.sentence}.")
+        message(f"note: {f'{label}: ' if label else ''}{remark.sentence}.", error=error)
 
 
 def message(text: str, *, error: bool = False) -> None:

@@ -154,7 +154,8 @@ class LearnedTorqueMethod:
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
         """Fit the mechanism first, then the map beside it."""
-        grey_box = fit_mechanism(model, train, say).simulator
+        fitted = fit_mechanism(model, train, say)
+        grey_box = fitted.simulator
         assert isinstance(grey_box, Model)
         at = self.at or next(iter(model.mechanism.port_vectors))
         first, last = split_for_validation(train, self.share)
@@ -162,4 +163,5 @@ class LearnedTorqueMethod:
         weights = np.asarray(found.effect.weights).size if found.kept else 0
         free = len(found.model.mechanism.free_names)
         note = f"at {at}, reads like {found.formula}" if found.kept else f"no torque at {at} was kept"
+        note = "; ".join(filter(None, (note, fitted.note)))
         return Fitted(found.model, free + weights, note, one_step_predictor(found.model, train))

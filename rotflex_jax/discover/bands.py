@@ -13,7 +13,7 @@ import numpy as np
 
 from rotflex_jax.discover.result import KnownRuns, SearchResult
 from rotflex_jax.discover.verdict import Verdict
-from rotflex_jax.effects.base import full_name
+from rotflex_jax.effects.base import name_prefix
 from rotflex_jax.fit.bands import Bands, BandSource, FitForRun, mixed_bands, scatter
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism.roles import calibrations
@@ -73,7 +73,7 @@ def bands_of_sets(
     runs = KnownRuns.of(result.train, result.validation)
     baseline = result.baseline.model.mechanism
     given = {(e.name, e.at) for e in baseline.effects}  # the machine's own, in `model_of` for every run
-    calibrating = {full_name(port, effect) for effect, port in set(calibrations(baseline)) - given}
+    calibrating = {name_prefix(port, effect) for effect, port in set(calibrations(baseline)) - given}
 
     def for_run(fit: Fit, r: Recording) -> FitForRun:
         if runs.compared or runs.index(r) is not None:

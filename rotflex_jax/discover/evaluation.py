@@ -315,7 +315,7 @@ def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> 
         pairs: Fits to compare.
         location: The effect; one that has a value for each recording is no property of the machine.
     """
-    head, kind = location.full_name(), CATALOG[location.effect]
+    head, kind = location.name_prefix, CATALOG[location.effect]
     if kind.per_recording or not kind.amplitudes:
         return ""
     names = {head + n for n in kind.amplitudes}
@@ -341,7 +341,7 @@ def difference_notes(s: SuperModel, pairs: Sequence[PairedEstimates]) -> tuple[s
     own = {s.mechanism.parameter_names[i] for i in s.local}
     for effect in s.mechanism.effects:
         if effect.per_recording:
-            own |= {n for n in s.mechanism.parameter_names if n.startswith(effect.full_name())}
+            own |= {n for n in s.mechanism.parameter_names if n.startswith(effect.name_prefix)}
     return tuple(
         f"{a.name} is {a.value:.3g} {a.unit} fitted to one part of the recordings and {b.value:.3g} {b.unit} "
         f"fitted to {where}: more than the intervals allow."
@@ -353,7 +353,7 @@ def difference_notes(s: SuperModel, pairs: Sequence[PairedEstimates]) -> tuple[s
 
 def own_estimates(stage: Stage, location: EffectLocation) -> dict[str, Estimate]:
     """Estimates of one effect of a stage, by short name."""
-    head = location.full_name()
+    head = location.name_prefix
     return {e.name.removeprefix(head): e for e in stage.estimates if e.name.startswith(head)}
 
 

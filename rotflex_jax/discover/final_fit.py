@@ -178,13 +178,14 @@ class _LastFit:
         return self.stage.calibrated or self.carried_over
 
     def made(self, h: Hypothesis) -> FinalFit | Refused:
-        """The fit of a final model; or why there is none, from measured first states."""
+        """The fit of a final model; or why that from measured first states is refused, where all are."""
         state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
         variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
         structures = [
             FinalStructure.of(s, state.model.solver, v, state.order, seconds) for v in variants.values()
         ]
-        candidates = [self.best_of(structures)]
+        best = self.best_trial(structures)
+        candidates = [_Candidate(best, self.fitted_to_all(best))]
         for improved in (
             self.without_needless_offsets,
             self.with_better_laws,
@@ -197,15 +198,23 @@ class _LastFit:
         while isinstance(made, Refused) and candidates:
             made = self.accepted(candidates.pop())
         if isinstance(made, Refused):
-            self.state.say("  with fitted first states")
-            as_searched = self.accepted(self.best_of([each.as_searched() for each in structures]))
-            made = made if isinstance(as_searched, Refused) else as_searched
+            made = self.with_fitted_first_states(structures) or made
         return made if isinstance(made, Refused) else self.tested(*made)
 
-    def best_of(self, structures: Sequence[FinalStructure]) -> _Candidate:
-        """The structure with the smallest errors on validation data, fitted to all."""
-        best = min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
-        return _Candidate(best, self.fitted_to_all(best))
+    def with_fitted_first_states(
+        self, structures: Sequence[FinalStructure]
+    ) -> tuple[FinalFit, FittedStructure] | None:
+        """The fit to free runs like those of the search; None where it is refused too."""
+        self.state.say("  with fitted first states")
+        best = self.best_trial([each.as_searched() for each in structures])
+        if log_error_ratio(best.errors, self.searched) > MOST_WORSE:
+            return None
+        made = self.accepted(_Candidate(best, self.fitted_to_all(best)))
+        return None if isinstance(made, Refused) else made
+
+    def best_trial(self, structures: Sequence[FinalStructure]) -> _Tried:
+        """The structure that has the smallest errors on validation data."""
+        return min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
 
     def fitted_to_all(self, tried: _Tried) -> FittedStructure:
         """The fit to all recordings of what was fitted without the validation data.

@@ -30,7 +30,7 @@ class FinalStructure:
 
     Attributes:
         starts: Models from which fits start, with the calibrations of the recordings; the first one has the
-            parameters of the search, or of an earlier fit, and the last one usual ones.
+            parameters of the search, or of an earlier fit, and the last one usual ones, if there are several.
         local: Parameters that each recording has for itself.
         own: Calibrations that are not carried over to other recordings.
         on: What is on in the model that a user gets.
@@ -94,7 +94,7 @@ class FinalStructure:
         return dataclasses.replace(self, starts=(*self.starts, start))
 
     def as_searched(self) -> "FinalStructure":
-        """The same with fitted first states, from the parameters of the search alone."""
+        """The same with fitted first states, from the parameters of the search without usual ones."""
         return dataclasses.replace(self, starts=self.starts[:1], first="fitted")
 
     def carrying(self, *locations: EffectLocation) -> "FinalStructure":

@@ -17,7 +17,7 @@ from rotflex_jax.discover.stepwise import fit_baseline
 from rotflex_jax.discover.supermodel import build, scales
 from rotflex_jax.discover.validation import ValidationSet, validate
 from rotflex_jax.effects import LearnedTorque, Viscous
-from rotflex_jax.effects.base import full_name
+from rotflex_jax.effects.base import name_prefix
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare, process_noise_ports
 from rotflex_jax.fit.plausibility import motion
@@ -298,7 +298,7 @@ def _own_terms(m: Mechanism, at: str) -> tuple[str, ...]:
 
 def _without_map(stage: Stage, at: str) -> Stage:
     """The stage of the model without the map, whose weights are all zero there."""
-    head, m = full_name(at, LearnedTorque.name), stage.model.mechanism
+    head, m = name_prefix(at, LearnedTorque.name), stage.model.mechanism
     return dataclasses.replace(
         stage,
         model=dataclasses.replace(stage.model, mechanism=m.without(LearnedTorque.name, at)),

@@ -342,7 +342,7 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
 
 def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
     """Which parameters of an effect the recordings do not speak for."""
-    head = location.full_name()
+    head = location.name_prefix
     return tuple(r.sentence for r in remarks if r.kind == BEYOND_RECORDINGS and r.parameter.startswith(head))
 
 

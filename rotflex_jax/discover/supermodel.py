@@ -15,7 +15,7 @@ from jaxtyping import Float, Shaped
 
 from rotflex_jax.checks import entries, shown
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.base import Effect, Scale, driven_place, full_name
+from rotflex_jax.effects.base import Effect, Scale, driven_place, full_name, name_prefix
 from rotflex_jax.effects.labels import law_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.plausibility import motion
@@ -86,8 +86,13 @@ class EffectLocation(NamedTuple):
     def __str__(self) -> str:
         return f"{self.effect} at {self.port}"
 
-    def full_name(self, parameter: str = "") -> str:
-        """Name of one of its parameters; what all of them begin with where none is given."""
+    @property
+    def name_prefix(self) -> str:
+        """What the full names of its parameters begin with."""
+        return name_prefix(self.port, self.effect)
+
+    def full_name(self, parameter: str) -> str:
+        """Name of one of its parameters in a mechanism."""
         return full_name(self.port, self.effect, parameter)
 
     def contains(self, other: "EffectLocation") -> bool:
@@ -263,7 +268,7 @@ class SuperModel:
 
     def parameter_indices(self, location: EffectLocation) -> list[int]:
         """Indices of an effect's parameters in the values."""
-        head = location.full_name()
+        head = location.name_prefix
         return [i for i, n in enumerate(self.mechanism.parameter_names) if n.startswith(head)]
 
     @functools.cached_property

@@ -64,13 +64,18 @@ def port_and_signal(place: str) -> tuple[str, str]:
     return port, signal
 
 
-def full_name(port: str, effect: str, parameter: str = "") -> str:
-    """Name of an effect's parameter in a mechanism; what all of them begin with where none is given.
+def name_prefix(port: str, effect: str) -> str:
+    """What the full names of an effect's parameters begin with."""
+    return f"{port}.{effect}."
 
-    >>> full_name("hub", "coulomb", "level"), full_name("hub", "coulomb")
-    ('hub.coulomb.level', 'hub.coulomb.')
+
+def full_name(port: str, effect: str, parameter: str) -> str:
+    """Name of an effect's parameter in a mechanism.
+
+    >>> full_name("hub", "coulomb", "level")
+    'hub.coulomb.level'
     """
-    return f"{port}.{effect}.{parameter}"
+    return name_prefix(port, effect) + parameter
 
 
 class Stamp(NamedTuple):
@@ -281,8 +286,13 @@ class Effect(abc.ABC):
         """The measured signal that drives it in the place of the voltage; empty for most."""
         return port_and_signal(self.at)[1] if self.acts_on == "signal" else ""
 
-    def full_name(self, parameter: str = "") -> str:
-        """Name of one of its parameters in a mechanism; see the function of that name."""
+    @property
+    def name_prefix(self) -> str:
+        """What the full names of its parameters begin with."""
+        return name_prefix(self.at, self.name)
+
+    def full_name(self, parameter: str) -> str:
+        """Name of one of its parameters in a mechanism."""
         return full_name(self.at, self.name, parameter)
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import checks
-from rotflex_jax.effects.base import Effect, full_name
+from rotflex_jax.effects.base import Effect, name_prefix
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import noise_std
 from rotflex_jax.experiment.discrimination import (
@@ -296,7 +296,7 @@ def _rival_pair(
         reference = DiscriminationProblem((pair[0], pair[1]), Ts, limits).scaled_to_limits(second_noise.u)
     u = np.asarray(reference, float)
     fitted = pair[rival]
-    prefix = full_name(locations[rival][1], locations[rival][0])
+    prefix = name_prefix(locations[rival][1], locations[rival][0])
     if known[rival]:
         held = {i for i, n in enumerate(fitted.mechanism.parameter_names) if n.startswith(prefix)}
         fitted = dataclasses.replace(fitted, free=tuple(i for i in fitted.free if i not in held))

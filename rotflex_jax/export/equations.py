@@ -138,7 +138,7 @@ def text(model: Mechanism | Model) -> str:
     for effect in mechanism.effects:
         if effect.is_linear and not effect.order:
             found = _parameters(mechanism, effect)
-            lines += [f"    {effect.at}.{effect.name}.{n} = {_plain(v)} {u}".rstrip() for n, v, u, _ in found]
+            lines += [f"    {effect.full_name(n)} = {_plain(v)} {u}".rstrip() for n, v, u, _ in found]
     return "\n".join(map(one_line, lines)) + "\n"
 
 

@@ -20,7 +20,7 @@ from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
-# Arrays of programs hold at least so many windows, where runs start again at all: they cost next to nothing.
+# Arrays of programs hold at least so many windows, where runs start again at all: more cost next to nothing.
 LEAST_WINDOWS = 16
 
 

@@ -332,16 +332,16 @@ class GreyBoxProblem:
         return e if self.bend is None else bent(e, np.zeros((*e.shape, 0)), self.bend)[0]
 
     @functools.cached_property
-    def _together(self) -> list[tuple[slice, StackedRecordings]]:
+    def _calls(self) -> list[tuple[slice, StackedRecordings]]:
         """Which recordings run in one call of a program, with their samples on the device.
 
         One at a time, so that a program does not depend on how many there are; all at once where devices
         share them.
         """
         R = len(self.dataset.recordings)
-        each = [slice(0, R)] if self.layout.mesh else [slice(r, r + 1) for r in range(R)]
+        calls = [slice(0, R)] if self.layout.mesh else [slice(r, r + 1) for r in range(R)]
         data = self.dataset.data
-        return [(rows, StackedRecordings(*(jnp.asarray(part[rows]) for part in data))) for rows in each]
+        return [(rows, StackedRecordings(*(jnp.asarray(part[rows]) for part in data))) for rows in calls]
 
     def _run_inputs(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
@@ -351,12 +351,13 @@ class GreyBoxProblem:
         x0, window = (point.x0, stage.windows.index) if many else (point.x0[:, 0], None)
         return [
             (rows, (x0[rows], samples, K[rows], None if window is None else window[rows]))
-            for rows, samples in self._together
+            for rows, samples in self._calls
         ]
 
     def _joined(self, results: list[tuple[jax.Array, ...]]) -> tuple[np.ndarray, ...]:
         """Results of all recordings in the place of those of each call."""
-        return tuple(map(np.concatenate, zip(*jax.device_get(results), strict=True)))
+        parts = jax.device_get(results)
+        return parts[0] if len(parts) == 1 else tuple(map(np.concatenate, zip(*parts, strict=True)))
 
     def robust(self, end: FitAttempt, beyond: float) -> tuple["GreyBoxProblem", FitAttempt]:
         """The same problem with large errors bent, and its end.
@@ -389,9 +390,10 @@ class GreyBoxProblem:
     def horizons(self, seconds: float | None, process_noise: ProcessNoise) -> list[Windows]:
         """Windows of some seconds, or whole recordings, behind those of shorter horizons for restarts.
 
-        They have the same number of windows, so that all share one compiled program, also with those of
-        recordings of nearby lengths. A solver of optimistix would compile a program for each; predictions,
-        and fits without restarts, have no use for them.
+        They have the same number of windows, so that all share one compiled program. Fits of recordings of
+        other lengths share it too, since the number is rounded up: with restarts to the most that they need.
+        A solver of optimistix would compile a program for each; predictions, and fits without restarts, have
+        no use for shorter horizons.
         """
         of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
         lengths = [r.N * r.Ts for r in self.dataset.recordings]
@@ -403,7 +405,8 @@ class GreyBoxProblem:
             length *= NEXT_HORIZON
         last = Windows.whole(self.dataset) if seconds is None else of_seconds(seconds)
         most = max(windows.number for windows in (*found, last))
-        number = 1 if most == 1 else program_length(most, LEAST_WINDOWS)
+        least = program_length(MOST_WINDOWS if found else LEAST_WINDOWS, LEAST_WINDOWS)
+        number = 1 if most == 1 else program_length(most, least)
         return [windows.filled_up(number) for windows in (*found, last)]
 
     def solve(

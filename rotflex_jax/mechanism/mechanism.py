@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Real
 
 from rotflex_jax import checks
 from rotflex_jax.checks import number, shown
-from rotflex_jax.effects.base import DryFriction, Effect, Linear, Memory, driven_place, full_name
+from rotflex_jax.effects.base import DryFriction, Effect, Linear, Memory, driven_place, name_prefix
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.quantity import TURNING, Quantity, Units
@@ -288,7 +288,7 @@ class Mechanism:
             raise InputError(
                 f"{name!r} at {at!r} was to be removed, but the mechanism has {present}; name one."
             )
-        prefix = full_name(at, name)
+        prefix = name_prefix(at, name)
         trusted = frozenset(t for t in self.trusted if not t.startswith(prefix))
         taken, removed = {e.signal for e in others}, self.effect(name, at).signal
         signals = tuple(s for s in self.signals if s != removed or s in taken)
@@ -364,7 +364,7 @@ class Mechanism:
     @functools.cached_property
     def followers(self) -> dict[str, str]:
         """Full name of each parameter that always equals another one -> full name of the other."""
-        heads = ((e.full_name(), e.follows) for e in self.effects)
+        heads = ((e.name_prefix, e.follows) for e in self.effects)
         return {head + name: head + other for head, follows in heads for name, other in follows.items()}
 
     @functools.cached_property
