@@ -365,6 +365,7 @@ def test_every_part_of_a_search_knows_the_constants_of_each_recording(servo_reco
     ("physics", "wanted"),
     [
         ({}, ["coulomb"]),
+        ({"lost": 0.4}, ["gear_friction"]),
         ({"lost": 0.4, "limit": 1.25}, ["gear_friction", "torque_saturation"]),
     ],
     ids=str,

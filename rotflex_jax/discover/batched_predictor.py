@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rotflex_jax.discover.supermodel import ReducedModel, SuperModel
-from rotflex_jax.fit.dataset import LEAST_WINDOWS, StackedRecordings
+from rotflex_jax.fit.dataset import StackedRecordings, padded_windows
 from rotflex_jax.fit.problem import predicted
 from rotflex_jax.mechanism import Mechanism, Solver
 from rotflex_jax.mechanism.assembly import whole_state
@@ -150,7 +150,7 @@ class BatchedPredictor:
         Its windows are filled up to a number that recordings of other lengths share.
         """
         values, number = parameter_set.values, parameter_set.x0.shape[1]
-        filled = program_length(number, LEAST_WINDOWS)
+        filled = padded_windows(number)
         if self.constants is not None:
             values = values.copy()
             known = ~np.isnan(self.constants)

@@ -318,7 +318,7 @@ def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> 
     head, kind = location.name_prefix, CATALOG[location.effect]
     if kind.per_recording or not kind.amplitudes:
         return ""
-    names = {head + n for n in kind.amplitudes}
+    names = {location.full_name(n) for n in kind.amplitudes}
     for training, other, where in pairs:
         for a, b in differing(training, other):
             if a.name in names:

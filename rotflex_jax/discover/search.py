@@ -43,7 +43,7 @@ from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, valid
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit.dataset import LEAST_WINDOWS, padded_length, prepare, process_noise_ports
+from rotflex_jax.fit.dataset import padded_length, padded_windows, prepare, process_noise_ports
 from rotflex_jax.fit.plausibility import check_signs
 from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
@@ -177,7 +177,7 @@ def _kind_of_programs(horizons: Horizons) -> tuple[Any, ...]:
     sets = (horizons.prediction.problem, horizons.prediction.validation.problem)
     shapes = tuple((program_length(p.seen.shape[1]), *p.dataset.data.y.shape[::2]) for p in sets)
     problem = sets[0]
-    windows = program_length(problem.windows.number, LEAST_WINDOWS)
+    windows = padded_windows(problem.windows.number)
     return problem.supermodel.mechanism.structure, problem.predictor.solver, shapes, windows
 
 

@@ -17,11 +17,11 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.initial_state import rough_states
 from rotflex_jax.mechanism.linear import inverse_mass, linearise
 from rotflex_jax.metrics import window_starts
-from rotflex_jax.models.model import Model
+from rotflex_jax.models.model import Model, program_length
 from rotflex_jax.recording import Recording
 
-# Arrays of programs hold at least so many windows, where runs start again at all: more cost next to nothing.
-LEAST_WINDOWS = 16
+# Least number of windows in arrays of programs, where runs start again at all: more cost next to nothing.
+_LEAST_WINDOWS = 16
 
 
 class StackedRecordings(NamedTuple):
@@ -160,6 +160,11 @@ def padded_length(recordings: Sequence[Recording]) -> int:
     longest = max((r.N for r in recordings), default=0)
     step = 2 ** max(0, longest.bit_length() - 4)
     return -(-longest // step) * step
+
+
+def padded_windows(number: int) -> int:
+    """A number of windows in arrays that runs with about as many share, and with it the compiled code."""
+    return program_length(number, _LEAST_WINDOWS)
 
 
 def stack(recordings: Sequence[Recording], model: Model, length: int | None = None) -> StackedRecordings:

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import (
-    LEAST_WINDOWS,
     Dataset,
     StackedRecordings,
     Windows,
+    padded_windows,
     process_noise_ports,
 )
 from rotflex_jax.fit.plausibility import AT_BOUND
@@ -28,7 +28,7 @@ from rotflex_jax.fit.problem import (
 )
 from rotflex_jax.mechanism import kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
-from rotflex_jax.models.model import Model, program_length
+from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import (
     LARGEST_STEP,
     Minimum,
@@ -98,6 +98,12 @@ def bent(
     """
     root = np.sqrt(1 + (e / bend) ** 2)
     return e * np.sqrt(2 / (root + 1)), J * (np.sqrt((root + 1) / 2) / root)[..., None]
+
+
+def _joined(results: Sequence[Any]) -> Any:
+    """Results of all recordings, NumPy arrays, in the place of those of each call of a program."""
+    first, *others = jax.device_get(results)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), first, *others) if others else first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,7 +317,7 @@ class GreyBoxProblem:
         values, slopes = self.physical(point)
         moved = np.array((*point.free, *point.local))
         inputs = self._run_inputs(point, stage, K)
-        y_hat, J = self._joined(
+        y_hat, J = _joined(
             [
                 runs_with_slopes(self.layout, values[rows], slopes[rows], moved, *given)
                 for rows, given in inputs
@@ -327,7 +333,7 @@ class GreyBoxProblem:
         """The same errors by runs without slopes, which cost less."""
         values, _ = self.physical(point)
         inputs = self._run_inputs(point, stage, K)
-        (y_hat,) = self._joined([(runs(self.layout, values[rows], *given),) for rows, given in inputs])
+        y_hat = _joined([runs(self.layout, values[rows], *given) for rows, given in inputs])
         e = np.where(self.dataset.data.seen[:, :, None] > 0, y_hat - self.dataset.data.y, 0.0)
         return e if self.bend is None else bent(e, np.zeros((*e.shape, 0)), self.bend)[0]
 
@@ -353,11 +359,6 @@ class GreyBoxProblem:
             (rows, (x0[rows], samples, K[rows], None if window is None else window[rows]))
             for rows, samples in self._calls
         ]
-
-    def _joined(self, results: list[tuple[jax.Array, ...]]) -> tuple[np.ndarray, ...]:
-        """Results of all recordings in the place of those of each call."""
-        parts = jax.device_get(results)
-        return parts[0] if len(parts) == 1 else tuple(map(np.concatenate, zip(*parts, strict=True)))
 
     def robust(self, end: FitAttempt, beyond: float) -> tuple["GreyBoxProblem", FitAttempt]:
         """The same problem with large errors bent, and its end.
@@ -405,8 +406,7 @@ class GreyBoxProblem:
             length *= NEXT_HORIZON
         last = Windows.whole(self.dataset) if seconds is None else of_seconds(seconds)
         most = max(windows.number for windows in (*found, last))
-        least = program_length(MOST_WINDOWS if found else LEAST_WINDOWS, LEAST_WINDOWS)
-        number = 1 if most == 1 else program_length(most, least)
+        number = 1 if most == 1 else padded_windows(max(most, MOST_WINDOWS) if found else most)
         return [windows.filled_up(number) for windows in (*found, last)]
 
     def solve(

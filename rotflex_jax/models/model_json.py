@@ -14,7 +14,7 @@ from jaxtyping import Float
 from rotflex_jax import effects
 from rotflex_jax.checks import shown
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.base import Effect
+from rotflex_jax.effects.base import Effect, full_name
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
 from rotflex_jax.mechanism.intersample import Intersample
@@ -281,7 +281,7 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
     units = Units(*given["units"], input=given.get("input_unit", "V"))
     built = [_effect_back(e, units) for e in given["effects"]]
     trusted = [
-        f"{e['at']}.{e['effect']}.{name}"
+        full_name(e["at"], e["effect"], name)
         for e in given["effects"]
         for name, p in e["parameters"].items()
         if p["trusted"]
