@@ -9,10 +9,11 @@ from scipy.optimize import lsq_linear
 
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.hypothesis import CandidateStart
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, Whitener, with_effect
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.pairs import (
     best_candidates,
+    best_refitted,
     find_pair,
     is_unexplained,
     pairs_passed_by,
@@ -32,9 +33,11 @@ from rotflex_jax.discover.score_test import (
 from rotflex_jax.discover.selection import predictions_apart
 from rotflex_jax.discover.stepwise import fit_baseline
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, build, scales
-from rotflex_jax.discover.validation import Horizons, as_free_run
+from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, as_free_run
 from rotflex_jax.fit.dataset import prepare
+from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.models.model import Model
+from rotflex_jax.parameters import Transform
 
 SAMPLES = 60
 
@@ -208,6 +211,66 @@ def test_the_best_candidates_of_both_horizons():
     assert best_candidates(*tests, 10) == [places[0], places[2], places[1]]
     assert best_candidates(*tests, 1) == places[:1]
     assert ScoreTest([], {}, None).pairs([]) == []
+
+
+def test_what_each_horizon_gained_most_by_is_refitted_together():
+    """The best two that were refitted alone, from where these fits ended; one law of one thing at a port."""
+    recordings = sp.recordings(sp.records())
+    wanted = (
+        (fx.Stribeck, "hub"),
+        (fx.Dahl, "hub"),
+        (fx.CubicSpring, "joint"),
+        (fx.Viscous, "arm"),
+    )
+    s = build(sp.baseline(), wanted, scales(Model(sp.baseline()), recordings, 0.1))
+    h = Hypothesis(
+        locations=s.calibrations,
+        free=(),
+        local=(),
+        z=Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values),
+        local_z=np.zeros((2, 0)),
+        x0=np.zeros((2, 1, 4)),
+        K=np.zeros((2, Layout.of(s.mechanism.structure).size, 2)),
+        process_noise={},
+        whitener=Whitener(np.eye(2)),
+    )
+    stribeck, dahl, spring, viscous = (EffectLocation(e.name, at) for e, at in wanted)
+
+    def validated(h, gain: float, **more) -> ValidatedHypothesis:
+        return ValidatedHypothesis(h, np.array([gain / 2, gain / 2]), h, np.ones(2), **more)
+
+    def alone(location, gains: tuple[float, float], sizes: tuple[float, float]) -> ValidatedHypothesis:
+        shape = np.array(s.candidates[location].probes[0][0])
+        fits = [with_effect(s, h, CandidateStart(location, x * shape), 1.0) for x in sizes]
+        runs = validated(fits[1], gains[1])
+        return validated(fits[0], gains[0], location=location, free_run=runs)
+
+    current = validated(h, 0.0, free_run=validated(h, 0.0))
+    for_predictions = alone(spring, (100.0, -5.0), (1.0, 2.0))
+    for_free_runs = alone(dahl, (-5.0, 30.0), (3.0, 4.0))
+    known = [
+        alone(viscous, (20.0, 3.0), (1.0, 1.0)),
+        for_predictions,
+        alone(stribeck, (0.0, 29.0), (1.0, 1.0)),
+    ]
+    both = best_refitted(s, current, [*known, for_free_runs])
+    for pair, place in zip(both, (0, 1), strict=True):
+        assert set(pair.locations) == {spring, dahl}
+        for start in pair.starts:
+            size = {spring: (1.0, 2.0), dahl: (3.0, 4.0)}[start.location][place]
+            np.testing.assert_allclose(
+                start.values, size * np.array(s.candidates[start.location].probes[0][0])
+            )
+    # Two laws of the friction at the hub lead: the better one goes with what comes after them.
+    frictions = [alone(stribeck, (90.0, 29.0), (1.0, 1.0)), for_free_runs, known[0]]
+    assert set(best_refitted(s, current, frictions)[0].locations) == {stribeck, viscous}
+    # None that gained nothing, is no refit beside this model, or was not fitted at both horizons.
+    for few in ([], [for_predictions], [for_predictions, alone(dahl, (-1.0, 0.0), (1.0, 1.0))]):
+        assert best_refitted(s, current, few) is None
+    beside_another = dataclasses.replace(current, hypothesis=for_predictions.hypothesis)
+    assert best_refitted(s, beside_another, [*known, for_free_runs]) is None
+    predicted_alone = dataclasses.replace(known[0], free_run=None)
+    assert best_refitted(s, current, [for_predictions, predicted_alone]) is None
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,10 @@ Two effects may hide each other: alone, each is refused, since the other one's e
 explains. The score test says without a run what two candidates would gain together; the best few pairs are
 refitted at both horizons, and validation data decide by the rules of single effects. A pair must pass them
 beside the model as it is and beside each of its members alone.
+
+The score test is of first order, and dry friction beside a poor model is not. So the two effects are refitted
+together, too, that gained most when each was refitted alone: what predictions ask for and what free runs ask
+for may each be refused for what the other one explains.
 """
 
 import dataclasses
@@ -21,7 +25,7 @@ from rotflex_jax.discover.hypothesis import (
     without,
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
-from rotflex_jax.discover.score_test import PairScore, ScoreTest
+from rotflex_jax.discover.score_test import PairScore, PairStart, ScoreTest
 from rotflex_jax.discover.selection import (
     TRAIN_NATS,
     admissible,
@@ -32,7 +36,7 @@ from rotflex_jax.discover.selection import (
     shares_of_gain,
 )
 from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
 from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS
 from rotflex_jax.effects import CATALOG
@@ -88,6 +92,47 @@ def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[Pa
     return [(tests[0][p], tests[1][p]) for p in best]
 
 
+def best_refitted(
+    s: SuperModel, current: ValidatedHypothesis, known: Sequence[ValidatedHypothesis]
+) -> tuple[PairStart, PairStart] | None:
+    """The two effects that validation data gained most by beside a model, each refitted alone.
+
+    Args:
+        s: What all are hypotheses of.
+        current: The model.
+        known: Models that were fitted and validated.
+
+    Returns:
+        Where their refits have ended, for predictions and for free runs; None where there are no two that
+        gained something and are not laws of the same thing.
+    """
+    effects = s.without_calibrations
+    now = effects(current.hypothesis.locations)
+    alone = {
+        v.location: v
+        for v in known
+        if v.location and v.free_run and effects(v.hypothesis.locations) == now | {v.location}
+    }
+    if not alone:
+        return None
+    shares = dict(zip(alone, shares_of_gain(list(alone.values()), current), strict=True))
+    best = sorted((p for p in shares if shares[p] > 0), key=lambda p: -shares[p])
+    pair = next(((best[0], p) for p in best[1:] if p not in s.other_laws(best[0])), None)
+    if pair is None:
+        return None
+
+    def ends(fits: Sequence[Hypothesis]) -> PairStart:
+        a, b = (
+            CandidateStart(p, h.mean_values(s)[s.parameter_indices(p)])
+            for p, h in zip(pair, fits, strict=True)
+        )
+        return PairStart((a, b))
+
+    fits = [alone[p] for p in pair]
+    runs = [v.free_run.hypothesis for v in fits if v.free_run]
+    return ends([v.hypothesis for v in fits]), ends(runs)
+
+
 def _is_a_simpler_one(pair: Pair, tests: Sequence[dict[Pair, PairScore]]) -> bool:
     """Whether a pair gains nothing over the one with a simpler effect in the place of a richer one."""
     for rich, other in (pair, pair[::-1]):
@@ -113,7 +158,7 @@ def refit_pairs(
 def validated_pairs(
     horizons: Horizons,
     beside: ValidatedHypothesis,
-    pairs: Sequence[tuple[PairScore, PairScore]],
+    pairs: Sequence[tuple[PairStart, PairStart]],
     is_plausible: Callable[[Hypothesis, EffectLocation], bool],
     grown: Sequence[Hypothesis] | None = None,
 ) -> dict[Pair, ValidatedHypothesis]:
@@ -122,7 +167,7 @@ def validated_pairs(
     Args:
         horizons: Training and validation recordings.
         beside: The model that they are added to.
-        pairs: Their scores of predictions and of free runs.
+        pairs: Where their refits start, for predictions and for free runs.
         is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
         grown: The models with them, where they were refitted to predictions before.
     """
@@ -238,12 +283,16 @@ def find_pair(
         known: Models that were fitted and validated at both horizons before; where one is a pair without a
             member, it is not fitted again.
     """
-    pairs = promising_pairs(*tests)
+    s = horizons.prediction.problem.supermodel
+    pairs: list[tuple[PairStart, PairStart]] = [*promising_pairs(*tests)]
+    best = best_refitted(s, current, known)
+    if best and all(set(best[0].locations) != set(a.locations) for a, _ in pairs):
+        pairs.append(best)
     if not pairs:
         return None, []
     say("looking one step further, refitting " + ", ".join(_named(a.locations) for a, _ in pairs))
     problem = horizons.prediction.problem
-    measured, noise, s = problem.measured_values, problem.noise, problem.supermodel
+    measured, noise = problem.measured_values, problem.noise
     tried = validated_pairs(horizons, current, pairs, is_plausible)
     _say_gains(tried, current, say)
     able = {p: v for p, v in tried.items() if admissible(v, current, measured, noise)}

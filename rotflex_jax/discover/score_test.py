@@ -229,27 +229,36 @@ def _amplitudes(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class PairScore:
+class PairStart:
+    """Where a refit of two candidates starts.
+
+    Attributes:
+        starts: Of each.
+    """
+
+    starts: tuple[CandidateStart, CandidateStart]
+
+    @property
+    def locations(self) -> tuple[EffectLocation, EffectLocation]:
+        """Effects and ports."""
+        return self.starts[0].location, self.starts[1].location
+
+
+@dataclasses.dataclass(frozen=True)
+class PairScore(PairStart):
     """What two candidates would gain together.
 
     Attributes:
-        starts: Where a refit of each should start.
         gain: Log-likelihood gained to first order [nat].
         nats: The same, less half a log N per parameter they need [nat].
         more: How much more than the penalised better one of them alone [nat].
         synergy: How much more than both alone [nat]: what each hides of the other.
     """
 
-    starts: tuple[CandidateStart, CandidateStart]
     gain: float
     nats: float
     more: float
     synergy: float
-
-    @property
-    def locations(self) -> tuple[EffectLocation, EffectLocation]:
-        """Effects and ports."""
-        return self.starts[0].location, self.starts[1].location
 
 
 @dataclasses.dataclass(frozen=True)
