@@ -65,6 +65,21 @@ def problem(found: tuple[Recording, ...]) -> LikelihoodProblem:
     return LikelihoodProblem.of(supermodel(), SOLVER, dataset(found), ("hub", "joint"))
 
 
+def unfitted(s: SuperModel, count: int = 2) -> Hypothesis:
+    """The baseline of a super-model as it is, at rest, with nothing to fit and nothing compiled."""
+    return Hypothesis(
+        locations=s.calibrations,
+        free=(),
+        local=(),
+        z=Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values),
+        local_z=np.zeros((count, 0)),
+        x0=np.zeros((count, 1, 4)),
+        K=np.zeros((count, Layout.of(s.mechanism.structure).size, 2)),
+        process_noise={},
+        whitener=Whitener(np.eye(2)),
+    )
+
+
 def start(at: LikelihoodProblem, wrong: float = 0.0, locations=None) -> Hypothesis:
     """The baseline in a free run from rest, its free numbers wrong by a share."""
     s = supermodel()

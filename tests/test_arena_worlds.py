@@ -246,6 +246,6 @@ def test_page_of_worlds(tmp_path):
     first, second = page.read_text().split("Worlds 3000 to 3069, which were read before")
     for part in (first, second):
         assert part.count("| link with gauge | 1 | 1/1 | 0/1 | 1/1 | 0 in 0/1 worlds |") == 1
-    assert "no revision of the search has seen" in first and "3000 to 3069" not in text
+    assert "no revision of the search had seen when they were run" in first and "3000 to 3069" not in text
     assert "failed 1" in summary([row, failed])
     assert publish_worlds([failed], tmp_path / "no.json") == []

@@ -1,6 +1,7 @@
 """Two candidates at once: the joint score is dense least squares, and which pairs are worth a refit."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from scipy.optimize import lsq_linear
 
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, Whitener, with_effect
+from rotflex_jax.discover import pairs
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_effect
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.pairs import (
     best_candidates,
@@ -23,6 +25,8 @@ from rotflex_jax.discover.pairs import (
 )
 from rotflex_jax.discover.score_test import (
     MAX_THRESHOLD_AMPLITUDE,
+    PairScore,
+    PairStart,
     Score,
     ScoreTest,
     _Column,
@@ -32,12 +36,10 @@ from rotflex_jax.discover.score_test import (
 )
 from rotflex_jax.discover.selection import predictions_apart
 from rotflex_jax.discover.stepwise import fit_baseline
-from rotflex_jax.discover.supermodel import Candidate, EffectLocation, build, scales
+from rotflex_jax.discover.supermodel import Candidate, EffectLocation, SuperModel, build, scales
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, as_free_run
 from rotflex_jax.fit.dataset import prepare
-from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.models.model import Model
-from rotflex_jax.parameters import Transform
 
 SAMPLES = 60
 
@@ -213,64 +215,131 @@ def test_the_best_candidates_of_both_horizons():
     assert ScoreTest([], {}, None).pairs([]) == []
 
 
-def test_what_each_horizon_gained_most_by_is_refitted_together():
-    """The best two that were refitted alone, from where these fits ended; one law of one thing at a port."""
-    recordings = sp.recordings(sp.records())
-    wanted = (
-        (fx.Stribeck, "hub"),
-        (fx.Dahl, "hub"),
-        (fx.CubicSpring, "joint"),
-        (fx.Viscous, "arm"),
-    )
-    s = build(sp.baseline(), wanted, scales(Model(sp.baseline()), recordings, 0.1))
-    h = Hypothesis(
-        locations=s.calibrations,
-        free=(),
-        local=(),
-        z=Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values),
-        local_z=np.zeros((2, 0)),
-        x0=np.zeros((2, 1, 4)),
-        K=np.zeros((2, Layout.of(s.mechanism.structure).size, 2)),
-        process_noise={},
-        whitener=Whitener(np.eye(2)),
-    )
-    stribeck, dahl, spring, viscous = (EffectLocation(e.name, at) for e, at in wanted)
+STRIBECK, DAHL = EffectLocation("stribeck", "hub"), EffectLocation("dahl", "hub")
+SPRING, VISCOUS = EffectLocation("cubic_spring", "joint"), EffectLocation("viscous", "arm")
 
-    def validated(h, gain: float, **more) -> ValidatedHypothesis:
-        return ValidatedHypothesis(h, np.array([gain / 2, gain / 2]), h, np.ones(2), **more)
 
-    def alone(location, gains: tuple[float, float], sizes: tuple[float, float]) -> ValidatedHypothesis:
-        shape = np.array(s.candidates[location].probes[0][0])
-        fits = [with_effect(s, h, CandidateStart(location, x * shape), 1.0) for x in sizes]
-        runs = validated(fits[1], gains[1])
-        return validated(fits[0], gains[0], location=location, free_run=runs)
+@pytest.fixture(scope="module")
+def s() -> SuperModel:
+    wanted = ((fx.Stribeck, "hub"), (fx.Dahl, "hub"), (fx.CubicSpring, "joint"), (fx.Viscous, "arm"))
+    return build(sp.baseline(), wanted, scales(Model(sp.baseline()), sp.recordings(sp.records()), 0.1))
 
-    current = validated(h, 0.0, free_run=validated(h, 0.0))
-    for_predictions = alone(spring, (100.0, -5.0), (1.0, 2.0))
-    for_free_runs = alone(dahl, (-5.0, 30.0), (3.0, 4.0))
-    known = [
-        alone(viscous, (20.0, 3.0), (1.0, 1.0)),
-        for_predictions,
-        alone(stribeck, (0.0, 29.0), (1.0, 1.0)),
-    ]
-    both = best_refitted(s, current, [*known, for_free_runs])
+
+def usual(s: SuperModel, location: EffectLocation) -> np.ndarray:
+    return np.array(s.candidates[location].probes[0][0])
+
+
+def grown(s: SuperModel, h: Hypothesis, location: EffectLocation, size: float) -> Hypothesis:
+    """A hypothesis with an effect of so many times its usual size; likelier on training data the larger."""
+    more = with_effect(s, h, CandidateStart(location, size * usual(s, location)), 1.0)
+    return dataclasses.replace(more, densities=np.full((2, 1), size))
+
+
+def validated(h: Hypothesis, gain: float, **more) -> ValidatedHypothesis:
+    return ValidatedHypothesis(h, np.array([gain / 2, gain / 2]), h, np.ones(2), **more)
+
+
+def alone(s, location, gains: tuple[float, float], sizes=(1.0, 1.0), h=None) -> ValidatedHypothesis:
+    """An effect beside a model, the baseline if None: gains on validation data and sizes at both horizons."""
+    fits = [grown(s, h or sp.unfitted(s), location, x) for x in sizes]
+    return validated(fits[0], gains[0], location=location, free_run=validated(fits[1], gains[1]))
+
+
+def placed(found) -> set[EffectLocation]:
+    return set(found[0].locations)
+
+
+def baseline_of(s: SuperModel) -> ValidatedHypothesis:
+    h = sp.unfitted(s)
+    return validated(h, 0.0, free_run=validated(h, 0.0))
+
+
+def test_what_each_horizon_gained_most_by_is_refitted_together(s):
+    """From where the refits of each alone have ended, and from these models."""
+    known = [alone(s, VISCOUS, (20.0, 3.0)), alone(s, SPRING, (100.0, -5.0), (1.0, 2.0))]
+    known += [alone(s, STRIBECK, (0.0, 29.0)), alone(s, DAHL, (-5.0, 30.0), (3.0, 4.0))]
+    both = best_refitted(s, baseline_of(s), known)
     for pair, place in zip(both, (0, 1), strict=True):
-        assert set(pair.locations) == {spring, dahl}
-        for start in pair.starts:
-            size = {spring: (1.0, 2.0), dahl: (3.0, 4.0)}[start.location][place]
-            np.testing.assert_allclose(
-                start.values, size * np.array(s.candidates[start.location].probes[0][0])
-            )
-    # Two laws of the friction at the hub lead: the better one goes with what comes after them.
-    frictions = [alone(stribeck, (90.0, 29.0), (1.0, 1.0)), for_free_runs, known[0]]
-    assert set(best_refitted(s, current, frictions)[0].locations) == {stribeck, viscous}
-    # None that gained nothing, is no refit beside this model, or was not fitted at both horizons.
-    for few in ([], [for_predictions], [for_predictions, alone(dahl, (-1.0, 0.0), (1.0, 1.0))]):
-        assert best_refitted(s, current, few) is None
-    beside_another = dataclasses.replace(current, hypothesis=for_predictions.hypothesis)
-    assert best_refitted(s, beside_another, [*known, for_free_runs]) is None
-    predicted_alone = dataclasses.replace(known[0], free_run=None)
-    assert best_refitted(s, current, [for_predictions, predicted_alone]) is None
+        assert pair.locations == (SPRING, DAHL)
+        for start, h, sizes in zip(pair.starts, pair.alone, ((1.0, 2.0), (3.0, 4.0)), strict=True):
+            np.testing.assert_allclose(start.values, sizes[place] * usual(s, start.location))
+            assert set(h.locations) - set(s.calibrations) == {start.location}
+            np.testing.assert_allclose(h.mean_values(s)[s.parameter_indices(start.location)], start.values)
+    # What predictions gain by another effect as well, free runs need not.
+    known = [alone(s, SPRING, (1.0, 0.3)), alone(s, VISCOUS, (0.95, 0.2)), alone(s, DAHL, (0.0, 1.0))]
+    assert placed(best_refitted(s, baseline_of(s), known)) == {SPRING, DAHL}
+
+
+def test_where_one_effect_leads_at_both_horizons_the_next_one_joins(s):
+    """Shares of both gains decide, and of two laws of the friction at the hub one counts."""
+    known = [alone(s, DAHL, (100.0, 30.0)), alone(s, SPRING, (20.0, 20.0)), alone(s, VISCOUS, (30.0, 3.0))]
+    assert placed(best_refitted(s, baseline_of(s), known)) == {DAHL, SPRING}
+    known = [alone(s, STRIBECK, (90.0, 29.0)), alone(s, DAHL, (-5.0, 30.0)), alone(s, VISCOUS, (20.0, 3.0))]
+    assert placed(best_refitted(s, baseline_of(s), known)) == {STRIBECK, VISCOUS}
+
+
+def test_of_two_fits_of_one_effect_the_likelier_counts(s):
+    """A candidate is refitted beside the model as it is and beside the values given, where these differ."""
+    known = [alone(s, SPRING, (100.0, 1.0)), alone(s, VISCOUS, (0.0, 20.0)), alone(s, DAHL, (0.0, 30.0))]
+    stuck = alone(s, DAHL, (0.0, -1.0), (0.5, 0.5))
+    for tried in ([*known, stuck], [stuck, *known]):
+        assert placed(best_refitted(s, baseline_of(s), tried)) == {SPRING, DAHL}
+
+
+def test_effects_of_another_model_are_no_pair(s):
+    """None that gained nothing, is in the model, was refitted beside another one, or at one horizon only."""
+    spring, dahl = alone(s, SPRING, (100.0, -5.0)), alone(s, DAHL, (-5.0, 30.0))
+    for few in ([], [spring], [spring, alone(s, DAHL, (-1.0, 0.0))]):
+        assert best_refitted(s, baseline_of(s), few) is None
+    current = dataclasses.replace(baseline_of(s), hypothesis=spring.hypothesis)
+    beside = alone(s, VISCOUS, (1.0, 2.0), h=spring.hypothesis)
+    assert best_refitted(s, current, [spring, dahl, beside]) is None
+    here = alone(s, DAHL, (1.0, 3.0), h=spring.hypothesis)
+    assert placed(best_refitted(s, current, [spring, dahl, beside, here])) == {VISCOUS, DAHL}
+    predicted = dataclasses.replace(alone(s, VISCOUS, (20.0, 3.0)), free_run=None)
+    assert best_refitted(s, baseline_of(s), [spring, predicted]) is None
+
+
+def test_a_pair_is_refitted_from_its_likeliest_start(s, monkeypatch: pytest.MonkeyPatch):
+    """Beside the model as it is, or an effect added to a model that has the other one."""
+    h = sp.unfitted(s)
+    monkeypatch.setattr(pairs, "refit", lambda problem, starts: starts)
+    moved = grown(s, h, DAHL, 3.0)
+    moved = dataclasses.replace(moved, z=moved.z + 1e-3)
+    ends = tuple(CandidateStart(p, usual(s, p)) for p in (SPRING, DAHL))
+    pair = PairStart(ends, alone=(grown(s, h, SPRING, 2.0), moved))
+    for wanted in (h, *pair.alone):
+        near = SimpleNamespace(
+            supermodel=s, log_likelihoods=lambda hs, z=wanted.z: [-np.count_nonzero(x.z - z) for x in hs]
+        )
+        (both,) = refit_pairs(near, h, [pair])
+        assert {SPRING, DAHL} <= set(both.locations) and len(both.locations) == len(h.locations) + 2
+        added = {SPRING, DAHL} - set(wanted.locations)
+        changed = set(np.flatnonzero(both.z != wanted.z).tolist())
+        assert changed <= {int(i) for p in added for i in s.parameter_indices(p)}
+
+
+def test_a_pair_of_the_best_effects_is_tried_once(s, monkeypatch: pytest.MonkeyPatch):
+    """After those of the scores, from where its effects were refitted; also where no score asks for any."""
+
+    def score(*locations: EffectLocation) -> PairScore:
+        a, b = (CandidateStart(p, usual(s, p)) for p in locations)
+        return PairScore((a, b), 1.0, 1.0, 1.0, 1.0)
+
+    known = [alone(s, SPRING, (100.0, -5.0)), alone(s, DAHL, (-5.0, 30.0))]
+    other, same = score(VISCOUS, STRIBECK), score(DAHL, SPRING)
+    asked: list[list] = []
+    monkeypatch.setattr(pairs, "validated_pairs", lambda *given: asked.append(list(given[2])) or {})
+    at = SimpleNamespace(problem=SimpleNamespace(supermodel=s, measured_values=1, noise=np.ones(2)))
+    given = SimpleNamespace(prediction=at), baseline_of(s), (None, None), None, lambda line: None
+    for scored in ([other], [same, other], []):
+        monkeypatch.setattr(pairs, "promising_pairs", lambda *_, found=scored: [(p, p) for p in found])
+        assert find_pair(*given, known) == (None, [])
+        expected = [other.locations] * (other in scored) + [(SPRING, DAHL)]
+        assert [p.locations for p, _ in asked[-1]] == expected
+        assert all(start.alone for start in asked[-1][-1])
+    asked.clear()
+    assert find_pair(*given) == (None, []) and not asked
 
 
 @pytest.fixture(scope="module")
@@ -303,7 +372,7 @@ def test_a_refit_of_a_pair_reaches_what_its_score_promises(small):
     problem, h, test = small
     spring = EffectLocation("cubic_spring", "joint")
     (p,) = test.pairs([sp.HUB, spring])
-    (both,) = refit_pairs(problem, h, [p.starts])
+    (both,) = refit_pairs(problem, h, [p])
     assert set(both.locations) == {*h.locations, sp.HUB, spring}
     assert both.log_likelihood - h.log_likelihood == pytest.approx(p.gain, rel=0.25)
 

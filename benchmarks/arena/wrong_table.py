@@ -19,11 +19,11 @@ Row = dict[str, Any]
 from rotflex_jax.text.files import write_file
 
 SEEN = tuple(range(3000, 3070))
-"""Report worlds that were read before the search was last revised; what is quoted is of the others."""
+"""Report worlds that were read before an earlier revision; what is quoted is of the others."""
 
 
 def fresh(records: Iterable[Row]) -> list[Row]:
-    """Worlds that no revision has seen."""
+    """Worlds that no revision had seen when they were run."""
     return [r for r in records if r["world"] not in SEEN]
 
 
@@ -181,8 +181,8 @@ def written(records: list[Row]) -> str:
     ]
     seen = [r for r in records if r["world"] in SEEN]
     for title, some in (
-        ("Worlds that no revision of the search has seen.", fresh(records)),
-        (f"Worlds {SEEN[0]} to {SEEN[-1]}, which were read before the search was last revised.", seen),
+        ("Worlds that no revision of the search had seen when they were run.", fresh(records)),
+        (f"Worlds {SEEN[0]} to {SEEN[-1]}, which were read before an earlier revision.", seen),
     ):
         if good(some):
             lines += ["", title, "", *_sums(some)]

@@ -13,6 +13,7 @@ from rotflex_jax.discover.selection import (
     choose,
     describe,
     horizon_gains,
+    likelier_of_each,
     replaced_by,
     validate_from_best_states,
 )
@@ -150,20 +151,6 @@ def refit_and_validate(
     return validated
 
 
-def _likelier(candidates: Sequence[ValidatedHypothesis]) -> list[ValidatedHypothesis]:
-    """Of each effect, at each horizon, the fit that is likelier on the training recordings."""
-
-    def better(a: ValidatedHypothesis, b: ValidatedHypothesis) -> ValidatedHypothesis:
-        return max(a, b, key=lambda v: v.hypothesis.log_likelihood)
-
-    best: dict[EffectLocation | None, ValidatedHypothesis] = {}
-    for v in candidates:
-        known = best.setdefault(v.location, v)
-        assert v.free_run and known.free_run
-        best[v.location] = dataclasses.replace(better(known, v), free_run=better(known.free_run, v.free_run))
-    return list(best.values())
-
-
 def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
     """Refit what is promising and add what validation data prefer; False where they prefer none of it."""
     scored, refitted = [], []
@@ -171,7 +158,7 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
         state.say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
         scored += scores
         refitted += refit_and_validate(state, beside, starts, runs_starts)
-    candidates = _likelier(refitted)
+    candidates = likelier_of_each(refitted)
     measured, current = state.problem.measured_values, state.current
     for candidate in candidates:
         state.say("  " + describe(candidate, current))

@@ -282,6 +282,28 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
     )
 
 
+def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis | None:
+    """The hypothesis less one effect, whose sizes go to those of the same name of a law that contains it.
+
+    Coulomb friction beside Stribeck friction is Stribeck friction with the sum of the levels. None where no
+    such law is on.
+    """
+    less = without(s, h, location)
+    richer = next((p for p in less.locations if p.contains(location)), None)
+    if richer is None:
+        return None
+    values, z = h.mean_values(s), less.z.copy()
+    simple, rich = s.candidates[location], s.candidates[richer]
+    short = [name.rpartition(".")[2] for name in s.mechanism.parameter_names]
+    sizes = {short[i]: values[i] for i, a in zip(simple.parameters, simple.amplitudes, strict=True) if a}
+    for i, amplitude in zip(rich.parameters, rich.amplitudes, strict=True):
+        if amplitude:
+            values[i] += sizes.get(short[i], 0.0)
+    own = list(rich.parameters)
+    z[own] = Transform.of([s.mechanism.parameter_specifications[i] for i in own]).unconstrain(values[own])
+    return dataclasses.replace(less, z=z)
+
+
 def with_all_calibrations(s: SuperModel, h: Hypothesis) -> Hypothesis:
     """The hypothesis with every calibration of the super-model, those that it lacks at zero."""
     missing = [p for p in s.calibrations if p not in h.locations]

@@ -5,9 +5,9 @@ explains. The score test says without a run what two candidates would gain toget
 refitted at both horizons, and validation data decide by the rules of single effects. A pair must pass them
 beside the model as it is and beside each of its members alone.
 
-The score test is of first order, and dry friction beside a poor model is not. So the two effects are refitted
-together, too, that gained most when each was refitted alone: what predictions ask for and what free runs ask
-for may each be refused for what the other one explains.
+The score test is of first order, and its slopes say little of dry friction beside a poor model. So the effect
+that predictions gained most by when it was refitted alone and the one that free runs gained most by are
+refitted together, too: each may have been refused because of the errors that the other one explains.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.discover.evaluation import process_noise_gain
 from rotflex_jax.discover.hypothesis import (
@@ -32,7 +33,9 @@ from rotflex_jax.discover.selection import (
     best_window_rmse,
     describe,
     distinguished,
+    likelier_of_each,
     predictions_apart,
+    shares_at_each,
     shares_of_gain,
 )
 from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions
@@ -95,42 +98,44 @@ def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[Pa
 def best_refitted(
     s: SuperModel, current: ValidatedHypothesis, known: Sequence[ValidatedHypothesis]
 ) -> tuple[PairStart, PairStart] | None:
-    """The two effects that validation data gained most by beside a model, each refitted alone.
+    """The effects with the largest gains on validation data, each refitted alone beside a model.
+
+    They are the best one as a predictor and the best one in free runs. Where these are the same, or laws of
+    the same thing, they are the two with the largest shares of both gains that are not.
 
     Args:
-        s: What all are hypotheses of.
+        s: The super-model.
         current: The model.
-        known: Models that were fitted and validated.
+        known: Models that were fitted and validated, those with one effect more among them.
 
     Returns:
-        Where their refits have ended, for predictions and for free runs; None where there are no two that
-        gained something and are not laws of the same thing.
+        Where a refit of both starts, for predictions and for free runs; None where there are no two.
     """
     effects = s.without_calibrations
     now = effects(current.hypothesis.locations)
-    alone = {
-        v.location: v
-        for v in known
-        if v.location and v.free_run and effects(v.hypothesis.locations) == now | {v.location}
-    }
-    if not alone:
-        return None
-    shares = dict(zip(alone, shares_of_gain(list(alone.values()), current), strict=True))
-    best = sorted((p for p in shares if shares[p] > 0), key=lambda p: -shares[p])
-    pair = next(((best[0], p) for p in best[1:] if p not in s.other_laws(best[0])), None)
+    one_more = [v for v in known if v.location and v.location not in now and v.free_run]
+    one_more = [v for v in one_more if effects(v.hypothesis.locations) == now | {v.location}]
+    alone = {v.location: v for v in likelier_of_each(one_more) if v.location}
+
+    def ranked(shares: Float[np.ndarray, " K"]) -> list[EffectLocation]:
+        share = dict(zip(alone, shares, strict=True))
+        return sorted((p for p in alone if share[p] > 0), key=lambda p: -share[p])
+
+    prediction, free_run = shares_at_each(list(alone.values()), current)
+    best, *others = ranked(prediction + free_run) or [None]
+    leading = zip(ranked(prediction)[:1], ranked(free_run)[:1], strict=False)
+    options = [*leading, *((best, p) for p in others if best)]
+    pair = next(((a, b) for a, b in options if a != b and b not in s.other_laws(a)), None)
     if pair is None:
         return None
 
-    def ends(fits: Sequence[Hypothesis]) -> PairStart:
-        a, b = (
-            CandidateStart(p, h.mean_values(s)[s.parameter_indices(p)])
-            for p, h in zip(pair, fits, strict=True)
-        )
-        return PairStart((a, b))
+    def start(fits: Sequence[Hypothesis]) -> PairStart:
+        ends = zip(pair, fits, strict=True)
+        a, b = (CandidateStart(p, h.mean_values(s)[s.parameter_indices(p)]) for p, h in ends)
+        return PairStart((a, b), alone=tuple(fits))
 
     fits = [alone[p] for p in pair]
-    runs = [v.free_run.hypothesis for v in fits if v.free_run]
-    return ends([v.hypothesis for v in fits]), ends(runs)
+    return start([v.hypothesis for v in fits]), start([v.free_run.hypothesis for v in fits if v.free_run])
 
 
 def _is_a_simpler_one(pair: Pair, tests: Sequence[dict[Pair, PairScore]]) -> bool:
@@ -145,12 +150,18 @@ def _is_a_simpler_one(pair: Pair, tests: Sequence[dict[Pair, PairScore]]) -> boo
 
 
 def refit_pairs(
-    problem: LikelihoodProblem, current: Hypothesis, pairs: Sequence[tuple[CandidateStart, CandidateStart]]
+    problem: LikelihoodProblem, current: Hypothesis, pairs: Sequence[PairStart]
 ) -> list[Hypothesis]:
-    """The current model with each pair, from the likeliest of several shares of both amplitudes."""
+    """The current model with each pair, from the likeliest of several shares of the amplitudes.
+
+    Both are added to the current model, or one of them to a model that has the other one already.
+    """
     s, starts = problem.supermodel, []
-    for a, b in pairs:
+    for pair in pairs:
+        a, b = pair.starts
         grown = [with_candidate(s, with_candidate(s, current, a, x), b, x) for x in AMPLITUDE_SHARES]
+        for h, other in zip(pair.alone, (b, a), strict=False):
+            grown += [with_candidate(s, h, other, x) for x in AMPLITUDE_SHARES]
         starts.append(grown[int(np.argmax(problem.log_likelihoods(grown)))])
     return refit(problem, starts)
 
@@ -174,13 +185,13 @@ def validated_pairs(
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
     assert beside.free_run
     if grown is None:
-        grown = refit_pairs(problem, beside.hypothesis, [a.starts for a, _ in pairs])
-    runs = refit_pairs(runs_problem, beside.free_run.hypothesis, [b.starts for _, b in pairs])
+        grown = refit_pairs(problem, beside.hypothesis, [a for a, _ in pairs])
+    runs = refit_pairs(runs_problem, beside.free_run.hypothesis, [b for _, b in pairs])
     runs = refit_near_predictions(runs_problem, runs, grown)
     plausible = [
-        (h, f, score.locations)
-        for h, f, (score, _) in zip(grown, runs, pairs, strict=True)
-        if all(is_plausible(x, p) for x in (h, f) for p in score.locations if p in x.locations)
+        (h, f, start.locations)
+        for h, f, (start, _) in zip(grown, runs, pairs, strict=True)
+        if all(is_plausible(x, p) for x in (h, f) for p in start.locations if p in x.locations)
     ]
     found = horizons.all_validated([(h, f) for h, f, _ in plausible], beside)
     count = functools.partial(parameter_count, problem.supermodel)
@@ -225,7 +236,7 @@ def pairs_passed_by(
     if len(effects) < 2 or not others:
         return [], []
     say("pairs of the start that were not found: " + ", ".join(_named(a.locations) for a, _ in others))
-    grown = refit_pairs(horizons.prediction.problem, beside.hypothesis, [a.starts for a, _ in others])
+    grown = refit_pairs(horizons.prediction.problem, beside.hypothesis, [a for a, _ in others])
     predictions = on_threads(lambda h: validate(horizons.prediction.validation, h, beside), grown)
     tried: dict[Pair, ValidatedHypothesis] = {}
     for h, v, scores in zip(grown, predictions, others, strict=True):
@@ -280,14 +291,13 @@ def find_pair(
         tests: Its score tests of predictions and of free runs.
         is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
         say: Called with lines of progress.
-        known: Models that were fitted and validated at both horizons before; where one is a pair without a
-            member, it is not fitted again.
+        known: Models that were fitted and validated at both horizons before: the effects with the largest
+            gains are taken from them, and a pair without a member that is among them is not fitted again.
     """
     s = horizons.prediction.problem.supermodel
     pairs: list[tuple[PairStart, PairStart]] = [*promising_pairs(*tests)]
-    best = best_refitted(s, current, known)
-    if best and all(set(best[0].locations) != set(a.locations) for a, _ in pairs):
-        pairs.append(best)
+    if best := best_refitted(s, current, known):
+        pairs = [*(p for p in pairs if set(p[0].locations) != set(best[0].locations)), best]
     if not pairs:
         return None, []
     say("looking one step further, refitting " + ", ".join(_named(a.locations) for a, _ in pairs))

@@ -234,9 +234,11 @@ class PairStart:
 
     Attributes:
         starts: Of each.
+        alone: Models with one of the two, to which a refit may add the other one.
     """
 
     starts: tuple[CandidateStart, CandidateStart]
+    alone: tuple[Hypothesis, ...] = dataclasses.field(default=(), kw_only=True)
 
     @property
     def locations(self) -> tuple[EffectLocation, EffectLocation]:

@@ -224,6 +224,18 @@ class SearchState:
 
         return sorted((p for p in added if p in on), key=place)
 
+    def hand_over_gains(self, left_out: EffectLocation, h: Hypothesis) -> None:
+        """Give a law that contains an effect what that one has gained, where it was added before the law.
+
+        Args:
+            left_out: The effect, which is left out.
+            h: The model without it.
+        """
+        added = list(self.scores)
+        for richer in [p for p in h.locations if p in added and p.contains(left_out)]:
+            if added.index(left_out) < added.index(richer):
+                self.scores[richer], self.gains[richer] = self.scores[left_out], self.gains[left_out]
+
     def replace(self, old: EffectLocation, found: ValidatedHypothesis) -> None:
         """Put another law in the place of an effect that was added, whose score and gains remain."""
         new = found.location

@@ -174,16 +174,40 @@ def best_window_rmse(t: ValidatedHypothesis) -> Float[np.ndarray, " C"]:
     return t.free_run.window_rmse
 
 
+def shares_at_each(
+    candidates: Sequence[ValidatedHypothesis], current: ValidatedHypothesis
+) -> Float[np.ndarray, "2 K"]:
+    """What each candidate gains on validation data as a share of the most, as a predictor and in free runs.
+
+    Zero where it gains nothing, and for free runs where one of the models has none.
+    """
+    shares = np.zeros((2, len(candidates)))
+    for row, at in zip(shares, (lambda t: t, lambda t: t.free_run), strict=True):
+        if candidates and all(at(t) is not None for t in (*candidates, current)):
+            gains = np.array([at(t).log_likelihood - at(current).log_likelihood for t in candidates])
+            row[:] = np.maximum(gains, 0.0) / max(float(gains.max()), 1e-9)
+    return shares
+
+
 def shares_of_gain(
     candidates: Sequence[ValidatedHypothesis], current: ValidatedHypothesis
 ) -> Float[np.ndarray, " K"]:
     """What each candidate gains on validation data as a share of the most, summed over the horizons."""
-    total = np.zeros(len(candidates))
-    for at in (lambda t: t, lambda t: t.free_run):
-        if all(at(t) is not None for t in (*candidates, current)):
-            gains = np.array([at(t).log_likelihood - at(current).log_likelihood for t in candidates])
-            total += np.maximum(gains, 0.0) / max(float(gains.max()), 1e-9)
-    return total
+    return shares_at_each(candidates, current).sum(axis=0)
+
+
+def likelier_of_each(candidates: Sequence[ValidatedHypothesis]) -> list[ValidatedHypothesis]:
+    """Of each effect, at each horizon, the fit that is likelier on the training recordings."""
+
+    def better(a: ValidatedHypothesis, b: ValidatedHypothesis) -> ValidatedHypothesis:
+        return max(a, b, key=lambda v: v.hypothesis.log_likelihood)
+
+    best: dict[EffectLocation | None, ValidatedHypothesis] = {}
+    for v in candidates:
+        known = best.setdefault(v.location, v)
+        assert v.free_run and known.free_run
+        best[v.location] = dataclasses.replace(better(known, v), free_run=better(known.free_run, v.free_run))
+    return list(best.values())
 
 
 def choose(

@@ -12,6 +12,7 @@ from rotflex_jax.discover.hypothesis import (
     Hypothesis,
     Whitener,
     embed_initial_state,
+    handed_over,
     is_physical,
     parameter_count,
     replacing,
@@ -232,7 +233,7 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
     s, rivals = problem.supermodel, []
     while tested := [p for p in h.locations if p not in added[-1:]]:
-        rivals = refit(problem, [without(s, h, p) for p in tested], alternations=1)
+        rivals = refit(problem, [_less(problem, h, p) for p in tested], alternations=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
         count = {p: parameter_count(s, h, p) for p in worth}
         needed = {p: needed_gain(count[p], problem.measured_values) for p in worth}
@@ -257,10 +258,21 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
         if drop is None:
             break
         h = without_each[drop]
-        runs = refit(runs_problem, [without(s, runs, drop)])[0]
+        runs = refit(runs_problem, [_less(runs_problem, runs, drop)])[0]
     else:
         worth, rivals = {}, []
     return Eliminated(h, runs, worth, rivals)
+
+
+def _less(problem: LikelihoodProblem, h: Hypothesis, location: EffectLocation) -> Hypothesis:
+    """Where a fit without an effect starts: with its sizes in a law that contains it, where that is likelier.
+
+    From the sizes that this law has beside it, a fit may end in another minimum, as if both were needed.
+    """
+    less, handed = without(problem.supermodel, h, location), handed_over(problem.supermodel, h, location)
+    if handed is None:
+        return less
+    return (less, handed)[int(np.argmax(problem.log_likelihoods([less, handed])))]
 
 
 def _need(
@@ -280,7 +292,7 @@ def _need(
         less: The model of predictions without it.
     """
     problem = horizons.free_run.problem
-    less_runs = refit(problem, [without(problem.supermodel, runs, location)], alternations=1)[0]
+    less_runs = refit(problem, [_less(problem, runs, location)], alternations=1)[0]
     gain, z = paired_gain(runs.blocks, less_runs.blocks)
     if z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER:
         return True

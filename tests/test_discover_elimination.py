@@ -1,0 +1,103 @@
+"""What a model can do without: an effect beside a law that contains it."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import small_problem as sp
+
+import rotflex_jax.effects as fx
+from rotflex_jax.discover import search, stepwise
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, handed_over, with_effect, without
+from rotflex_jax.discover.search_state import SearchState
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, scales
+from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.models.model import Model
+
+COULOMB, STRIBECK = EffectLocation("coulomb", "hub"), EffectLocation("stribeck", "hub")
+ARM = EffectLocation("coulomb", "arm")
+SIZES = {COULOMB: [0.004], STRIBECK: [0.003, 0.002, 0.5], ARM: [0.001]}
+
+
+@pytest.fixture(scope="module")
+def s() -> SuperModel:
+    wanted = ((fx.Coulomb, "hub"), (fx.Stribeck, "hub"), (fx.Coulomb, "arm"))
+    return build(sp.baseline(), wanted, scales(Model(sp.baseline()), sp.recordings(sp.records()), 0.1))
+
+
+def holding(s: SuperModel, *locations: EffectLocation) -> Hypothesis:
+    """The baseline with effects of these sizes."""
+    h = sp.unfitted(s)
+    for location in locations:
+        h = with_effect(s, h, CandidateStart(location, np.array(SIZES[location])), 1.0)
+    return h
+
+
+def simulated(s: SuperModel, h: Hypothesis) -> np.ndarray:
+    """A free run with the effects of a hypothesis."""
+    gates = tuple(s.gates(h.locations))  # one program for all
+    model = Model(s.mechanism.with_values(h.mean_values(s)), sp.SOLVER, gates)
+    return model.simulate(sp.recordings(sp.records())[0])
+
+
+def test_a_law_that_contains_an_effect_takes_over_its_size(s):
+    """Two levels of dry friction at one port are one: the run is the same, without the level it is not."""
+    both = holding(s, COULOMB, STRIBECK, ARM)
+    y = simulated(s, both)
+    one = handed_over(s, both, COULOMB)
+    assert COULOMB not in one.locations and {STRIBECK, ARM} <= set(one.locations)
+    values = one.mean_values(s)[s.parameter_indices(STRIBECK)]
+    np.testing.assert_allclose(values, [0.007, 0.002, 0.5], rtol=1e-9)
+    np.testing.assert_allclose(simulated(s, one), y, atol=1e-9)
+    assert np.abs(simulated(s, without(s, both, COULOMB)) - y).max() > 20 * sp.NOISE[0]
+    # A law at another port and one that contains nothing that is on take nothing.
+    assert handed_over(s, both, ARM) is handed_over(s, both, STRIBECK) is None
+
+
+@pytest.mark.parametrize("locations", [(COULOMB, STRIBECK), (COULOMB, ARM)])
+def test_of_two_levels_at_one_port_one_is_needless(s, monkeypatch: pytest.MonkeyPatch, locations):
+    """Coulomb friction beside Stribeck friction goes, even if no fit finds its way; elsewhere it stays."""
+    true = simulated(s, holding(s, *locations))
+
+    def costs(hypotheses: list[Hypothesis]) -> list[np.ndarray]:
+        return [-0.5 * np.sum(((simulated(s, h) - true) / sp.NOISE) ** 2, axis=1) for h in hypotheses]
+
+    def evaluated(problem, hypotheses: list[Hypothesis], **_) -> list[Hypothesis]:
+        """Log-likelihoods of free runs, no fit."""
+        return [
+            dataclasses.replace(h, densities=np.array([d, 0 * d]), blocks=d.reshape(8, -1).sum(axis=1))
+            for h, d in zip(hypotheses, costs(hypotheses), strict=True)
+        ]
+
+    likelihoods = lambda hypotheses: [float(d.sum()) for d in costs(hypotheses)]  # noqa: E731
+    problem = SimpleNamespace(supermodel=s, measured_values=2 * len(true), log_likelihoods=likelihoods)
+    at = SimpleNamespace(problem=problem)
+    alike = ValidatedHypothesis(sp.unfitted(s), np.zeros(2), sp.unfitted(s), np.ones(2))
+    horizons = SimpleNamespace(prediction=at, free_run=at, validated=lambda *_: alike)
+    monkeypatch.setattr(stepwise, "refit", evaluated)
+    (h,) = evaluated(problem, [holding(s, *locations)])
+    needed = stepwise.eliminate(horizons, h, h, list(locations))
+    for h in (needed.prediction, needed.free_run):
+        assert set(h.locations) - set(s.calibrations) == {
+            p for p in locations if p != COULOMB or ARM in locations
+        }
+        np.testing.assert_allclose(simulated(s, h), true, atol=1e-9)
+
+
+@pytest.mark.parametrize("first", [COULOMB, STRIBECK])
+def test_the_law_that_is_left_has_gained_what_was_found_first(s, monkeypatch: pytest.MonkeyPatch, first):
+    """Beside Coulomb friction Stribeck's has gained little; in its place it has gained all."""
+    added = [first, *({COULOMB, STRIBECK} - {first}), ARM]
+    left = holding(s, STRIBECK, ARM)
+    alike = ValidatedHypothesis(left, np.zeros(2), left, np.ones(2))
+    current = dataclasses.replace(alike, hypothesis=holding(s, *added), free_run=alike)
+    horizons = SimpleNamespace(validated=lambda *_: alike)
+    state = SearchState(Model(sp.baseline()), horizons, lambda line: None, current)
+    state.scores = {p: 10.0 / (k + 1) for k, p in enumerate(added)}
+    state.gains = {p: (f"of {p}", None) for p in added}
+    monkeypatch.setattr(search, "eliminate", lambda *_: stepwise.Eliminated(left, left, {}, []))
+    search._eliminate(state)
+    assert state.scores[STRIBECK] == 10.0 and state.gains[STRIBECK] == (f"of {first}", None)
+    assert state.scores[ARM] == 10.0 / 3 and state.gains[ARM] == (f"of {ARM}", None)
+    assert state.current is alike is state.tried[0]
