@@ -97,7 +97,7 @@ def worlds_wrong_bound() -> str:
 
 @named
 def worlds_seen_named() -> str:
-    """The same of worlds that were read before the search was last revised."""
+    """The same of worlds that were read before an earlier revision."""
     return "{} of {}".format(*_worlds("named", seen=True))
 
 

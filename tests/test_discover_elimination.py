@@ -9,7 +9,15 @@ import small_problem as sp
 
 import rotflex_jax.effects as fx
 from rotflex_jax.discover import search, stepwise
-from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, handed_over, with_effect, without
+from rotflex_jax.discover.hypothesis import (
+    CandidateStart,
+    Hypothesis,
+    handed_over,
+    usual_start,
+    with_effect,
+    without,
+)
+from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, scales
 from rotflex_jax.discover.validation import ValidatedHypothesis
@@ -23,6 +31,7 @@ SIZES = {COULOMB: [0.004], STRIBECK: [0.003, 0.002, 0.5], ARM: [0.001]}
 @pytest.fixture(scope="module")
 def s() -> SuperModel:
     wanted = ((fx.Coulomb, "hub"), (fx.Stribeck, "hub"), (fx.Coulomb, "arm"))
+    wanted += ((fx.Gravity, "hub"), (fx.Cogging, "hub"))
     return build(sp.baseline(), wanted, scales(Model(sp.baseline()), sp.recordings(sp.records()), 0.1))
 
 
@@ -51,8 +60,14 @@ def test_a_law_that_contains_an_effect_takes_over_its_size(s):
     np.testing.assert_allclose(values, [0.007, 0.002, 0.5], rtol=1e-9)
     np.testing.assert_allclose(simulated(s, one), y, atol=1e-9)
     assert np.abs(simulated(s, without(s, both, COULOMB)) - y).max() > 20 * sp.NOISE[0]
-    # A law at another port and one that contains nothing that is on take nothing.
+    # A law at another port and one that contains nothing that is on take nothing, nor do calibrations.
     assert handed_over(s, both, ARM) is handed_over(s, both, STRIBECK) is None
+    assert all(handed_over(s, both, p) is None for p in s.calibrations)
+    # Cogging contains gravity at one of its periods only, and its amplitudes are no place for it at another.
+    gravity, cogging = EffectLocation("gravity", "hub"), EffectLocation("cogging", "hub")
+    assert cogging.contains(gravity)
+    turning = with_effect(s, with_effect(s, both, usual_start(s, gravity), 1.0), usual_start(s, cogging), 1.0)
+    assert handed_over(s, turning, gravity) is None
 
 
 @pytest.mark.parametrize("locations", [(COULOMB, STRIBECK), (COULOMB, ARM)])
@@ -70,8 +85,7 @@ def test_of_two_levels_at_one_port_one_is_needless(s, monkeypatch: pytest.Monkey
             for h, d in zip(hypotheses, costs(hypotheses), strict=True)
         ]
 
-    likelihoods = lambda hypotheses: [float(d.sum()) for d in costs(hypotheses)]  # noqa: E731
-    problem = SimpleNamespace(supermodel=s, measured_values=2 * len(true), log_likelihoods=likelihoods)
+    problem = SimpleNamespace(supermodel=s, measured_values=2 * len(true))
     at = SimpleNamespace(problem=problem)
     alike = ValidatedHypothesis(sp.unfitted(s), np.zeros(2), sp.unfitted(s), np.ones(2))
     horizons = SimpleNamespace(prediction=at, free_run=at, validated=lambda *_: alike)
@@ -85,19 +99,22 @@ def test_of_two_levels_at_one_port_one_is_needless(s, monkeypatch: pytest.Monkey
         np.testing.assert_allclose(simulated(s, h), true, atol=1e-9)
 
 
-@pytest.mark.parametrize("first", [COULOMB, STRIBECK])
-def test_the_law_that_is_left_has_gained_what_was_found_first(s, monkeypatch: pytest.MonkeyPatch, first):
-    """Beside Coulomb friction Stribeck's has gained little; in its place it has gained all."""
-    added = [first, *({COULOMB, STRIBECK} - {first}), ARM]
-    left = holding(s, STRIBECK, ARM)
+@pytest.mark.parametrize("more", [COULOMB, STRIBECK])
+def test_the_law_that_is_left_has_gained_what_was_found_first(s, monkeypatch: pytest.MonkeyPatch, more):
+    """What Coulomb friction has gained goes to Stribeck friction in its place, with its rivals."""
+    left, elsewhere = holding(s, STRIBECK, ARM), EffectLocation("gravity", "hub")
     alike = ValidatedHypothesis(left, np.zeros(2), left, np.ones(2))
-    current = dataclasses.replace(alike, hypothesis=holding(s, *added), free_run=alike)
-    horizons = SimpleNamespace(validated=lambda *_: alike)
+    current = dataclasses.replace(alike, hypothesis=holding(s, COULOMB, STRIBECK, ARM), free_run=alike)
+    problem = SimpleNamespace(supermodel=s)
+    horizons = SimpleNamespace(validated=lambda *_: alike, prediction=SimpleNamespace(problem=problem))
     state = SearchState(Model(sp.baseline()), horizons, lambda line: None, current)
-    state.scores = {p: 10.0 / (k + 1) for k, p in enumerate(added)}
-    state.gains = {p: (f"of {p}", None) for p in added}
+    state.scores = {COULOMB: 10.0, STRIBECK: 5.0, ARM: 3.0}
+    sizes = {p: 100.0 if p == more else 20.0 for p in state.scores}
+    state.gains = {p: (HorizonGain(x, 9.0, 0.5, x), None) for p, x in sizes.items()}
+    state.rivals = {COULOMB: [elsewhere, STRIBECK], STRIBECK: [EffectLocation("cogging", "hub")], ARM: []}
     monkeypatch.setattr(search, "eliminate", lambda *_: stepwise.Eliminated(left, left, {}, []))
     search._eliminate(state)
-    assert state.scores[STRIBECK] == 10.0 and state.gains[STRIBECK] == (f"of {first}", None)
-    assert state.scores[ARM] == 10.0 / 3 and state.gains[ARM] == (f"of {ARM}", None)
+    assert state.gains[STRIBECK][0].gain == 100.0 and state.gains[ARM][0].gain == 20.0
+    assert state.scores == {COULOMB: 10.0, STRIBECK: 10.0 if more == COULOMB else 5.0, ARM: 3.0}
+    assert state.rivals[STRIBECK] == [EffectLocation("cogging", "hub"), elsewhere] and state.rivals[ARM] == []
     assert state.current is alike is state.tried[0]

@@ -335,9 +335,13 @@ def test_a_pair_of_the_best_effects_is_tried_once(s, monkeypatch: pytest.MonkeyP
     for scored in ([other], [same, other], []):
         monkeypatch.setattr(pairs, "promising_pairs", lambda *_, found=scored: [(p, p) for p in found])
         assert find_pair(*given, known) == (None, [])
-        expected = [other.locations] * (other in scored) + [(SPRING, DAHL)]
-        assert [p.locations for p, _ in asked[-1]] == expected
-        assert all(start.alone for start in asked[-1][-1])
+        last = asked[-1][-1][0]
+        assert [p.locations for p, _ in asked[-1][:-1]] == [other.locations] * bool(scored)
+        assert last.locations == ((DAHL, SPRING) if len(scored) == 2 else (SPRING, DAHL))
+        for start in asked[-1][-1]:  # each model has the effect that is named at its place
+            for location, h in zip(start.locations, start.alone, strict=True):
+                assert set(h.locations) - set(s.calibrations) == {location}
+        assert isinstance(last, PairScore) == (len(scored) == 2)  # with the sizes of its score
     asked.clear()
     assert find_pair(*given) == (None, []) and not asked
 

@@ -9,6 +9,8 @@ from jaxtyping import Float
 from rotflex_jax.discover.batched_predictor import Directions, ParameterSet
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects.base import DRY_FRICTION
+from rotflex_jax.effects.labels import law_of
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.parameters import Transform
 
@@ -282,25 +284,30 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
     )
 
 
-def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis | None:
-    """The hypothesis less one effect, whose sizes go to those of the same name of a law that contains it.
+def law_with_its_size(
+    s: SuperModel, locations: Sequence[EffectLocation], location: EffectLocation
+) -> EffectLocation | None:
+    """The law of dry friction among some effects that contains another one and has its size; None if none.
 
-    Coulomb friction beside Stribeck friction is Stribeck friction with the sum of the levels. None where no
-    such law is on.
+    Coulomb friction beside Stribeck friction is Stribeck friction with the sum of the levels.
     """
-    less = without(s, h, location)
-    richer = next((p for p in less.locations if p.contains(location)), None)
-    if richer is None:
+    sizes = set(s.amplitude_names(location)) if law_of(location.effect) == DRY_FRICTION else set[str]()
+    laws = (p for p in locations if p.contains(location) and p in s.candidates)
+    return next((p for p in laws if sizes.intersection(s.amplitude_names(p))), None)
+
+
+def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis | None:
+    """The hypothesis less one effect, whose size goes to `law_with_its_size`; None without such a law."""
+    law = law_with_its_size(s, h.locations, location)
+    if law is None:
         return None
-    values, z = h.mean_values(s), less.z.copy()
-    simple, rich = s.candidates[location], s.candidates[richer]
-    short = [name.rpartition(".")[2] for name in s.mechanism.parameter_names]
-    sizes = {short[i]: values[i] for i, a in zip(simple.parameters, simple.amplitudes, strict=True) if a}
-    for i, amplitude in zip(rich.parameters, rich.amplitudes, strict=True):
-        if amplitude:
-            values[i] += sizes.get(short[i], 0.0)
-    own = list(rich.parameters)
-    z[own] = Transform.of([s.mechanism.parameter_specifications[i] for i in own]).unconstrain(values[own])
+    less, values = without(s, h, location), h.mean_values(s)
+    given, taken = s.amplitude_names(location), s.amplitude_names(law)
+    z = less.z.copy()
+    for name in given.keys() & taken.keys():
+        i = taken[name]
+        total = np.array([values[i] + values[given[name]]])
+        z[i] = Transform.of([s.mechanism.parameter_specifications[i]]).unconstrain(total)[0]
     return dataclasses.replace(less, z=z)
 
 

@@ -23,7 +23,6 @@ from rotflex_jax.discover.hypothesis import (
     Hypothesis,
     parameter_count,
     with_candidate,
-    without,
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.score_test import PairScore, PairStart, ScoreTest
@@ -38,7 +37,7 @@ from rotflex_jax.discover.selection import (
     shares_at_each,
     shares_of_gain,
 )
-from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions
+from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions, refit_without
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
 from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS
@@ -122,10 +121,11 @@ def best_refitted(
         return sorted((p for p in alone if share[p] > 0), key=lambda p: -share[p])
 
     prediction, free_run = shares_at_each(list(alone.values()), current)
-    best, *others = ranked(prediction + free_run) or [None]
     leading = zip(ranked(prediction)[:1], ranked(free_run)[:1], strict=False)
-    options = [*leading, *((best, p) for p in others if best)]
-    pair = next(((a, b) for a, b in options if a != b and b not in s.other_laws(a)), None)
+    best = ranked(prediction + free_run)
+    options = [(a, b) for a, b in (*leading, *((best[0], p) for p in best[1:])) if a != b]
+    unlike = ((a, b) for a, b in options if b not in s.other_laws(a) and not a.is_related_to(b))
+    pair = next(unlike, None)
     if pair is None:
         return None
 
@@ -136,6 +136,12 @@ def best_refitted(
 
     fits = [alone[p] for p in pair]
     return start([v.hypothesis for v in fits]), start([v.free_run.hypothesis for v in fits if v.free_run])
+
+
+def _with_models(scored: PairStart, refitted: PairStart) -> PairStart:
+    """The start of a pair that scores put forward, and the models with either effect, as it names these."""
+    models = dict(zip(refitted.locations, refitted.alone, strict=True))
+    return dataclasses.replace(scored, alone=tuple(models[p] for p in scored.locations))
 
 
 def _is_a_simpler_one(pair: Pair, tests: Sequence[dict[Pair, PairScore]]) -> bool:
@@ -297,7 +303,10 @@ def find_pair(
     s = horizons.prediction.problem.supermodel
     pairs: list[tuple[PairStart, PairStart]] = [*promising_pairs(*tests)]
     if best := best_refitted(s, current, known):
-        pairs = [*(p for p in pairs if set(p[0].locations) != set(best[0].locations)), best]
+        places = set(best[0].locations)
+        same = [p for p in pairs if set(p[0].locations) == places]
+        pairs = [p for p in pairs if set(p[0].locations) != places]
+        pairs += [(_with_models(a, best[0]), _with_models(b, best[1])) for a, b in same] or [best]
     if not pairs:
         return None, []
     say("looking one step further, refitting " + ", ".join(_named(a.locations) for a, _ in pairs))
@@ -338,12 +347,11 @@ def _without(
 ) -> ValidatedHypothesis:
     """A model less one effect, refitted and validated at both horizons."""
     assert found.free_run
-    s = horizons.prediction.problem.supermodel
     at = (
-        (horizons.prediction.problem, without(s, found.hypothesis, location)),
-        (horizons.free_run.problem, without(s, found.free_run.hypothesis, location)),
+        (horizons.prediction.problem, found.hypothesis),
+        (horizons.free_run.problem, found.free_run.hypothesis),
     )
-    prediction, runs = on_threads(lambda one: refit(one[0], [one[1]])[0], at)
+    prediction, runs = on_threads(lambda one: refit_without(*one, [location])[0], at)
     return horizons.validated(prediction, runs, current)
 
 

@@ -234,7 +234,7 @@ class PairStart:
 
     Attributes:
         starts: Of each.
-        alone: Models with one of the two, to which a refit may add the other one.
+        alone: Models with the first and with the second, to which a refit may add the other one.
     """
 
     starts: tuple[CandidateStart, CandidateStart]

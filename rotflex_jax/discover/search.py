@@ -295,7 +295,7 @@ def _eliminate(state: SearchState) -> Eliminated:
     for location in (p for p in state.scores if p in h.locations):
         if location not in needed.prediction.locations:
             state.say(f"  left out: {location}")
-            state.hand_over_gains(location, needed.prediction)
+            state.hand_over(location, needed.prediction)
         elif 0 < needed.worth.get(location, 0.0) < np.inf:
             lost = f"{needed.worth[location]:.0f} nats less of predictions on training data"
             state.say(f"  without {location}: {lost}")

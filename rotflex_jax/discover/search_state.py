@@ -15,7 +15,7 @@ from rotflex_jax.discover.checkpoint import (
     read_stages,
     restored,
 )
-from rotflex_jax.discover.hypothesis import Hypothesis, is_physical
+from rotflex_jax.discover.hypothesis import Hypothesis, is_physical, law_with_its_size
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.pairs import promising_pairs
 from rotflex_jax.discover.reading import (
@@ -224,17 +224,25 @@ class SearchState:
 
         return sorted((p for p in added if p in on), key=place)
 
-    def hand_over_gains(self, left_out: EffectLocation, h: Hypothesis) -> None:
-        """Give a law that contains an effect what that one has gained, where it was added before the law.
+    def hand_over(self, left_out: EffectLocation, h: Hypothesis) -> None:
+        """Give what an effect has gained to the law that has its size now, if that was more, and its rivals.
 
         Args:
-            left_out: The effect, which is left out.
+            left_out: The effect.
             h: The model without it.
         """
-        added = list(self.scores)
-        for richer in [p for p in h.locations if p in added and p.contains(left_out)]:
-            if added.index(left_out) < added.index(richer):
-                self.scores[richer], self.gains[richer] = self.scores[left_out], self.gains[left_out]
+        law = law_with_its_size(self.problem.supermodel, h.locations, left_out)
+        if law is None or law not in self.scores:
+            return
+
+        def nats(p: EffectLocation) -> float:
+            prediction, _ = self.gains[p]
+            return prediction.gain + prediction.training_gain
+
+        if nats(left_out) > nats(law):
+            self.scores[law], self.gains[law] = self.scores[left_out], self.gains[left_out]
+        rivals = dict.fromkeys([*self.rivals[law], *self.rivals[left_out]])
+        self.rivals[law] = [p for p in rivals if p not in (law, left_out) and p not in h.locations]
 
     def replace(self, old: EffectLocation, found: ValidatedHypothesis) -> None:
         """Put another law in the place of an effect that was added, whose score and gains remain."""

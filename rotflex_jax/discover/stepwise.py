@@ -233,7 +233,7 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
     s, rivals = problem.supermodel, []
     while tested := [p for p in h.locations if p not in added[-1:]]:
-        rivals = refit(problem, [_less(problem, h, p) for p in tested], alternations=1)
+        rivals = refit_without(problem, h, tested, alternations=1)
         worth = {p: h.log_likelihood - r.log_likelihood for p, r in zip(tested, rivals, strict=True)}
         count = {p: parameter_count(s, h, p) for p in worth}
         needed = {p: needed_gain(count[p], problem.measured_values) for p in worth}
@@ -258,21 +258,32 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
         if drop is None:
             break
         h = without_each[drop]
-        runs = refit(runs_problem, [_less(runs_problem, runs, drop)])[0]
+        (runs,) = refit_without(runs_problem, runs, [drop])
     else:
         worth, rivals = {}, []
     return Eliminated(h, runs, worth, rivals)
 
 
-def _less(problem: LikelihoodProblem, h: Hypothesis, location: EffectLocation) -> Hypothesis:
-    """Where a fit without an effect starts: with its sizes in a law that contains it, where that is likelier.
+def refit_without(
+    problem: LikelihoodProblem, h: Hypothesis, locations: Sequence[EffectLocation], alternations: int = 3
+) -> list[Hypothesis]:
+    """The model without each of some effects, refitted.
 
-    From the sizes that this law has beside it, a fit may end in another minimum, as if both were needed.
+    Where a law that contains the effect can take over its size, a second fit starts with it there, and the
+    likelier end counts: from the size that the law has beside it a fit may end in another minimum, as if
+    both were needed.
+
+    Args:
+        problem: The likelihood.
+        h: The model.
+        locations: What is left out, one at a time.
+        alternations: See `refit`.
     """
-    less, handed = without(problem.supermodel, h, location), handed_over(problem.supermodel, h, location)
-    if handed is None:
-        return less
-    return (less, handed)[int(np.argmax(problem.log_likelihoods([less, handed])))]
+    s = problem.supermodel
+    starts = [(without(s, h, p), handed_over(s, h, p)) for p in locations]
+    given = [[start for start in each if start is not None] for each in starts]
+    fits = iter(refit(problem, [start for each in given for start in each], alternations=alternations))
+    return [max((next(fits) for _ in each), key=lambda fit: fit.log_likelihood) for each in given]
 
 
 def _need(
@@ -292,7 +303,7 @@ def _need(
         less: The model of predictions without it.
     """
     problem = horizons.free_run.problem
-    less_runs = refit(problem, [_less(problem, runs, location)], alternations=1)[0]
+    (less_runs,) = refit_without(problem, runs, [location], alternations=1)
     gain, z = paired_gain(runs.blocks, less_runs.blocks)
     if z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER:
         return True
