@@ -870,10 +870,8 @@ def test_an_effect_without_which_validation_runs_are_clearly_worse_is_needed(
 ) -> None:
     """A tenth, though the training recordings are as well off without it; the better horizon counts."""
     blocks, runs_problem = np.zeros(12), SimpleNamespace(supermodel=None)
-    monkeypatch.setattr(stepwise, "without", lambda s, h, location: h)
-    monkeypatch.setattr(
-        stepwise, "refit", lambda problem, hypotheses, alternations: [SimpleNamespace(blocks=blocks)]
-    )
+    without = SimpleNamespace(blocks=blocks)
+    monkeypatch.setattr(stepwise, "refit_without", lambda problem, h, locations, alternations: [without])
     errors = {"with": np.array([0.02, 0.01]), "without": rise * np.array([0.02, 0.01])}
 
     def validated(prediction: str, free_run: Any, near: Any = None) -> Any:
