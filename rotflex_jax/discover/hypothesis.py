@@ -284,29 +284,32 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
     )
 
 
-def law_with_its_size(
-    s: SuperModel, locations: Sequence[EffectLocation], location: EffectLocation
-) -> EffectLocation | None:
+def law_with_its_size(locations: Sequence[EffectLocation], location: EffectLocation) -> EffectLocation | None:
     """The law of dry friction among some effects that contains another one and has its size; None if none.
 
     Coulomb friction beside Stribeck friction is Stribeck friction with the sum of the levels.
     """
-    sizes = set(s.amplitude_names(location)) if law_of(location.effect) == DRY_FRICTION else set[str]()
-    laws = (p for p in locations if p.contains(location) and p in s.candidates)
-    return next((p for p in laws if sizes.intersection(s.amplitude_names(p))), None)
+    if law_of(location.effect) != DRY_FRICTION:
+        return None
+    laws = (p for p in locations if p.contains(location))
+    return next((p for p in laws if _common_sizes(p, location)), None)
+
+
+def _common_sizes(a: EffectLocation, b: EffectLocation) -> list[str]:
+    """Short names of amplitudes that two effects share."""
+    return [n for n in CATALOG[a.effect].amplitudes if n in CATALOG[b.effect].amplitudes]
 
 
 def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis | None:
     """The hypothesis less one effect, whose size goes to `law_with_its_size`; None without such a law."""
-    law = law_with_its_size(s, h.locations, location)
+    law = law_with_its_size(h.locations, location)
     if law is None:
         return None
     less, values = without(s, h, location), h.mean_values(s)
-    given, taken = s.amplitude_names(location), s.amplitude_names(law)
-    z = less.z.copy()
-    for name in given.keys() & taken.keys():
-        i = taken[name]
-        total = np.array([values[i] + values[given[name]]])
+    z, index = less.z.copy(), s.mechanism.parameter_names.index
+    for name in _common_sizes(law, location):
+        i, given = index(law.full_name(name)), index(location.full_name(name))
+        total = np.array([values[i] + values[given]])
         z[i] = Transform.of([s.mechanism.parameter_specifications[i]]).unconstrain(total)[0]
     return dataclasses.replace(less, z=z)
 

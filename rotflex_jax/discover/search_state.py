@@ -231,7 +231,7 @@ class SearchState:
             left_out: The effect.
             h: The model without it.
         """
-        law = law_with_its_size(self.problem.supermodel, h.locations, left_out)
+        law = law_with_its_size(h.locations, left_out)
         if law is None or law not in self.scores:
             return
 

@@ -19,8 +19,8 @@ from rotflex_jax.discover.evaluation import (
     process_noise_gain,
 )
 from rotflex_jax.discover.final_fit import Refused, fit_to_all
-from rotflex_jax.discover.hypothesis import Hypothesis, without
-from rotflex_jax.discover.likelihood import choose_process_noise, finer_integration, refit
+from rotflex_jax.discover.hypothesis import Hypothesis
+from rotflex_jax.discover.likelihood import choose_process_noise, finer_integration
 from rotflex_jax.discover.localise import locate
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
 from rotflex_jax.discover.result import (
@@ -43,6 +43,7 @@ from rotflex_jax.discover.stepwise import (
     disturbance_notes,
     far_from_given,
     nested_models,
+    refit_without,
     titled,
 )
 from rotflex_jax.discover.supermodel import EffectLocation
@@ -332,11 +333,11 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
         return stage.log_likelihood - before.log_likelihood
     if location in state.gains:
         return state.gains[location][0].gain
-    current, s = state.current, state.problem.supermodel
+    current = state.current
     if location not in current.hypothesis.locations:
         return float("nan")
     # A calibration of a model whose parameters are those of free runs.
-    less = refit(state.problem, [without(s, current.hypothesis, location)], alternations=1)[0]
+    (less,) = refit_without(state.problem, current.hypothesis, [location], alternations=1)
     return current.log_likelihood - validate(state.validation, less, current).log_likelihood
 
 

@@ -292,12 +292,6 @@ class SuperModel:
         """The effects among some that a search may find."""
         return frozenset(locations) - set(self.calibrations)
 
-    def amplitude_names(self, location: EffectLocation) -> dict[str, int]:
-        """Amplitudes of a candidate by short name -> their indices among the parameters."""
-        c, names = self.candidates[location], self.mechanism.parameter_names
-        pairs = zip(c.parameters, c.amplitudes, strict=True)
-        return {names[i].rpartition(".")[2]: i for i, amplitude in pairs if amplitude}
-
     def other_laws(self, location: EffectLocation) -> list[EffectLocation]:
         """Candidates at the port of an effect that are laws of the same thing."""
         law = law_of(location.effect)
