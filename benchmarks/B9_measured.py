@@ -1,4 +1,4 @@
-"""B9: every measured machine, every direction, evaluated on recordings that had no say.
+"""B9: every measured machine, every direction, evaluated on recordings used for no fit and no choice.
 
     python benchmarks/B9_measured.py
     python benchmarks/B9_measured.py --only rotflex two_dof_link_1
@@ -6,10 +6,10 @@
     python benchmarks/B9_measured.py --workers 16
     python benchmarks/B9_measured.py --list
 
-The ends of the runs that are learnt from decide (validation); the test recordings have no other use. Free
-runs over the whole test and over windows of 2 s, with and without the voltage offset that the first 2 s of a
-test ask for. A search runs in a new process with nothing compiled, and once more in another one with what the
-first has compiled. Beside it is the best of the other methods (`rotflex_jax.compare`) on the same data. With
+The ends of the training runs decide (validation); the test recordings have no other use. Free runs over the
+whole test and over windows of 2 s, with and without the voltage offset that is fitted to the first 2 s of a
+test. A search runs in a new process with nothing compiled, and once more in another one with what the first
+has compiled. Beside it is the best of the other methods (`rotflex_jax.compare`) on the same data. With
 several workers each direction has a core, all share what they compile, and no times are reported.
 
 Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B9.json` after each

@@ -640,7 +640,7 @@ def arena_intervals() -> str:
 
 @named
 def arena_numbers() -> str:
-    """How many parameters these intervals speak of."""
+    """How many parameters these intervals are of."""
     return str(sum(bool(p.get("std")) for r in records() for p in r["parameters"].values()))
 
 
@@ -1134,7 +1134,10 @@ def _arm_runs(name: str) -> str:
 
 
 def _arm_others(name: str) -> str:
-    """Error of a model of the SO-101 over motions that had no say [deg], averaged over joints and motions."""
+    """Error of a model of the SO-101 over the test motions [deg], averaged over joints and motions.
+
+    These motions were used for no fit and no choice.
+    """
     rows = results("B10.json")["so101"]
     return f"{statistics.mean(errors[name] for row in rows for errors in row['others'].values()):.2f}"
 

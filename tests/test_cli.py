@@ -486,7 +486,7 @@ def test_a_file_with_one_sensor_has_its_joint(
 
 
 def test_several_files_validate_each_other(run, search, recorded, tmp_path) -> None:
-    """Unless --split or --held-out says otherwise; a file that has no say is passed on as such."""
+    """Unless --split or --held-out is given; a test file is passed on as such."""
     other, third = (write(tmp_path / name, DEMO[:400]) for name in ("other.csv", "third.csv"))
     status, out, _ = run("discover", recorded, other, "--test", third, "--calibrate", 1)
     assert status == 0

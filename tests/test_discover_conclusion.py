@@ -37,7 +37,7 @@ from rotflex_jax.discover.tables import status_sentence
 from rotflex_jax.discover.validation import SearchHorizon, ValidatedHypothesis, ValidationSet
 from rotflex_jax.discover.verdict import Assessment, Grade, Verdict, assess, grade
 from rotflex_jax.effects.labels import effect_phrase, effect_title
-from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder
+from rotflex_jax.effects.sensors import CrossTalk, EccentricEncoder, SensorGain
 from rotflex_jax.mechanism import simulate
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
@@ -154,6 +154,9 @@ def test_sensor_faults_of_an_impossible_size_are_not_physical():
         for name in names:
             low, high = specifications(fault(at="theta"))[name].physical
             assert -0.14 < low < -0.02 < 0.02 < high < 0.14
+    # A gauge may be off by a third. One that reads a tenth of the true value, or ten times, has another unit.
+    low, high = specifications(SensorGain(at="alpha"))["error"].physical
+    assert -0.9 < low < -0.3 < 0.5 < high < 9.0
 
 
 def test_a_window_that_diverges_says_nothing(same):

@@ -1,4 +1,4 @@
-"""What a search reports of a model: which data had a say, and whether an effect is established."""
+"""What a search reports of a model: on which data its errors are, and whether an effect is established."""
 
 import dataclasses
 import json
@@ -84,12 +84,12 @@ def replaced(before: tuple[dict, dict], after: tuple[dict, dict], tried=(), winn
 
 def test_candidates_whose_score_the_winner_took_are_refitted_too():
     before = ({"gravity": 100.0, "coulomb": 15.0}, {"coulomb": 400.0, "cogging": 500.0, "backlash": 90.0})
-    # Coulomb friction promises nothing beside the winner; gravity and cogging promise what they did.
+    # Beside the winner the score of Coulomb friction is nothing; those of gravity and cogging hardly change.
     after = ({"gravity": 90.0, "coulomb": -3.0}, {"coulomb": 2.0, "cogging": 480.0, "backlash": -4.0})
     assert replaced(before, after) == ["coulomb"]
     assert replaced(before, after, tried=("coulomb",)) == []
     assert replaced(before, ({"coulomb": 12.0}, {"coulomb": 300.0, "cogging": 480.0})) == ["gravity"]
-    # A part of it that is left may be an effect of its own; what contains the winner is asked again later.
+    # A part of it that is left may be an effect of its own; what contains the winner is tested again later.
     assert "coulomb" not in replaced(before, (after[0] | {"coulomb": 9.0}, after[1] | {"coulomb": 90.0}))
     rich = ({"lugre": 100.0}, {"lugre": 100.0})
     assert replaced(rich, ({}, {}), winner="coulomb") == []
@@ -98,10 +98,10 @@ def test_candidates_whose_score_the_winner_took_are_refitted_too():
     quarter = ({"gravity": 100.0, "coulomb": 25.0, "viscous": 24.9}, {})
     assert replaced(quarter, ({"gravity": 95.0}, {})) == ["coulomb"]
     assert replaced(({"gravity": 40.0}, {}), ({"gravity": 4.0}, {})) == []
-    # Two at most, those that promised most over both horizons.
+    # Two at most, those with the largest shares over both horizons.
     gone = ({}, {})
     assert replaced(before, gone) == ["gravity", "cogging"]
-    # However little they promised.
+    # However small their scores.
     assert replaced(({"gravity": 1.5, "coulomb": 0.5}, {}), gone) == ["gravity", "coulomb"]
 
 
@@ -118,7 +118,7 @@ def test_a_tenth_of_a_score_is_nothing(left: float, taken: bool):
 
 
 def test_errors_name_the_data_they_are_on():
-    """JSON keys of data that chose the model and of data without a say, with and without own offsets."""
+    """JSON keys of validation data and of test data, with and without own offsets."""
     stage = two_rounds().final
     assert set(stage.errors()) == {"held_out_rmse", "held_out_rmse_windows"}
     errors = [

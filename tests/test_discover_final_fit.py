@@ -1,4 +1,4 @@
-"""The model of a search that ends unexplained is fitted once more, to all recordings that had a say."""
+"""The model of a search that ends unexplained is fitted once more, to training and validation data."""
 
 import dataclasses
 import functools
@@ -60,7 +60,7 @@ def run(level: float, offset: float, seed: int, N: int = 3000, excess: float = 0
 
 @pytest.fixture(scope="module")
 def runs():
-    """To fit, to choose by, and one whose friction lies between that of the two."""
+    """For training, for validation, and for testing, whose friction lies between that of the others."""
     return run(0.05, 0.0, 0), run(0.075, 0.0, 1), run(0.07, 0.0, 2)
 
 
@@ -100,7 +100,7 @@ def test_its_errors_are_those_of_its_model(found, runs):
     assert last.test.windows["theta"] == pytest.approx(short_runs_miss(last.model, test), rel=1e-6)
     whole = rf.metrics.rmse(test, last.model.simulate(test))["theta"]
     assert last.test.whole["theta"] == pytest.approx(whole, rel=1e-6)
-    # It is the fit that a user makes, tried first on data that have not seen what they validate.
+    # It is the fit that a user makes; the same fit to training data alone was tried on validation data.
     structure, local = found.final.model.mechanism, list(last.fit.local)
     if OFFSET in local:
         structure = structure + rf.effects.VoltageOffset("input")
@@ -303,7 +303,7 @@ LAWS_ON = tuple((law.name, port) for law, port in LAWS)
 
 @pytest.fixture
 def coulomb_found(monkeypatch):
-    """A search that takes the simpler law, whatever the data say, and leaves it where it is."""
+    """A search that takes the simpler law, whatever the data are, and leaves it where it is."""
     monkeypatch.setattr(sys.modules[choose.__module__], "_clearly_better", lambda *given: False)
     monkeypatch.setattr(sys.modules[rf.discover.__module__], "take_better_laws", lambda state: ())
 
@@ -549,7 +549,7 @@ def test_it_is_saved_and_told(found, runs, tmp_path: Path, monkeypatch):
     assert len(row.stages) == len(found.stages) + 1
     page = found.report(tmp_path / "report", learned=False).read_text()
     assert FITTED_TO_ALL in page and "training and validation recordings together" in page
-    # What stands large at the top is what the model to use does on data that had no say.
+    # What stands large at the top is the error of the model to use on test data.
     top = page[page.index("error over 2 s of test data") :]
     shown = next(float(x) for x in re.findall(r"→ </span>([\d.]+) deg", top))
     assert shown == pytest.approx(np.rad2deg(short_runs_miss(found.model, runs[2])), rel=0.01)
@@ -567,7 +567,7 @@ def test_runs_that_validate_each_other(runs, arm):
 
 
 def test_what_recordings_know_is_theirs(arm, monkeypatch):
-    """An inertia that each recording knows: the fit and its errors have that of each."""
+    """An inertia that is a constant of each recording: the fit and its errors have that of each."""
     inertia, given = "hub.inertia.inertia", []
     for seed, (level, J) in enumerate(((0.05, 0.0075), (0.075, 0.012), (0.07, 0.02))):
         monkeypatch.setitem(globals(), "INERTIA", J)
@@ -734,7 +734,7 @@ def fewer_effects(needed=(), spoken_for=(), refused=()):
     """What becomes of friction, lag, cogging and a bias, where LuGre friction took the place of Coulomb's.
 
     Args:
-        needed: Effects that free runs of all recordings prefer.
+        needed: Effects with which free runs of all recordings are better.
         spoken_for: Those without which runs of validation data are worse by more than a tenth.
         refused: Those without which the fit would not be accepted.
     """
@@ -748,7 +748,7 @@ def fewer_effects(needed=(), spoken_for=(), refused=()):
 
     def tried(structures):
         (structure,) = structures
-        assert structure.start == "training"  # a fit to all has seen the validation data
+        assert structure.start == "training"  # a fit to all uses the validation data
         lost = 0.15 if set(spoken_for) - set(structure.on) else 0.0
         errors = RunErrors({}, {"theta": np.exp(lost)})
         return [MODULE._Tried([fitted(structure.on, "training")], errors)]

@@ -100,7 +100,7 @@ def blocks(h) -> tuple[Windows, list[list[slice]]]:
 
 
 def every_row(h, W: np.ndarray) -> np.ndarray:
-    """Slopes along every coordinate of a fit (M, R N C), zero where a coordinate has no say."""
+    """Slopes along every coordinate of a fit (M, R N C), zero where a coordinate has no influence."""
     shared, local = len(h.free), len(h.local)
     rows = [W[k] for k in range(shared)]
     for r, slices in enumerate(blocks(h)[1]):

@@ -63,7 +63,7 @@ def test_even_leads_are_a_softmax():
     passed = np.array([0.4, 0.0, 0.0, 0.0])
     expected = softmax(lead / 2.0 + 1.5 * runs - 0.7 * n + passed)
     np.testing.assert_allclose(set_probabilities(sets, rule=RULE), expected, rtol=1e-9)
-    assert expected.min() > 0.02  # all have a say
+    assert expected.min() > 0.02  # none is negligible
     # Where something remains, nats of predictions count for less; in the end, for nothing.
     expected = softmax(lead / 20.0 + 1.5 * runs - 0.7 * n + passed)
     np.testing.assert_allclose(set_probabilities(sets, misfit=10.0, rule=RULE), expected, rtol=1e-9)

@@ -189,7 +189,7 @@ def test_from_the_deflection_alone_a_linear_joint_has_four_numbers() -> None:
 
     def coefficients(mechanism) -> np.ndarray:
         linear = linearise(mechanism)
-        # The angle itself has no say in the deflection.
+        # The deflection does not depend on the angle itself.
         A, B, C = linear.A[1:, 1:], linear.B[1:], linear.C[:, 1:]
         s = 1j * np.array([2.0, 11.0, 40.0])
         return np.concatenate([[*(C @ np.linalg.solve(x * np.eye(3) - A, B)).ravel()] for x in s])

@@ -16,7 +16,7 @@ from rotflex_jax.text.plotting import blank, styled
 
 
 def publish(records: list[Row], results: Path) -> list[Path]:
-    """Write `B0.md`, `B0_confusion.png` and `B0_reliability.png` beside `B0.json`, where they have a say.
+    """Write `B0.md` beside `B0.json`, and those of its two figures that have anything to show.
 
     Args:
         records: all rows of the results file.

@@ -177,7 +177,7 @@ def written(records: list[Row]) -> str:
         "was found. Wrong: neither hidden",
         "nor a right name of something besides. Errors in degrees, theta / alpha, free runs of 2 s and",
         "whole runs, before -> after the search, with the voltage offset found on the first 2 s of the",
-        "record that is run; the test record had no say.",
+        "record that is run; the test record was used for no fit and no choice.",
     ]
     seen = [r for r in records if r["world"] in SEEN]
     for title, some in (

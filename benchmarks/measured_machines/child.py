@@ -65,7 +65,7 @@ def row(
         "reported": {
             "baseline": reported(told["baseline"]),
             "final": reported((told["rounds"] or [told["baseline"]])[-1]),
-            # The last one fitted to all that had a say, where the search has done that.
+            # The last one, fitted to training and validation recordings, where the search has done that.
             "fitted to all": reported(last) if last else None,
         },
         "simulated": {
@@ -96,7 +96,7 @@ def reported(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def compared(model: rf.Model, way: Way, methods: Sequence[str], say: Callable[[str], None]) -> dict[str, Any]:
-    """Other methods on the same data, best first; they learn from all that has a say in the search."""
+    """Other methods on the same data, best first; they are fitted to training and validation recordings."""
     began = time.perf_counter()
     table = rf.compare(
         [*way.train, *way.validation], methods, mechanism=model, test=list(way.test), progress=say

@@ -17,15 +17,16 @@ KEYS = dict(
 )
 HEAD = """# B9: measured machines
 
-Written by `python benchmarks/B9_measured.py`. Learnt from some recordings, decided on the ends of these,
-evaluated on others that had no say. Root mean square errors of free runs over the whole test and over windows
-of 2 s, of all channels; calibrated: with the voltage offset that the first 2 s of each test recording ask
-for. Provisional rounds are in brackets, look-alikes after an equals sign. "fitted to all, A for B": that fit
-has law A in the place of the law B that was found; "without C": it does without an effect or offset that
-was found; "D separate for each run": each run has a value of its own of this parameter.
+Written by `python benchmarks/B9_measured.py`. Fitted to some recordings, decided on the ends of these,
+evaluated on others, which were used for no fit and no choice. Root mean square errors of free runs over the
+whole test and over windows of 2 s, of all channels; calibrated: with the voltage offset that is fitted to the
+first 2 s of each test recording. Provisional rounds are in brackets, look-alikes after an equals sign.
+"fitted to all, A for B": that fit has law A in the place of the law B that was found; "without C": it does
+without an effect or offset that was found; "D separate for each run": each run has a value of its own of this
+parameter.
 
 """
-BANDS = """Bands of 90 % around free runs over each test recording, of models that have seen training and
+BANDS = """Bands of 90 % around free runs over each test recording, of models made from training and
 validation data alone: how many samples they hold, their mean half width, and what gives most of their
 variance."""
 
@@ -33,8 +34,8 @@ variance."""
 def evaluated(row: Row, stage: str) -> tuple[dict[str, Any], str]:
     """Errors of a stage on the test by kind, and where they are from.
 
-    The search's own where it reports any on recordings that had no say; otherwise simulated by the benchmark
-    with the public interface.
+    The search's own where it reports any on test recordings; otherwise simulated by the benchmark with the
+    public interface.
     """
     own = row["reported"][stage]
     if own.get(KEYS["whole"]):
@@ -43,7 +44,7 @@ def evaluated(row: Row, stage: str) -> tuple[dict[str, Any], str]:
 
 
 def held_out(row: Row, stage: str) -> dict[str, Any]:
-    """Errors that the search reports on the validation part, which had a say."""
+    """Errors that the search reports on the validation part, on which it chose the model."""
     own = row["reported"][stage]
     return {
         "whole": _channels(own.get("held_out_rmse")),

@@ -86,12 +86,12 @@ def page(found: dict[str, Any]) -> str:
     if "direction" in found:
         d = found["direction"]
         fits = ", ".join(f"{n} = {v:.3g} ± {HALF_WIDTH_95 * s:.2g}" for n, (v, s) in d["fit"].items())
-        lines += ["", "## Friction that knows the direction of the load", ""]
+        lines += ["", "## Friction that depends on the direction of the load", ""]
         lines += [
             f"Fitted with a level for lifting and one for lowering: {fits}. As a candidate beside friction "
             f"in proportion to the weight: excited {str(d['excited']).lower()}, {d['unconfounded']:.1g} of "
-            f"its derivative unconfounded, verdict `{d['verdict']}`. One mass does not tell a directional "
-            "friction from another torque constant.",
+            f"its derivative unconfounded, verdict `{d['verdict']}`. One mass does not distinguish a "
+            "directional friction from another torque constant.",
         ]
     if "released" in found:
         lines += ["", "## The torque off", ""]
@@ -127,7 +127,7 @@ def page(found: dict[str, Any]) -> str:
             "",
         ]
         if all("others" in r for r in rows):
-            lines += ["Over the other motions, which had no say in anything:", ""]
+            lines += ["Over the other motions, used for no fit and no choice:", ""]
             lines += [
                 "| model | " + " | ".join(f"{r['joint']}: {m}" for r in rows for m in r["others"]) + " |"
             ]

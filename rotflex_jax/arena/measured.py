@@ -10,7 +10,7 @@ from typing import Any
 import rotflex_jax as rf
 from rotflex_jax.data.readers import stages_together
 
-# Of what is learnt from, the rest is for validation.
+# Share of a run for training, the rest is for validation.
 SHARE = 0.7
 # A quarter of the Silverbox's training record is plenty for three or four effects, as in B3.
 SILVERBOX_SAMPLES = 16_000
@@ -18,13 +18,13 @@ SILVERBOX_SAMPLES = 16_000
 
 @dataclass(frozen=True)
 class Way:
-    """What is learnt from what, and evaluated on what.
+    """Which recordings are fitted, which decide, and on which the result is evaluated.
 
     Args:
         name: of the direction.
         train: recordings to fit.
         validation: recordings that decide.
-        test: recordings that have no say.
+        test: recordings used for no fit and no choice.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Machine:
         preset: name of its mechanism in `rotflex_jax.joints`.
         directions: recordings of the data set to all directions.
         options: of the preset.
-        unit: that errors are told in.
+        unit: of the errors that are reported.
         factor: errors in that unit per unit of the channel.
         solver: integration rule, where it is not the usual one.
         with_signals: whether its recordings have signals beside the input.
@@ -70,7 +70,7 @@ class Machine:
 
 
 def learnt(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Way:
-    """Learnt from runs, whose ends decide, and evaluated on other recordings."""
+    """Fitted to the beginnings of runs, whose ends decide, and evaluated on other recordings."""
     parts = [r.split(SHARE) for r in runs]
     return Way(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
 
@@ -90,8 +90,8 @@ def together(runs: Sequence[rf.Recording]) -> Way:
 def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
     """From each run to the others, then all together.
 
-    Of two runs, the end of the one that is learnt from decides, or else the first half of the other one,
-    whose second half is the test. Of three, the next one decides and the third is the test.
+    Of two runs, the end of the first one decides and the other one is the test, or the first half of the
+    other one decides and its second half is the test. Of three, the next one decides, the third is the test.
     """
     names, ways = list(runs), list[Way]()
     for k, name in enumerate(names):
@@ -109,7 +109,7 @@ def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
 
 
 def _emps(_: list[rf.Recording]) -> list[Way]:
-    # The test record has pulses of the voltage, which the training record lacks: it has no say.
+    # The test record has pulses of the voltage, which the training record lacks. It is for the errors only.
     official = rf.data.benchmark("emps")
     return [
         learnt("official", [official.train], list(official.tests.values())),
@@ -133,8 +133,8 @@ def by_itself(name: str, run: rf.Recording) -> Way:
 def _two_runs(runs: Sequence[rf.Recording]) -> list[Way]:
     """Two runs of the serial link, by LQR and by full state feedback: each by itself, and across.
 
-    They are fifteen years apart, with other friction and amplifiers: a run by itself says what a model can
-    do, and across the runs the machine is another one too.
+    They are fifteen years apart, with other friction and amplifiers: a run by itself shows what a model can
+    do, while across the runs the machine has changed as well.
     """
     named: dict[str, rf.Recording] = dict(zip(("lqr", "feedback"), runs, strict=True))
     return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]

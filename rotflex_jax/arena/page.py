@@ -10,13 +10,13 @@ from rotflex_jax.text.markup import fill_template
 
 HEADINGS = {
     "right": "Answers that are right as a whole, of all simulated records.",
-    "named": "Hidden effects of the catalogue that were named, or what no recording tells from them.",
+    "named": "Hidden effects of the catalogue that were named, or effects indistinguishable from them.",
     "wrong": "Names that are not true, wrong worlds not counted.",
     "alarms": "Records with nothing hidden on which something was said to be missing.",
     "withheld": "Records whose effect has no name in the catalogue, and the answer was 'unexplained'.",
     "worlds": "Wrong worlds whose hidden effect was named.",
     "calibration": "Mean distance between a probability and how often it held; - where none was given.",
-    "error": "Median error of free runs that had no say, in units of the sensors' noise; - without a model.",
+    "error": "Median error of free runs over test data, in units of the sensors' noise; - without a model.",
     "seconds": "Median time of an answer [s].",
     "failures": "Records on which the method raised, answered nonsense or took too long.",
 }

@@ -93,7 +93,7 @@ def _hidden(r: rf.Recording) -> rf.Recording:
 
 
 def _alone(r: rf.Recording, source: str = "arena") -> rf.Recording:
-    """A recording that says neither where it is from nor what came before."""
+    """A recording without its source and without what came before it."""
     return replace(r, source=source, start=0.0, continues=None, accept=ACCEPTABLE)
 
 
@@ -108,7 +108,7 @@ def drawn(
     """Simulated records: half with one hidden effect, the others of every other kind.
 
     Effects, strengths, widths, inputs, constants of the machine and noise are drawn from the seed. The order
-    of the kinds is drawn too, so that the place of a record tells nothing.
+    of the kinds is drawn too, so that the place of a record reveals nothing.
 
     Args:
         records: How many.
@@ -195,7 +195,7 @@ def _world(rng: np.random.Generator) -> Problem:
 def measured(say: Callable[[str], None] = lambda _: None) -> list[Problem]:
     """Every direction of every measured machine whose recordings are on this machine.
 
-    Nobody knows the truth of these; the free run over recordings that had no say is what counts.
+    The truth of these is unknown; what counts is the free run over test recordings.
 
     Args:
         say: Called with a line for each machine, also where it is left out.

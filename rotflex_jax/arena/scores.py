@@ -34,12 +34,12 @@ BINS, LEAST = 10, 0.01
 
 FOUND, FAILED = "found", "failed"
 
-# A run that leaves the noise so many times over has diverged.
+# A run whose error is so many times the noise has diverged.
 _DIVERGED = 1e6
 
 
 class Event(NamedTuple):
-    """A probability, and whether what it speaks of was so."""
+    """A probability, and whether the statement that it was given for is true."""
 
     probability: float
     true: bool
@@ -50,7 +50,7 @@ class Bin(NamedTuple):
 
     Attributes:
         claimed: Their mean probability.
-        held: Share of them that were so.
+        held: Share of them that are true.
         cases: How many.
     """
 
@@ -83,7 +83,7 @@ def calibration_error(events: Iterable[Event]) -> float:
 
 
 class Share(NamedTuple):
-    """So many of so many."""
+    """A count out of a total."""
 
     count: int
     of: int
@@ -108,12 +108,13 @@ class Marks:
         answered: Effects that were named.
         verdict: `found`, `nothing missing`, `unexplained` or `failed`.
         reason: Why it failed, or why its model did not run.
-        hits: How many of the hidden effects were named, each by itself or by what no recording tells from it.
+        hits: How many of the hidden effects were named, each by itself or by one that no recording
+            distinguishes from it.
         wrong: Names that are neither true nor of what else is wrong.
         right: Whether the answer as a whole is right.
         events: Probabilities that were given, and whether the effects were there.
         seconds: Time that the answer took.
-        error: Root mean square of free runs over recordings that had no say, over the noise of the sensors
+        error: Root mean square error of free runs over test recordings, divided by the noise of the sensors
             (geometric mean over channels); of measured machines in the unit of the channel; None without a
             model.
         truth: All of the truth, fit for JSON.
@@ -166,10 +167,11 @@ def marked(
 ) -> Marks:
     """An answer beside the truth.
 
-    On a record with one or two hidden effects the answer is right if it names them, each by itself or by what
-    no recording tells from it, and nothing else. On one with nothing hidden it is right if it says so. On one
-    whose effect is outside the catalogue the right answer is that something stays unexplained. In a wrong
-    world it is right to name the effect; names of what else is wrong there count neither way.
+    On a record with one or two hidden effects the answer is right if it names them, each by itself or by an
+    effect that no recording distinguishes from it, and nothing else. On one with nothing hidden the right
+    answer is that nothing is missing. On one whose effect is outside the catalogue it is that something stays
+    unexplained. In a wrong world it is right to name the effect; names of what else is wrong there count
+    neither way.
 
     Args:
         problem: The record.
@@ -419,7 +421,7 @@ def score(
         methods: A function, which runs in this process; `"FILE.py:NAME"` or the name of an entrant, which has
             a process of its own; or several of these.
         records: How many simulated records; half have one hidden effect, see `problems.drawn`.
-        seed: What the records are drawn from; drawn itself where it is None. No method is told.
+        seed: What the records are drawn from; drawn itself where it is None. No method is given it.
         seconds: Length of a record, training and validation together [s].
         limit: Most time for an answer [s]. A process is stopped then; a function of this process fails
             when it returns.

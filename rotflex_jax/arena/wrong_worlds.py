@@ -1,12 +1,12 @@
 """Wrong worlds: what a laboratory records of a machine whose model is wrong in more than one way.
 
 A world has one hidden effect that a search should name, with strength and shape drawn at random, and beside
-it what laboratories have: torques that no candidate describes, and faults that one would name. Trusted
-constants of the model are wrong, every run has a voltage offset of its own, a controller is in the loop, and
-its voltage and the counted angles are recorded.
+it what laboratories have: torques that no candidate describes, and faults that a candidate does describe.
+Trusted constants of the model are wrong, every run has a voltage offset of its own, a controller is in the
+loop, and its voltage and the counted angles are recorded.
 
     world = wrong_worlds.world(3000)
-    rf.discover(world.model, world.train, world.validation)      # world.test has no say
+    rf.discover(world.model, world.train, world.validation)      # world.test is for the errors only
 
 Two kinds: the flexible joint of the paper, and a flexible link with a strain gauge on the same servo.
 """
@@ -104,8 +104,8 @@ class World:
         kind: `joint` or `link`.
         train: recording to fit.
         validation: another reference, controller and offset.
-        test: a third of each; it has no say.
-        model: the textbook joint, trusted constants as a user believes them.
+        test: a third reference, controller and offset; used for no fit and no choice.
+        model: the textbook joint, with trusted constants as a user would have them.
         hidden: effect and port to be named, or None.
         parameters: of the hidden effect, under the arena's names.
         besides: what else is wrong.
@@ -243,7 +243,7 @@ def _sensors(rng: np.random.Generator, kind: str, besides: Sequence[Beside]) -> 
 
 
 def _wandering(size: float, time: float, N: int, Ts: float, rng: np.random.Generator) -> np.ndarray:
-    """A torque of mean zero that forgets itself within `time`."""
+    """A torque of mean zero whose correlation decays within `time`."""
     keep, w, x = np.exp(-Ts / time), rng.standard_normal(N), np.empty(N)
     x[0] = w[0]
     for k in range(1, N):

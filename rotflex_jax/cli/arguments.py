@@ -127,7 +127,9 @@ HeldOut = Annotated[
 Test = Annotated[
     list[Path] | None,
     typer.Option(
-        "--test", metavar="FILE", help="Recording that has no say, to report errors on; may be repeated."
+        "--test",
+        metavar="FILE",
+        help="Test recording to report errors on, used for no fit and no choice; may be repeated.",
     ),
 ]
 Calibrate = Annotated[

@@ -154,7 +154,7 @@ def errors_on_test(
     runs: KnownRuns,
     of_runs: Sequence[EffectLocation] = (),
 ) -> RunErrors:
-    """Errors over recordings that had no say, each with the offsets that are known of its run.
+    """Errors over test recordings, each with the offsets that are known of its run.
 
     A recording of a run that was fitted has the offsets of that run. One of another run has those that the
     machine has, and none that a single run has shown; nor the phase of a disturbance.
@@ -363,7 +363,7 @@ class Evaluation:
 
     Attributes:
         validation: Free runs over the validation recordings.
-        test: Free runs over recordings that had no say; None without any.
+        test: Free runs over test recordings; None without any.
         calibrate_seconds: How much of a recording its own offsets may be fitted to [s].
         runs: Those of the training recordings.
     """
@@ -419,7 +419,7 @@ class Evaluation:
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """Those that had no say."""
+        """Test recordings, used for no fit and no choice."""
         return self.test.problem.dataset.recordings if self.test else ()
 
     def of_stage(

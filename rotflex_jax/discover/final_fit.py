@@ -1,23 +1,24 @@
-"""The last fit of a search that ends unexplained: the structure that was chosen, to all that had a say.
+"""The last fit of a search that ends unexplained: the chosen structure, to training and validation data.
 
-A search fits its models to training recordings alone, so that validation data can compare them. Once these
-have chosen, they are as good to learn from as the others: friction differs with the amplitude of the motion
-and from run to run, and half of the recordings show half of that.
+A search fits its models to the training recordings alone, so that validation data can compare them. Once the
+structure is chosen, the validation recordings are as useful for a fit as the others: friction differs with
+the amplitude of the motion and from run to run, and half of the recordings show half of that.
 
-Parameters of an incomplete model depend on what they are fitted to. Those of the search suit predictions, or
-free runs that each have a first state of their own, which may hide a drift of the model. Whoever uses a model
-starts it from a measured state. So this fit is to free runs over windows from what their first samples show.
-Where validation data speak against that clearly, tried on the training recordings alone, it is to free runs
-with fitted first states instead, as in the search. Validation data also decide whether recordings have
-offsets that the search could do without. A run of which nothing is known gets what the fitted runs have in
-common of them.
+Parameters of an incomplete model depend on what they are fitted to. Those of the search are fitted to
+predictions, or to free runs that each have a fitted first state, which may hide a drift of the model. A user
+starts the model from a measured state. So this fit is to free runs over windows, each from the state that its
+first samples show. Where such a fit has clearly larger errors on validation data than the fit of the search,
+tried on the training recordings alone too, it is to free runs with fitted first states instead, as in the
+search. Validation data also decide whether recordings have offsets that the search could do without. A run of
+which nothing is known gets the offsets that the fitted runs have in common.
 
-In a search each free run has a first state of its own, which hides much of what distinguishes one law of
-friction from another. From measured first states it shows: a law that the search cannot exclude, or that
-contains the one found, takes its place where these runs prefer it beyond doubt. Where every run prefers
-beyond doubt a friction of its own size, each has it. An offset that a single run has shown is left out where
-that run hardly needs it; so is an effect beside the first one that such runs are not clearly better with:
-predictions may ask for it to make up, within a few samples, for what no candidate explains.
+In a search each free run has a fitted first state, which hides much of the difference between one law of
+friction and another. Runs from measured first states show this difference: a law that the search cannot
+exclude, or that contains the one found, takes its place where these runs are better with it beyond doubt.
+Where every run is better beyond doubt with a friction of its own size, each has one. An offset that a single
+run has shown is left out where that run is hardly better with it. So is any effect but the first where such
+runs are not clearly better with it: in predictions it may make up, within a few samples, for what no
+candidate explains.
 """
 
 import dataclasses
@@ -57,12 +58,12 @@ from rotflex_jax.recording.recording import joined
 # Errors of a fit from measured first states over those of the search, both fitted to training recordings,
 # up to which the former is taken: logarithm of their ratio on validation data, mean over channels.
 MOST_WORSE = 0.2
-# Where runs validate each other, at most so many fits, each without a share of them, say how well a way does.
+# Where runs validate each other, at most so many fits, each without a share of them, rate a way of fitting.
 MOST_FOLDS = 3
 
 
 class Refused(NamedTuple):
-    """Why the final model was not fitted to all that had a say.
+    """Why the final model was not fitted to training and validation recordings together.
 
     Attributes:
         sentence: For the notes of a result.
@@ -83,12 +84,13 @@ def fit_to_all(
         evaluation: The recordings that errors are reported on.
 
     Returns:
-        The fit; or why there is none: validation data speak against it, it does worse on them than the model
-        that has not seen them, or it has a periodic disturbance, whose phase no other recording shares.
+        The fit; or why there is none: its errors on validation data are clearly larger than those of the
+        search, fitted without these data or to them as well, or it has a periodic disturbance, whose phase
+        no other recording shares.
     """
     if state.problem.supermodel.phased.intersection(final.hypothesis.local):
         return _refused(state, "it has a periodic disturbance, whose phase no other recording shares")
-    state.say("fitting what was chosen to all recordings that had a say")
+    state.say("fitting the chosen structure to all training and validation recordings")
     try:
         return _LastFit(state, stage, evaluation).made(final.hypothesis)
     except InputError as error:  # some recordings cannot be fitted alone: no reason to lose what was found
@@ -129,7 +131,7 @@ class _Candidate(NamedTuple):
     """A structure fitted to all recordings.
 
     Attributes:
-        tried: The structure fitted without the validation data, which may speak against it.
+        tried: The structure fitted without the validation data, whose errors on these may refuse it.
         fitted: It is fitted to all; its friction may belong to runs, unlike in `tried`.
         laws: Pairs of an effect that was found and the law that stands in its place.
         left_out: Effects and offsets that were found and that the structure does without.
@@ -157,7 +159,7 @@ class _LastFit:
 
     @functools.cached_property
     def recordings(self) -> tuple[Recording, ...]:
-        """All that had a say, parts of one run that follow on each other as one."""
+        """Training and validation recordings, parts of one run that follow on each other as one."""
         validation = self.state.validation
         held_back = () if validation.folds else validation.problem.dataset.recordings
         return joined((*self.state.problem.dataset.recordings, *held_back))
@@ -292,7 +294,7 @@ class _LastFit:
         return candidate if isinstance(self.accepted(fewer), Refused) else fewer
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
-        """The same with laws that free runs of all recordings prefer in the places of those found."""
+        """The same with other laws in the places of those found, where free runs are better with them."""
         for location in self.state.order:
             if location in candidate.tried.structure.on:  # not where a law has taken its place already
                 candidate = self.with_best_law(candidate, location)
@@ -313,7 +315,7 @@ class _LastFit:
         ]
         for other, law in sorted(better, key=lambda each: each[0].fit.cost):
             (tried,) = self.tried([other.structure])
-            # As little as validation data may speak against the fit, they may against the law.
+            # With the law, errors on validation data may grow by no more than the fit itself is allowed.
             before = (self.searched, candidate.tried.errors)
             if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in before):
                 replaced = [(p, law) for p in structure.on if p not in other.structure.on]
@@ -321,7 +323,7 @@ class _LastFit:
         return candidate
 
     def with_own_friction(self, candidate: _Candidate) -> _Candidate:
-        """The same with dry friction of its own size in each run, if every run prefers that."""
+        """The same with dry friction of its own size in each run, if every run is better with that."""
         if log_error_ratio(candidate.tried.errors, self.searched) > MOST_WORSE:
             return candidate  # it would be refused for that
         structure = candidate.fitted.with_own_friction()
@@ -334,12 +336,12 @@ class _LastFit:
         return candidate._replace(fitted=fitted)
 
     def runs_prefer(self, a: Fit, b: Fit, every: bool = False) -> bool:
-        """Whether free runs of fit `a` leave a tenth less than those of `b`, beyond doubt.
+        """Whether errors of free runs of fit `a` are a tenth smaller than those of `b`, beyond doubt.
 
         Args:
             a: The fit in question.
             b: The fit that it is compared with.
-            every: Whether those of every recording have to prefer it beyond doubt.
+            every: Whether the runs of every recording have to be better with it beyond doubt.
         """
         smaller = mean_log_ratio(*(np.array([x.noise[c] for c in b.noise]) for x in (a, b)))
         if np.isinf(smaller):  # one of them diverges, and its half seconds are not numbers
@@ -369,16 +371,16 @@ class _LastFit:
         return fitted.as_hypotheses([self.runs.index(r) for r in recordings])
 
     def accepted(self, candidate: _Candidate) -> tuple[FinalFit, FittedStructure] | Refused:
-        """The result with a candidate and its fit, or why its errors on validation data refuse it.
+        """The result with a candidate and its fit, or why it is refused for its errors on validation data.
 
-        The same fit without these data must not be clearly worse than that of the search, nor this fit.
+        Neither the same fit without these data nor this fit may be clearly worse than that of the search.
         """
         tried, fitted, laws, left_out = candidate
         trained, seconds = tried.errors, self.state.validation.window_seconds
         if (ratio := log_error_ratio(trained, self.searched)) > MOST_WORSE:
             others = "the other recordings" if self.state.validation.folds else "the training recordings"
             return _refused(self.state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
-        # A fit to recordings that does clearly worse on them than one that has not seen them has failed.
+        # A fit to recordings that does clearly worse on them than one without them has failed.
         # Without their offsets it may be worse by more.
         if self.evaluation.runs.compared and len(self.recordings) > 1:
             # What most runs have in common may be far from what a run of validation data has.
@@ -409,13 +411,13 @@ class _LastFit:
         return made, fitted
 
     def tested(self, made: FinalFit, fitted: FittedStructure) -> FinalFit:
-        """A final fit with its errors on recordings that had no say, if there are any."""
+        """A final fit with its errors on test recordings, if there are any."""
         test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
         if not test:
             return made
         structure, own = fitted.structure, fitted.own_values(len(self.recordings))
         each = self.hypotheses(fitted, test.problem.dataset.recordings)
-        # Of one run alone, validation data have said already whether its own offsets do any good.
+        # Of one run alone, validation data have decided already whether its own offsets are of use.
         of_runs = structure.own if self.runs.compared else ()
         errors = errors_on_test(test, each, own, structure.on, self.runs, of_runs)
         calibrated = errors_with_own_calibration(test, each, structure.on, seconds) if seconds else None

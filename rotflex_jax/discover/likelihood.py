@@ -1,10 +1,10 @@
 """The likelihood of recordings under a hypothesis, and the refits that maximise it.
 
-Two horizons have a say in a search. The one-step prediction uses every sample, but where another part of the
-model is wrong its state follows the data within a few samples, and what acts slowly is no longer seen. A free
-run over a few seconds shows what acts slowly. It is a predictor with no gain, which starts again at each
-window; as its errors are alike from sample to sample, its likelihood is that of independent errors in name
-only, and gains of it count by their scatter between blocks of time.
+A search uses two horizons. The one-step prediction uses every sample, but where another part of the model is
+wrong its state follows the data within a few samples, and what acts slowly is no longer visible. A free run
+over a few seconds shows what acts slowly. It is a predictor with no gain, which starts again at each window.
+Its errors are alike from sample to sample, although its likelihood is that of independent errors; so gains of
+it count by their scatter between blocks of time.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from rotflex_jax.runtime.xla import on_threads
 
 # Hypotheses are compared block by block, so that the scatter shows what is chance.
 BLOCK_SECONDS = 0.5
-# What a block says for a model that diverges: finite, so that it can be compared.
+# Value of a block where a model diverges: finite, so that it can be compared.
 DIVERGED = -1e9
 # Errors beyond so many times the noise of a sensor are those of a run that diverges.
 LARGEST_ERROR = 1e6
@@ -159,7 +159,7 @@ class LikelihoodProblem:
         keys = [(Ts, known.tobytes()) for Ts, known in rows]
         for key, (Ts, known) in zip(keys, rows, strict=True):
             if key not in found:
-                # A learned map has its parameters after those that recordings may know.
+                # A learned map has its parameters after those that may be constants of a recording.
                 values = mechanism.values.copy()
                 values[: len(known)] = np.where(np.isnan(known), values[: len(known)], known)
                 here = mechanism.with_values(values)
@@ -416,8 +416,8 @@ def _refitted(problem: LikelihoodProblem, h: Hypothesis, wide: bool, alternation
     return current
 
 
-# Where friction holds and lets go at other samples, the slopes predict too large a decrease: what most steps
-# do not need, a few refused ones find.
+# Where friction holds and lets go at other samples, the slopes predict too large a decrease. Most steps need
+# no more damping than this; where it is too little, a few steps are refused until it is enough.
 CORRECTION_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-6, increase=30)
 MAX_CORRECTION_STEPS = 10
 

@@ -109,7 +109,7 @@ class Stage:
         simulated: Free run over each validation recording.
         windowed: The same, started again every `window_seconds`.
         window_seconds: [s].
-        process_noise: Port -> intensity of the process torque that the data ask for [(N m)^2 s]; small
+        process_noise: Port -> intensity of the process torque with the largest likelihood [(N m)^2 s]; small
             where the model is right.
         process_noise_nats: Log-likelihood per measured value of the training recordings that the process
             torque gains [nat]; near zero where the model is right.
@@ -118,7 +118,7 @@ class Stage:
             the validation recordings are then clearly better.
         calibrated: The validation errors where each recording has the offsets that its own first
             `calibrate_seconds` give.
-        test: Errors on recordings that had no say in the choice of the model, if there are any.
+        test: Errors on test recordings, which were used for no fit and no choice; None without any.
         test_calibrated: The same with each recording's own offsets.
         calibrate_seconds: What a recording's own offsets are fitted to [s].
         of_validation: The model with the phase that a disturbance has in each validation recording; empty
@@ -215,10 +215,10 @@ def assess_stages(baseline: Stage, final: Stage, floor: dict[str, float]) -> Ass
 
 @dataclasses.dataclass(frozen=True)
 class FinalFit:
-    """The final model of a search that ends unexplained, fitted once more to all that had a say in it.
+    """The final model of a search that ends unexplained, fitted to training and validation recordings.
 
     The fit is to free runs over windows, from what the first samples of each show; or from fitted first
-    states (`fit.options.first`) where validation data speak against that.
+    states (`fit.options.first`) where the former errs clearly more on validation data than the search.
 
     Attributes:
         fit: To the training and validation recordings together, with what each has for itself. What belongs
@@ -229,7 +229,7 @@ class FinalFit:
         trained: Errors on validation recordings, with their own offsets where these are calibrated, of the
             structure fitted in the same way to training recordings alone.
         searched: The same errors of the final model as the search has fitted it.
-        test: Errors on recordings that had no say, if there are any.
+        test: Errors on test recordings, if there are any.
         test_calibrated: The same with each recording's own offsets.
         laws: Pairs of an effect that the search has found and the law that stands in its place in this model.
         friction: Sizes of dry friction that each run has for itself, by full name; `model` has their mean.
@@ -255,7 +255,7 @@ class FinalFit:
         return tuple(self._noted(e) for e in self.fit.parameters if e.name in names)
 
     def _noted(self, e: Estimate) -> Estimate:
-        """An estimate that says of a friction that belongs to runs what it is in each."""
+        """An estimate; for a friction that belongs to runs, with the value in each run as a note."""
         if e.name not in self.friction:
             return e
         of_runs = "mean of runs with " + ", ".join(f"{own.value:.3g}" for own in self.fit.local[e.name])
@@ -306,9 +306,9 @@ class HorizonGain(NamedTuple):
 class Round:
     """One round of the search: an effect that was added.
 
-    Where another effect has taken the place of the one that the round added (a law that data
-    prefer at the end, or one effect for several), `score`, `prediction` and `free_run` are those of the
-    effect that the round added; so is `held_out_gain_nats` where the stages have parameters of free runs.
+    Where another effect has taken the place of the one that the round added (a law that fits the data better
+    at the end, or one effect for several), `score`, `prediction` and `free_run` are those of the effect that
+    the round added; so is `held_out_gain_nats` where the stages have parameters of free runs.
 
     Attributes:
         effect: Name of the effect.
@@ -352,7 +352,7 @@ class Round:
 
     @property
     def doubt(self) -> str:
-        """Why the effect may stand in for something else, in words; empty where nothing speaks for that."""
+        """Why the effect may stand in for something else, in words; empty without a reason to think so."""
         if self.certain:
             *laws, last = (effect_title(effect) for effect in (self.effect, *(e for e, _ in self.equivalent)))
             return f"{self.certain} is certain, but not whether it is {', '.join(laws)} or {last}"
@@ -398,7 +398,7 @@ class Ranked:
     Attributes:
         effect: Name of the effect.
         port: Where it would act.
-        score: Penalised score [nat]; negative where the data speak against it.
+        score: Penalised score [nat]; negative where the data are evidence against it.
         excited: False where this recording could not have shown an effect of a plausible size.
         unconfounded: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
         smallest: Detection limit: factor of a plausible size that would just have been visible.
@@ -431,7 +431,7 @@ class Where:
 
     Attributes:
         statement: A plain sentence.
-        share: Share of the squared error that it speaks of.
+        share: Share of the squared error that it is about.
         p_value: Chance of such a share if the error were spread evenly.
         kind: time, frequency, speed, deflection or reversal.
         channel: Whose error.
@@ -476,10 +476,10 @@ class SearchResult:
     """What a search found, as data; `Discovery` adds what can be done with it.
 
     Attributes:
-        verdict: Speaks of the end state.
+        verdict: On the end state.
         sentence: The verdict in words.
         train: Recordings that were fitted.
-        validation: Recordings that no fit saw, but that decided between models.
+        validation: Recordings that the search fitted no model to, but on which it chose between models.
         baseline: The user's model, fitted.
         rounds: What was added, in order.
         ranking: All candidates in the score test of the baseline, best first.
@@ -488,7 +488,7 @@ class SearchResult:
         elapsed_s: Time taken [s].
         notes: Remarks for a reader.
         proposal: Where two effects remain: the standard input that distinguishes them best.
-        test: Recordings that had no say in anything.
+        test: Test recordings, used for no fit and no choice.
         remarks: Parameters of the final model at a bound, or far beyond what the recordings reach.
         probabilities: Of sets of effects and of effects; None for results made by hand.
         conditional: Parameters whose intervals from predictions and from free runs exclude each other: the
@@ -530,7 +530,7 @@ class SearchResult:
         without those that a single run has shown.
 
         Args:
-            recording: Any of this machine; a part of a recording knows its run. An offset that the final fit
+            recording: Any of this machine; a part of a recording keeps its run. An offset that the final fit
                 leaves out is in no model.
         """
         runs, m = KnownRuns.of(self.train, self.validation), self.model.mechanism

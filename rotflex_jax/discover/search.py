@@ -72,11 +72,11 @@ def discover(
 ) -> Discovery:
     """Find the physical effects that a model lacks, and say how sure that is.
 
-    The baseline is fitted as a predictor whose process noise the data choose, and to free runs of a few
-    seconds; all candidate effects are scored at once by the slopes of its errors at both horizons; the best
-    are refitted at both; likelihood on validation data decides, for one effect or for a set that the
-    recordings cannot distinguish. Repeated until nothing is gained, then every effect must show that the
-    model is worse without it.
+    The baseline is fitted as a predictor, together with its process noise, and to free runs of a few seconds;
+    all candidate effects are scored at once by the slopes of its errors at both horizons; the best are
+    refitted at both; likelihood on validation data decides, for one effect or for a set that the recordings
+    cannot distinguish. This is repeated until nothing is gained. At the end an effect is left out where the
+    model is no worse without it.
 
     Args:
         mechanism: The user's model; its parameter values are the start.
@@ -88,14 +88,14 @@ def discover(
             model that was chosen is fitted to them once, to see whether its parameters are the same there.
             Where the search ends unexplained, `Discovery.model` is fitted to them as well. Without any, every
             training recording validates what was fitted to the others.
-        test: Recordings that have no say in anything; the errors on them are reported beside.
+        test: Test recordings, used for no fit and no choice; the errors on them are reported as well.
         candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
             answer to those of the flexible joint (`mechanism.roles`). Each of the `signals` that all
             recordings have is tried as a torque at each of these ports.
         rounds: Most effects to add; two that are added together count as two.
         window_seconds: Length of short free runs [s].
-        calibrate_seconds: The errors reported as calibrated allow each recording that no fit saw the offsets
-            that its own first seconds give [s]; 0 for none.
+        calibrate_seconds: For the errors reported as calibrated, each validation and test recording has the
+            offsets that its own first seconds give [s]; 0 for none.
         resume: `NAME.stopped.json` that a stopped search of the same recordings has left: the search goes on
             after the rounds in it, which count among `rounds`.
         progress: Called with a line of text at each stage.
@@ -119,7 +119,7 @@ def discover(
     if candidates is not None:
         candidates = checked_candidates(model.mechanism, candidates)
     horizons = _prepare(model, trained, held_back, candidates, window_seconds)
-    reason = "errors are reported on data that had no say; give other recordings, or leave `test` out"
+    reason = "test recordings are used for no fit and no choice; give others, or leave `test` out"
     check_apart((*trained, *held_back), tested, "to search and to test", reason)
     evaluation = Evaluation.of(model, horizons, tested, calibrate_seconds)
     supermodel = horizons.prediction.problem.supermodel
@@ -152,7 +152,7 @@ def discover(
 def _with_signals(
     model: Model, deciding: Sequence[Recording], tested: Sequence[Recording]
 ) -> tuple[Model, tuple[str, ...]]:
-    """The model that measured signals may drive, those of all recordings with a say; a note on the others.
+    """The model with the signals that all training and validation recordings have; a note on the others.
 
     Raises:
         InputError: A test recording lacks one of them.
@@ -224,7 +224,7 @@ def _prepare(
 
 
 def _check_apart(train: Sequence[Recording], held_back: Sequence[Recording]) -> None:
-    """Refuses data that were fitted in the place of data that no fit has seen."""
+    """Refuses validation data that are training data too."""
     reason = "a search decides on data that no fit has seen; give another recording, or the two parts of "
     reason += "recording.split(0.7)"
     for k, a in enumerate(train):

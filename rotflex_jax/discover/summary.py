@@ -66,9 +66,9 @@ class EvaluatedModels:
         remarks: On its parameters.
         rounds: What was added, in order.
         where: When the error of the baseline is large.
-        test: Recordings that had no say.
-        final_fit: The final model fitted to all that had a say, or why not; None where it explains its
-            recordings.
+        test: Test recordings, used for no fit and no choice.
+        final_fit: The final model fitted to training and validation recordings, or why not; None where it
+            explains its recordings.
     """
 
     stages: tuple[Stage, ...]
@@ -212,8 +212,8 @@ def _far_baseline(state: SearchState) -> tuple[str, ...]:
     if not moved:
         return ()
     return (
-        f"The fit of the model as it is has moved {' and '.join(moved)}: values that were given far off do "
-        "that, and friction that holds a machine at rest"
+        f"The fit of the model as it is has moved {' and '.join(moved)}, as happens where the values given "
+        "are far off or where friction holds a machine at rest"
         + ("; candidates were also tried beside the values given." if state.ranking else "."),
     )
 
@@ -243,7 +243,7 @@ def _resumed(count: int) -> tuple[str, ...]:
 
 
 def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis, corrected: bool) -> Stage:
-    """A stage with the process noise that predictions with its parameters ask for, and what it gains.
+    """A stage with the process noise that makes predictions with its parameters likeliest, and what it gains.
 
     Args:
         state: What was found.
@@ -342,7 +342,7 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
 
 
 def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
-    """Which parameters of an effect the recordings do not speak for."""
+    """Which parameters of an effect have values far beyond what the recordings reach."""
     head = location.name_prefix
     return tuple(r.sentence for r in remarks if r.kind == BEYOND_RECORDINGS and r.parameter.startswith(head))
 
@@ -351,7 +351,7 @@ def _doubts(
     state: SearchState, location: EffectLocation, pairs: Sequence[PairedEstimates]
 ) -> tuple[str, ...]:
     """Why an effect that is distinguished from others may still stand in for something else, in words."""
-    if location not in state.gains:  # a calibration, which has shown by other means that the machine has it
+    if location not in state.gains:  # a calibration, which other tests have established
         return ()
     reasons = []
     prediction, runs = state.gains[location]

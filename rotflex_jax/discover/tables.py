@@ -65,7 +65,7 @@ class ParameterRow:
     given: str = ""
 
 
-FITTED_TO_ALL = "the last, fitted to all recordings that had a say"
+FITTED_TO_ALL = "the last, fitted to all training and validation data"
 """Label of the final fit."""
 
 
@@ -81,7 +81,7 @@ class ErrorTable:
 
     Attributes:
         title: Which recordings, and with which offsets.
-        note: What say they had.
+        note: Whether the model was chosen on them.
         rows: One for each stage.
     """
 
@@ -95,7 +95,7 @@ class NamedErrors(NamedTuple):
 
     Attributes:
         title: Which recordings, and with which offsets.
-        note: What say they had.
+        note: Whether the model was chosen on them.
         errors: Label of a model -> its errors.
     """
 
@@ -107,16 +107,16 @@ class NamedErrors(NamedTuple):
 def error_lists(discovery: SearchResult) -> list[NamedErrors]:
     """Errors of every stage on validation and on test data, with and without own offsets; what there is.
 
-    The fit to all that had a say has errors on test data alone.
+    The fit to all training and validation recordings has errors on test data alone.
     """
     stages, labels, last = discovery.stages, stage_labels(discovery), discovery.final_fit
     own, own_tested = (
         ", each recording with " + _own_offsets(stages[0].calibrate_seconds, recordings)
         for recordings in (discovery.validation, discovery.test)
     )
-    chose, no_say = "These recordings chose the model.", "No choice rests on these recordings."
+    chose, no_say = "The model was chosen on these recordings.", "Used for no fit and no choice."
     if not discovery.test:
-        chose += " Recordings that had no say (test=) would show its error without favour."
+        chose += " Test recordings (test=), used for no fit and no choice, would give an unbiased error."
     tested = (last.test, last.test_calibrated) if last else (None, None)
     listed = [
         (
@@ -178,7 +178,7 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     remarks = "".join(f" {remark.sentence}." for remark in found.fit.remarks)
     laws = "".join(
         f" It has {effect_phrase(*used)} in the place of {effect_phrase(*replaced)}, which the search has "
-        "found: such runs of all that was fitted prefer it by far."
+        "found: such runs of all fitted recordings are far better with it."
         for replaced, used in found.laws
     )
     sizes = "; ".join(
@@ -246,9 +246,9 @@ def error_rows(discovery: SearchResult) -> tuple[ErrorRow, ...]:
 def status_sentence(added: Round) -> str:
     """Whether an effect is established, and if not, why, as a sentence."""
     if not added.doubt and added.prediction is None:
-        return "Established: training data ask for it, and validation runs are better with its trained value."
+        return "Established: training data show it, and validation runs are better with its trained value."
     if not added.doubt:
-        return "Established: it helps predictions and free runs, and no recording disagrees about its size."
+        return "Established: predictions and free runs are better with it, and its size agrees in all data."
     if added.certain:
         return f"Provisional as a law: {added.doubt}."
     return f"Provisional, it may stand in for something else: {added.doubt}."

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from rotflex_jax.effects.base import Beside, Probe, Scalar, Scale, Sensing, Stamp, StatePart, register
 from rotflex_jax.parameters import parameter
 
+# A sensor that reads less than half of the true value or more than twice has another scale, not an error.
+_OUT_OF_CALIBRATION = (-0.5, 1.0)
 # No disc of an encoder is further out of its centre than this share of its radius. Over a part of a turn a
 # larger one would be a gain of the sensor.
 _OUT_OF_CENTRE = (-0.05, 0.05)
@@ -42,7 +44,14 @@ class SensorGain(Sensing):
     relative: ClassVar[bool] = True
 
     # The bound keeps the gain positive: a sensor that reads nothing is not out of calibration.
-    error: float = parameter(0.0, unit="", typical=0.05, lower=-0.9, meaning="relative error of the gain")
+    error: float = parameter(
+        0.0,
+        unit="",
+        typical=0.05,
+        lower=-0.9,
+        physical=_OUT_OF_CALIBRATION,
+        meaning="relative error of the gain",
+    )
 
     def measure(self, value: Scalar) -> Scalar:
         """Reading [unit of the channel]."""

@@ -97,9 +97,9 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
 
 
 def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
-    """The error of each channel before and after, large: on data that had no say, where there are any.
+    """The error of each channel before and after, large: on test data, where there are any.
 
-    After is the model to use: that of the final fit, where there is one and data that had no say.
+    After is the model to use: that of the final fit, where there is one and test data.
     """
     tiles, data, fit = [], "test" if discovery.test else "validation", discovery.final_fit
     first, last = (
@@ -252,7 +252,7 @@ def _settings(discovery: SearchResult) -> list[tuple[str, str]]:
     ]
     for label, stage in zip(stage_labels(discovery), discovery.stages, strict=True):
         noise = ", ".join(f"{p} {plain_number(q)}" for p, q in stage.process_noise.items())
-        rows.append((f"White torque that the data ask for, {label} [(N\xa0m)² s]", noise or "none"))
+        rows.append((f"Fitted white torque, {label} [(N\xa0m)² s]", noise or "none"))
     versions = ", ".join(f"{p} {_version(p)}" for p in REPORTED_PACKAGES)
     rows.append(("Versions", f"Python {platform.python_version()}, {versions}"))
     return rows
